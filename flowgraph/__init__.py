@@ -1,0 +1,85 @@
+"""Declare a filter once as a graph; draw it, simulate it, and lower it to a fixed-size pipeline."""
+
+from flowgraph.block import Block, block, when
+from flowgraph.clock import aperiodic, periodic
+from flowgraph.declare import delay, graph
+from flowgraph.errors import (
+    ClockError,
+    CycleError,
+    DataError,
+    DeclarationError,
+    FifoOverflowError,
+    FlowgraphError,
+    LoweringError,
+    MissingDependencyError,
+    PipelineError,
+    TypeMismatchError,
+    UnknownNameError,
+)
+from flowgraph.graph import Graph
+from flowgraph.inputs import arrays, timing_of
+from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
+from flowgraph.lowering import lower
+from flowgraph.pipeline import Pipeline
+from flowgraph.registry import Case, find_graph, load_flight
+from flowgraph.result import Result
+from flowgraph.run import Run
+from flowgraph.series import Flight, Series
+from flowgraph.simulate import simulate
+from flowgraph.state import load_state, save_state
+from flowgraph.stream import Held, Stream, apply
+from flowgraph.types import Array, Scalar, Signal, boolean, integer, real
+
+__all__ = [
+    "Array",
+    "Block",
+    "Case",
+    "ClockError",
+    "CycleError",
+    "DataError",
+    "DeclarationError",
+    "FifoOverflowError",
+    "Flight",
+    "FlowgraphError",
+    "Graph",
+    "Held",
+    "LoweringError",
+    "MissingDependencyError",
+    "Pipeline",
+    "PipelineError",
+    "Result",
+    "Run",
+    "Scalar",
+    "Series",
+    "Signal",
+    "Stream",
+    "TypeMismatchError",
+    "UnknownNameError",
+    "aperiodic",
+    "apply",
+    "arrays",
+    "block",
+    "boolean",
+    "collect",
+    "delay",
+    "every",
+    "find_graph",
+    "graph",
+    "integer",
+    "latest",
+    "load_flight",
+    "load_state",
+    "lower",
+    "match",
+    "merge",
+    "periodic",
+    "real",
+    "save_state",
+    "simulate",
+    "sink",
+    "timing_of",
+    "when",
+    "zip",
+    "zip_latest",
+    "zip_latest_right",
+]

@@ -1,0 +1,94 @@
+"""Errors that teach: where it happened, what was expected, what came, and how to mend it.
+
+Every error that flowgraph raises on purpose derives from `FlowgraphError`. It carries its parts as
+attributes, so that a program can act on them, and prints them in one fixed layout, so that a person
+finds the same thing in the same place each time.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class FlowgraphError(Exception):
+    """An error with the place, what was expected, what came and the fix.
+
+    Args:
+        message: one sentence that says what is wrong.
+        path: where: a graph path (`rbpf/resample/weights`), a port, or a file and row.
+        expected: what would have been right.
+        got: what came instead.
+        fix: what to write or do.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: str | None = None,
+        expected: object = None,
+        got: object = None,
+        fix: str | None = None,
+    ) -> None:
+        self.message, self.path, self.expected, self.got, self.fix = message, path, expected, got, fix
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        lines = [f"{self.path}: {self.message}" if self.path else self.message]
+        for label, part in (("expected", self.expected), ("got", self.got), ("fix", self.fix)):
+            if part is not None:
+                lines.append(f"  {label + ':':<10}{part}")
+        return "\n".join(lines)
+
+
+class DeclarationError(FlowgraphError):
+    """A graph or block is declared wrongly: a port, a name, a setting, an unfed delay."""
+
+
+class TypeMismatchError(DeclarationError):
+    """Two ends of a wire differ in shape, dtype, unit, frame or signal type."""
+
+
+class ClockError(FlowgraphError):
+    """Clocks that a join needs to be related are not, or data break the clock that was declared."""
+
+
+class CycleError(DeclarationError):
+    """A cycle of ports that passes through no delay."""
+
+
+class LoweringError(FlowgraphError):
+    """A block's step does something that a fixed-size pipeline cannot hold; names the source line."""
+
+
+class PipelineError(FlowgraphError):
+    """A pipeline description is malformed, of an unknown version, or is given the wrong inputs."""
+
+
+class DataError(FlowgraphError):
+    """Input data are missing, malformed, out of order or not finite; names file and row, or source and time."""
+
+
+class FifoOverflowError(FlowgraphError):
+    """A bounded queue of a join was full when a value arrived; names the join, its bound and the time."""
+
+
+class UnknownNameError(FlowgraphError):
+    """A name that is not there; lists the valid ones."""
+
+    def __init__(self, kind: str, name: object, valid: Iterable[str], *, path: str | None = None) -> None:
+        names = sorted(valid)
+        near = difflib.get_close_matches(str(name), names, n=1)
+        super().__init__(
+            f"no {kind} is called {str(name)!r}",
+            path=path,
+            expected="one of " + ", ".join(names) if names else f"no {kind} exists here",
+            got=repr(name),
+            fix=f"did you mean {near[0]!r}?" if near else f"use one of the {kind} names above",
+        )
+        self.valid = names
+
+
+class MissingDependencyError(FlowgraphError):
+    """An optional package or program is absent; says what to install."""

@@ -1,0 +1,438 @@
+"""Joins: how streams of different clocks meet. None of them guesses.
+
+Each says when its result is present, what it remembers, and what is refused when the graph is built.
+`latest` and `delay` are registers. The others are blocks like any other, written in the array API with
+queues of fixed size, so that they are simulated, drawn and lowered by the same rules.
+"""
+
+from __future__ import annotations
+
+import builtins
+import math
+import typing
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+from flowgraph import clock as clocks
+from flowgraph.block import REQUIRED, Block, block, when
+from flowgraph.builder import builder
+from flowgraph.clock import Clock, Condition, Counted, Source, clock_of, nanoseconds, within
+from flowgraph.errors import ClockError, DeclarationError
+from flowgraph.graph import NEVER
+from flowgraph.stream import Stream
+from flowgraph.types import ArrayType, Type, annotation_type, flatten, tuple_type, unflatten, zeros
+
+T = TypeVar("T")
+
+
+def latest(
+    stream: Stream[T] | None = None,
+    *,
+    init: Any = REQUIRED,
+    at: object = None,
+    name: str | None = None,
+    type: Any = None,
+) -> Any:
+    """The last value of a stream, held; with `at`, sampled at that clock.
+
+    Reads after this tick's write: where the stream is present, its fresh value. One register.
+    Without a stream, feed it later with `.feed(stream)`; such a cycle still needs a delay.
+
+    Args:
+        stream: what to hold.
+        init: the value before the first; may be left out where `at` proves that the stream came first.
+        at: a stream or clock; the result is then a stream that is present at its ticks.
+        name: its name in paths and in `run.state`.
+
+    Raises:
+        ClockError: with neither `init` nor a proof.
+    """
+    if stream is not None and not isinstance(stream, Stream):
+        raise DeclarationError(
+            "latest needs a stream",
+            path=name or "latest",
+            expected="a Stream",
+            got=repr(stream),
+            fix="a held value is already held",
+        )
+    if init is REQUIRED:
+        if stream is not None and at is not None and within(clock_of(at), stream.clock):
+            return _sample(stream, at=at, name=name or "latest")
+        raise ClockError(
+            "no initial value, and no proof that a value came first",
+            path=stream.label if stream is not None else name or "latest",
+            expected="init=..., or at= a clock at which the stream is always present",
+            got="latest without init" + ("" if at is None else f", at {clock_of(at)}"),
+            fix="write latest(stream, init=...)",
+        )
+    build = builder("latest")
+    declared = stream.type if stream is not None else annotation_type(type) if type is not None else None
+    held = build.register("latest", name or "latest", init, declared, given=name is not None)
+    if stream is not None:
+        held.feed(stream)
+    return held if at is None else held.at(at)
+
+
+_sample: Block[Any] = Block(lambda value: value, name="sample")
+
+
+@block(name="filter")
+def filter_(x, *, predicate):  # type: ignore[no-untyped-def]
+    """Present, with the value of `x`, where `predicate(x)` is true."""
+    return when(predicate(x), x)
+
+
+def _count_clock(firing: Clock, _: list[Clock], settings: dict[str, Any]) -> Clock:
+    return clocks.every(settings["n"], firing, phase=settings["phase"])
+
+
+@block(name="every", clock=_count_clock)
+def _every(state, x, *, n, phase):  # type: ignore[no-untyped-def]
+    """Present at each n-th value of `x`; state: values seen, modulo n."""
+    return (state + 1) % n, when(state == phase, x)
+
+
+@_every.init
+def _(x: Type, *, n: int, phase: int) -> Any:
+    return np.int32(0)
+
+
+@block(name="every", clock=_count_clock)
+def _every_tick(state, *, n, phase):  # type: ignore[no-untyped-def]
+    """Present at each n-th tick of a clock; state: ticks seen, modulo n."""
+    return (state + 1) % n, when(state == phase, state == phase)
+
+
+@_every_tick.init
+def _(*, n: int, phase: int) -> Any:
+    return np.int32(0)
+
+
+def every(n: int, stream: Stream[T] | Clock, *, phase: int = 0, name: str | None = None) -> Stream[T]:
+    """Each n-th value of a stream (or tick of a clock), starting with number `phase`."""
+    if not isinstance(n, int) or n < 1 or not 0 <= phase < n:
+        raise DeclarationError(
+            "every needs a positive whole number and a phase below it",
+            path=name or "every",
+            expected="n >= 1, 0 <= phase < n",
+            got=f"n={n!r}, phase={phase!r}",
+            fix="write every(5, imu)",
+        )
+    if isinstance(stream, Clock):
+        return typing.cast("Stream[T]", _every_tick(at=stream, n=n, phase=phase, name=name))
+    return stream if n == 1 else typing.cast("Stream[T]", _every(stream, n=n, phase=phase, name=name))
+
+
+@block(name="merge")
+def _merge(a=None, b=None, *, tie):  # type: ignore[no-untyped-def]
+    """The one that is present; `tie(a, b)` where both are."""
+    if a is None:
+        return b
+    return a if b is None else tie(a, b)
+
+
+_TIES: dict[str, Callable[[Any, Any], Any]] = {"left": lambda a, b: a, "right": lambda a, b: b}
+
+
+def merge(a: Stream[T], b: Stream[T], *, tie: Any = None, name: str | None = None) -> Stream[T]:
+    """Either stream; present when one is. No memory.
+
+    Args:
+        tie: what to take where both are present: "left", "right", or a function of both values.
+
+    Raises:
+        ClockError: where the clocks can coincide and no `tie` is named.
+    """
+    if tie is None and not clocks.disjoint(a.clock, b.clock):
+        raise ClockError(
+            f"{a.label} and {b.label} can be present together",
+            path=name or "merge",
+            expected="a rule for ties",
+            got=f"{a.clock} and {b.clock}, no tie",
+            fix='write merge(a, b, tie="left"), "right" or a function of both',
+        )
+    if isinstance(tie, str) and tie not in _TIES:
+        raise DeclarationError(
+            "this tie rule does not exist",
+            path=name or "merge",
+            expected='"left", "right" or a function',
+            got=repr(tie),
+            fix='write tie="left"',
+        )
+    rule = _TIES[tie] if isinstance(tie, str) else tie or _TIES["left"]
+    return typing.cast("Stream[T]", _merge(a, b, tie=rule, name=name))
+
+
+# Queues: {"items": leaves with a leading axis of the queue's size, "count": how many are in it}.
+
+
+def _queue(type_: Type, size: int) -> dict[str, Any]:
+    blank = zeros(type_)
+    items = tuple(np.repeat(np.asarray(leaf)[None], size, axis=0) for leaf in flatten(blank, type_))
+    return {"items": items, "count": np.int32(0)}
+
+
+def _push(queue: dict[str, Any], leaves: list[Any], present: Any, xp: Any) -> dict[str, Any]:
+    size = queue["items"][0].shape[0]
+    slot = (xp.arange(size, dtype=xp.int32) == queue["count"]) & present
+    items = tuple(
+        xp.where(
+            xp.reshape(slot, (size,) + (1,) * (old.ndim - 1)), xp.expand_dims(xp.asarray(new), axis=0), old
+        )
+        for old, new in builtins.zip(queue["items"], leaves, strict=True)
+    )
+    return {"items": items, "count": queue["count"] + xp.astype(xp.asarray(present), xp.int32)}
+
+
+def _drop(queue: dict[str, Any], n: Any, xp: Any) -> dict[str, Any]:
+    size = queue["items"][0].shape[0]
+    index = xp.clip(xp.arange(size, dtype=xp.int32) + n, max=xp.asarray(np.int32(size - 1)))
+    return {
+        "items": tuple(xp.take(leaf, index, axis=0) for leaf in queue["items"]),
+        "count": queue["count"] - n,
+    }
+
+
+def _ranks(clock: Clock, root: Clock, ticks: int) -> list[bool]:
+    """Which of the first `ticks` ticks of `root` belong to `clock`."""
+    if clock == root:
+        return [True] * ticks
+    assert isinstance(clock, Counted)
+    inner = _ranks(clock.parent, root, ticks)
+    number = -1
+    hits = []
+    for here in inner:
+        number += here
+        hits.append(here and number % clock.period in clock.offsets)
+    return hits
+
+
+def _root(clock: Clock) -> Clock:
+    return _root(clock.parent) if isinstance(clock, Counted) else clock
+
+
+def _span(clock: Clock) -> int:
+    return clock.period * _span(clock.parent) if isinstance(clock, Counted) else 1
+
+
+def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
+    """The queue size that a zip needs, and the clock of its pairs.
+
+    Raises:
+        ClockError: where the rates differ, are only nominally equal, or cannot be known.
+    """
+    root = _root(a)
+    if root != _root(b):
+        sources = [c for c in (root, _root(b)) if isinstance(c, Source)]
+        rates = {f"{c.timing.period}" for c in sources if c.timing.period is not None}
+        same = len(sources) == 2 and len(rates) == 1 and all(c.timing.period for c in sources)
+        raise ClockError(
+            "two devices whose rates are only nominally equal drift apart"
+            if same
+            else "the rates cannot be proven equal",
+            path=label,
+            expected="streams derived from one source at equal rates",
+            got=f"{a} and {b}",
+            fix="pair by time with match(a, b, tolerance=..., size=...)"
+            + ("" if same else ", or hold one with latest(b, init=...)"),
+        )
+    span = math.lcm(_span(a), _span(b))
+    in_a, in_b = _ranks(a, root, 2 * span), _ranks(b, root, 2 * span)
+    if sum(in_a) != sum(in_b):
+        raise ClockError(
+            "the rates are unequal, so a queue would grow without bound",
+            path=label,
+            expected="equal rates",
+            got=f"{a}: {sum(in_a)} of {2 * span}, {b}: {sum(in_b)} of {2 * span} ticks of {root}",
+            fix="hold the slower one: latest(slow, init=...)",
+        )
+    depth, ahead, pairs = 1, 0, []
+    for i, (x, y) in enumerate(builtins.zip(in_a, in_b, strict=True)):
+        before = ahead
+        ahead += int(x) - int(y)
+        depth = max(depth, abs(before) + 1, abs(ahead))
+        if (y and before > 0) or (x and before < 0) or (x and y):
+            pairs.append(i)
+    first = [i for i in pairs if i >= span]
+    offsets = [i - span for i in first]
+    steady = [i for i in pairs if i < span] == offsets  # no pair is missing from the first round
+    clock = clocks.counted(root, span, offsets) if steady else Condition(label, root)
+    return depth, clock
+
+
+def _pair_type(types: list[Type], _: Any) -> Type:
+    return tuple_type(types)
+
+
+def _zip_clock(firing: Clock, args: list[Clock], settings: dict[str, Any]) -> Clock:
+    return typing.cast(Clock, settings["clock"])
+
+
+@block(name="zip", clock=_zip_clock, output=_pair_type, fault=("overflow", "the queue is full"))
+def _zip(state, a=None, b=None, *, size, types, clock, t, xp):  # type: ignore[no-untyped-def]
+    """Present where both queues hold a value; takes the oldest of each. State: two queues."""
+    left = _arrive(state["a"], a, types[0], xp)
+    right = _arrive(state["b"], b, types[1], xp)
+    ready = (left["count"] > 0) & (right["count"] > 0)
+    out = tuple(
+        unflatten(kind, iter([leaf[0, ...] for leaf in queue["items"]]))
+        for kind, queue in builtins.zip(types, (left, right), strict=True)
+    )
+    gone = xp.astype(xp.asarray(ready), xp.int32)
+    over = (left["count"] - gone > size) | (right["count"] - gone > size)
+    new = {
+        "a": _drop(left, gone, xp),
+        "b": _drop(right, gone, xp),
+        "overflow": xp.where(over & (state["overflow"] == NEVER), t, state["overflow"]),
+    }
+    return new, when(ready, out)
+
+
+@_zip.init
+def _(a: Type, b: Type, *, size: int, types: Any, clock: Any) -> Any:
+    return {"a": _queue(types[0], size + 1), "b": _queue(types[1], size + 1), "overflow": np.int64(NEVER)}
+
+
+def _arrive(queue: dict[str, Any], value: Any, type_: Type, xp: Any) -> dict[str, Any]:
+    return queue if value is None else _push(queue, flatten(value, type_), True, xp)
+
+
+@block(name="zip")
+def _pair(a, b):  # type: ignore[no-untyped-def]
+    """Both values; streams of one clock need no queue."""
+    return a, b
+
+
+def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[Any]:
+    """Pairs in order: the k-th of `a` with the k-th of `b`. Two queues, whose size follows from the clocks.
+
+    Raises:
+        ClockError: where rates are unequal (use `latest`) or only nominally equal (use `match`).
+    """
+    label = name or f"zip({a.label}, {b.label})"
+    if clocks.equal(a.clock, b.clock):
+        return typing.cast("Stream[Any]", _pair(a, b, name=name))
+    size, clock = _zip_plan(a.clock, b.clock, label)
+    return typing.cast("Stream[Any]", _zip(a, b, size=size, types=(a.type, b.type), clock=clock, name=name))
+
+
+def zip_latest(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
+    """Pairs whenever either comes, with the last value of the other; `init` is the pair before the first."""
+    first, second = init
+    left, right = latest(a, init=first), latest(b, init=second)
+    return typing.cast("Stream[Any]", _pair(left, right, at=a | b, name=name or "zip_latest"))
+
+
+def zip_latest_right(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
+    """Pairs whenever `a` comes, with the last value of `b`; `init` is the value of `b` before its first."""
+    return typing.cast("Stream[Any]", _pair(a, latest(b, init=init), name=name or "zip_latest_right"))
+
+
+@block(name="match", output=_pair_type, fault=("overflow", "the queue is full"))
+def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ignore[no-untyped-def]
+    """Present where an arriving value finds one of the other stream within `tolerance`; takes the nearest.
+
+    State: two queues of (time, value); what is passed over or grows too old is counted as expired.
+    """
+    stamped = [tuple_type([ArrayType((), "int64"), kind]) for kind in types]
+    state_a, state_b = state["a"], state["b"]
+    left = state_a if a is None else _push(state_a, [t, *flatten(a, types[0])], True, xp)
+    right = state_b if b is None else _push(state_b, [t, *flatten(b, types[1])], True, xp)
+    # only one queue can hold older values, except in the tick in which both arrive
+    pick_a, near_a = _nearest(left, t, tolerance, xp)
+    pick_b, near_b = _nearest(right, t, tolerance, xp)
+    fresh_a, fresh_b = a is not None, b is not None
+    if fresh_a and fresh_b:
+        pick_a, pick_b, ready = left["count"] - 1, right["count"] - 1, xp.asarray(True)
+    elif fresh_a:
+        pick_a, ready = left["count"] - 1, near_b
+    else:
+        pick_b, ready = right["count"] - 1, near_a
+    value = tuple(
+        unflatten(kind, iter([xp.take(leaf, xp.maximum(pick, 0), axis=0) for leaf in queue["items"]]))[1]
+        for kind, queue, pick in ((stamped[0], left, pick_a), (stamped[1], right, pick_b))
+    )
+    stale_a = _stale(left, t, tolerance, xp) if fresh_b else xp.asarray(np.int32(0))
+    stale_b = _stale(right, t, tolerance, xp) if fresh_a else xp.asarray(np.int32(0))
+    gone_a = xp.where(ready, xp.astype(pick_a, xp.int32) + 1, stale_a)
+    gone_b = xp.where(ready, xp.astype(pick_b, xp.int32) + 1, stale_b)
+    taken = xp.astype(ready, xp.int32)
+    over = (left["count"] - gone_a > size) | (right["count"] - gone_b > size)
+    new = {
+        "a": _drop(left, gone_a, xp),
+        "b": _drop(right, gone_b, xp),
+        "expired_a": state["expired_a"] + gone_a - taken,
+        "expired_b": state["expired_b"] + gone_b - taken,
+        "overflow": xp.where(over & (state["overflow"] == NEVER), t, state["overflow"]),
+    }
+    return new, when(ready, value)
+
+
+@_match.init
+def _(a: Type, b: Type, *, tolerance: int, size: int, types: Any) -> Any:
+    stamp = ArrayType((), "int64")
+    left, right = (_queue(tuple_type([stamp, kind]), size + 1) for kind in types)
+    none = np.int32(0)
+    return {"a": left, "b": right, "expired_a": none, "expired_b": none, "overflow": np.int64(NEVER)}
+
+
+def _distances(queue: dict[str, Any], t: Any, xp: Any) -> tuple[Any, Any]:
+    held = xp.arange(queue["items"][0].shape[0], dtype=xp.int32) < queue["count"]
+    return held, t - queue["items"][0]
+
+
+def _nearest(queue: dict[str, Any], t: Any, tolerance: int, xp: Any) -> tuple[Any, Any]:
+    """Place of the value nearest in time, and whether it is within the tolerance."""
+    held, age = _distances(queue, t, xp)
+    gap = xp.where(held, age, 2**62)
+    return xp.argmin(gap), xp.min(gap) <= tolerance
+
+
+def _stale(queue: dict[str, Any], t: Any, tolerance: int, xp: Any) -> Any:
+    """How many values are too old for anything that can still come."""
+    held, age = _distances(queue, t, xp)
+    return xp.astype(xp.sum(xp.astype(held & (age > tolerance), xp.int32)), xp.int32)
+
+
+def match(
+    a: Stream[Any], b: Stream[Any], *, tolerance: str | int, size: int | None = None, name: str | None = None
+) -> Stream[Any]:
+    """Pairs of values whose time stamps agree within `tolerance`; each arriving value takes the nearest.
+
+    A value expires once the other stream has passed it, which `run.stats` counts (`expired_a`, `expired_b`).
+
+    Args:
+        tolerance: a duration such as "5ms".
+        size: how many values of one stream may wait; more is an error at run time.
+
+    Raises:
+        DeclarationError: without a size.
+    """
+    if not isinstance(size, int) or size < 1:
+        raise DeclarationError(
+            "match needs the size of its queues",
+            path=name or f"match({a.label}, {b.label})",
+            expected="size=, a positive whole number",
+            got=repr(size),
+            fix="write match(a, b, tolerance=..., size=8): how many values may wait for a partner",
+        )
+    span = nanoseconds(tolerance, what="tolerance")
+    return typing.cast(
+        "Stream[Any]", _match(a, b, tolerance=span, size=size, types=(a.type, b.type), name=name)
+    )
+
+
+def collect(stream: Stream[Any], name: str) -> None:
+    """Keep all values of a stream in the result of a run, under `name`."""
+    builder("collect").collect(name, stream)
+
+
+def sink(stream: Stream[Any], function: Callable[..., Any], *, name: str | None = None) -> None:
+    """Call `function(value)` on the host for each value: a print, a file, a display."""
+
+    def consume(value: Any) -> None:
+        function(value)
+
+    Block(consume, name=name or getattr(function, "__name__", "sink").strip("<>"), host=True)(stream)

@@ -1,0 +1,325 @@
+"""The instructions of a pipeline: a fixed part of the array-API standard, each with one shape rule.
+
+An `Op` says what the result's shape and dtype are, given those of its arguments and its attributes, and
+how to compute it in a namespace (`numpy`, `jax.numpy`). Recording, the reference interpreter and every
+backend read this one table, so an operation exists either everywhere or nowhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from flowgraph.types import DTYPES
+
+
+class Spec(NamedTuple):
+    """Shape and dtype of a value in a pipeline."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class ShapeError(ValueError):
+    """The arguments of an operation do not fit together."""
+
+
+@dataclass(frozen=True)
+class Op:
+    """One kind of instruction.
+
+    Args:
+        name: as in the array-API standard.
+        rule: `(specs of the arguments, attributes) -> Spec` of the result; raises `ShapeError`.
+        run: `(namespace, *arrays, **attributes) -> array`.
+        operands: kind to which the arguments are brought first: "same", "real", "bool", "int" or "as is".
+    """
+
+    name: str
+    rule: Callable[..., Spec]
+    run: Callable[..., Any]
+    operands: str = "as is"
+
+
+_RANK = {"bool": 0, "uint32": 1, "int32": 1, "int64": 2, "real": 3}
+
+
+def promote(*dtypes: str) -> str:
+    """The kind of number that holds all of `dtypes`."""
+    if {"uint32", "int32"} <= set(dtypes):
+        dtypes = (*dtypes, "int64")
+    return max(dtypes, key=_RANK.__getitem__)
+
+
+def broadcast(*shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """The common shape under broadcasting."""
+    rank = max(map(len, shapes), default=0)
+    padded = [(1,) * (rank - len(s)) + s for s in shapes]
+    out = []
+    for sizes in zip(*padded, strict=True):
+        wide = {n for n in sizes if n != 1}
+        if len(wide) > 1:
+            raise ShapeError(f"shapes {', '.join(map(str, shapes))} do not broadcast")
+        out.append(wide.pop() if wide else 1)
+    return tuple(out)
+
+
+def _axis(axis: int, rank: int) -> int:
+    if not -rank <= axis < rank:
+        raise ShapeError(f"axis {axis} is outside an array of {rank} axes")
+    return axis % rank
+
+
+def _elementwise(dtype: str | None) -> Callable[..., Spec]:
+    def rule(*args: Spec, **_: Any) -> Spec:
+        return Spec(broadcast(*(a.shape for a in args)), dtype or promote(*(a.dtype for a in args)))
+
+    return rule
+
+
+def _reduction(dtype: str | None, counted: bool = False) -> Callable[..., Spec]:
+    def rule(x: Spec, *, axis: Any = None, keepdims: bool = False) -> Spec:
+        axes = range(len(x.shape)) if axis is None else [axis] if isinstance(axis, int) else axis
+        gone = {_axis(a, len(x.shape)) for a in axes}
+        shape = tuple(1 if i in gone else n for i, n in enumerate(x.shape) if keepdims or i not in gone)
+        kind = dtype or ("int64" if counted and x.dtype in ("bool", "int32") else x.dtype)
+        return Spec(shape, kind)
+
+    return rule
+
+
+def _single(dtype: str) -> Callable[..., Spec]:
+    def rule(x: Spec, *, axis: int | None = None) -> Spec:
+        if axis is None:
+            return Spec((), dtype)
+        gone = _axis(axis, len(x.shape))
+        return Spec(x.shape[:gone] + x.shape[gone + 1 :], dtype)
+
+    return rule
+
+
+def _matmul(a: Spec, b: Spec) -> Spec:
+    if not a.shape or not b.shape:
+        raise ShapeError("matmul needs at least one axis on both sides")
+    left = a.shape if len(a.shape) > 1 else (1, *a.shape)
+    right = b.shape if len(b.shape) > 1 else (*b.shape, 1)
+    if left[-1] != right[-2]:
+        raise ShapeError(f"matmul of {a.shape} and {b.shape}: {left[-1]} columns meet {right[-2]} rows")
+    tail = (left[-2:-1] if len(a.shape) > 1 else ()) + (right[-1:] if len(b.shape) > 1 else ())
+    return Spec(broadcast(left[:-2], right[:-2]) + tail, promote(a.dtype, b.dtype))
+
+
+def _square(x: Spec) -> Spec:
+    if len(x.shape) < 2 or x.shape[-1] != x.shape[-2]:
+        raise ShapeError(f"needs a square matrix, not {x.shape}")
+    return x
+
+
+def _solve(a: Spec, b: Spec) -> Spec:
+    _square(a)
+    if len(b.shape) == 1:
+        if b.shape[0] != a.shape[-1]:
+            raise ShapeError(f"solve of {a.shape} with {b.shape}")
+        return Spec((*a.shape[:-2], b.shape[0]), "real")
+    if b.shape[-2] != a.shape[-1]:
+        raise ShapeError(f"solve of {a.shape} with {b.shape}")
+    return Spec((*broadcast(a.shape[:-2], b.shape[:-2]), *b.shape[-2:]), "real")
+
+
+def _permute(x: Spec, *, axes: list[int]) -> Spec:
+    if sorted(axes) != list(range(len(x.shape))):
+        raise ShapeError(f"axes {axes} do not permute an array of {len(x.shape)} axes")
+    return Spec(tuple(x.shape[a] for a in axes), x.dtype)
+
+
+def _transpose(x: Spec) -> Spec:
+    if len(x.shape) < 2:
+        raise ShapeError(f"matrix_transpose needs two axes, not {x.shape}")
+    return Spec((*x.shape[:-2], x.shape[-1], x.shape[-2]), x.dtype)
+
+
+def _reshape(x: Spec, *, shape: list[int]) -> Spec:
+    size = math.prod(x.shape)
+    if shape.count(-1) == 1:
+        rest = -math.prod(shape)
+        shape = [size // rest if n == -1 and rest else n for n in shape]
+    if math.prod(shape) != size:
+        raise ShapeError(f"cannot reshape {x.shape} to {tuple(shape)}")
+    return Spec(tuple(shape), x.dtype)
+
+
+def _broadcast_to(x: Spec, *, shape: list[int]) -> Spec:
+    if broadcast(x.shape, tuple(shape)) != tuple(shape):
+        raise ShapeError(f"cannot broadcast {x.shape} to {tuple(shape)}")
+    return Spec(tuple(shape), x.dtype)
+
+
+def _concat(*xs: Spec, axis: int) -> Spec:
+    along = _axis(axis, len(xs[0].shape))
+    others = {x.shape[:along] + x.shape[along + 1 :] for x in xs}
+    if len(others) > 1 or len({len(x.shape) for x in xs}) > 1:
+        raise ShapeError(f"cannot concat {', '.join(str(x.shape) for x in xs)} along axis {axis}")
+    shape = list(xs[0].shape)
+    shape[along] = sum(x.shape[along] for x in xs)
+    return Spec(tuple(shape), promote(*(x.dtype for x in xs)))
+
+
+def _stack(*xs: Spec, axis: int) -> Spec:
+    if len({x.shape for x in xs}) > 1:
+        raise ShapeError(f"cannot stack {', '.join(str(x.shape) for x in xs)}")
+    along = _axis(axis, len(xs[0].shape) + 1)
+    shape = xs[0].shape[:along] + (len(xs),) + xs[0].shape[along:]
+    return Spec(shape, promote(*(x.dtype for x in xs)))
+
+
+def _getitem(x: Spec, *, index: list[Any]) -> Spec:
+    shape = []
+    for size, entry in zip(x.shape, index, strict=True):
+        if isinstance(entry, int):
+            if not -size <= entry < size:
+                raise ShapeError(f"index {entry} is outside an axis of size {size}")
+        else:
+            shape.append(len(range(*slice(*entry).indices(size))))
+    return Spec(tuple(shape), x.dtype)
+
+
+def _run_getitem(xp: Any, x: Any, *, index: list[Any]) -> Any:
+    return x[tuple(e if isinstance(e, int) else slice(*e) for e in index)]
+
+
+def _take(x: Spec, indices: Spec, *, axis: int) -> Spec:
+    along = _axis(axis, len(x.shape))
+    return Spec(x.shape[:along] + indices.shape + x.shape[along + 1 :], x.dtype)
+
+
+def _cross(a: Spec, b: Spec) -> Spec:
+    shape = broadcast(a.shape, b.shape)
+    if not shape or shape[-1] != 3:
+        raise ShapeError(f"cross needs vectors of length 3, not {a.shape} and {b.shape}")
+    return Spec(shape, promote(a.dtype, b.dtype))
+
+
+def _vecdot(a: Spec, b: Spec) -> Spec:
+    return Spec(broadcast(a.shape, b.shape)[:-1], promote(a.dtype, b.dtype))
+
+
+def _outer(a: Spec, b: Spec) -> Spec:
+    if len(a.shape) != 1 or len(b.shape) != 1:
+        raise ShapeError(f"outer needs two vectors, not {a.shape} and {b.shape}")
+    return Spec((*a.shape, *b.shape), promote(a.dtype, b.dtype))
+
+
+def _astype(x: Spec, *, dtype: str) -> Spec:
+    return Spec(x.shape, dtype)
+
+
+def _same(x: Spec, **_: Any) -> Spec:
+    return x
+
+
+def _int_of(x: Spec, v: Spec, **_: Any) -> Spec:
+    return Spec(v.shape, "int64")
+
+
+def _where(c: Spec, a: Spec, b: Spec) -> Spec:
+    return Spec(broadcast(c.shape, a.shape, b.shape), promote(a.dtype, b.dtype))
+
+
+def _namespace(name: str) -> Callable[..., Any]:
+    return lambda xp, *args, **attrs: getattr(xp, name)(*args, **attrs)
+
+
+def _linalg(name: str) -> Callable[..., Any]:
+    return lambda xp, *args, **attrs: getattr(xp.linalg, name)(*args, **attrs)
+
+
+def _many(name: str) -> Callable[..., Any]:
+    return lambda xp, *args, **attrs: getattr(xp, name)(args, **attrs)
+
+
+def _run_astype(xp: Any, x: Any, *, dtype: Any) -> Any:
+    return xp.asarray(x).astype(dtype)
+
+
+def _run_shape(name: str) -> Callable[..., Any]:
+    return lambda xp, x, *, shape: getattr(xp, name)(x, tuple(shape))
+
+
+def _run_axes(xp: Any, x: Any, *, axes: list[int]) -> Any:
+    return xp.permute_dims(x, tuple(axes))
+
+
+def _run_reduce(name: str) -> Callable[..., Any]:
+    def run(xp: Any, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return getattr(xp, name)(x, axis=tuple(axis) if isinstance(axis, list) else axis, keepdims=keepdims)
+
+    return run
+
+
+def _table() -> dict[str, Op]:
+    ops: dict[str, Op] = {}
+
+    def add(
+        names: str, rule: Callable[..., Spec], operands: str, run: Callable[[str], Any] = _namespace
+    ) -> None:
+        for name in names.split():
+            ops[name] = Op(name, rule, run(name), operands)
+
+    add("add subtract multiply maximum minimum remainder floor_divide pow", _elementwise(None), "same")
+    add("negative abs sign square positive", _elementwise(None), "same")
+    add("divide atan2 hypot copysign", _elementwise("real"), "real")
+    add(
+        "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh",
+        _elementwise("real"),
+        "real",
+    )
+    add("floor ceil round trunc", _elementwise(None), "same")
+    add("equal not_equal less less_equal greater greater_equal", _elementwise("bool"), "same")
+    add("logical_and logical_or logical_xor logical_not", _elementwise("bool"), "bool")
+    add("isfinite isnan", _elementwise("bool"), "real")
+    add(
+        "bitwise_and bitwise_or bitwise_xor bitwise_invert bitwise_left_shift bitwise_right_shift",
+        _elementwise(None),
+        "int",
+    )
+    add("sum prod", _reduction(None, counted=True), "as is", _run_reduce)
+    add("max min", _reduction(None), "as is", _run_reduce)
+    add("mean", _reduction("real"), "real", _run_reduce)
+    add("any all", _reduction("bool"), "bool", _run_reduce)
+    add("argmax argmin", _single("int64"), "as is")
+    add("sort flip roll", _same, "as is")
+    add("argsort", lambda x, **_: Spec(x.shape, "int64"), "as is")
+    add("cumulative_sum", _same, "as is")
+    add("concat stack", _concat, "same", _many)
+    ops["stack"] = Op("stack", _stack, _many("stack"), "same")
+    add("matmul", _matmul, "same")
+    add("matrix_transpose", _transpose, "as is")
+    add("cholesky", _square, "real", _linalg)
+    add("solve", _solve, "real", _linalg)
+    add("cross", _cross, "same", _linalg)
+    add("vecdot", _vecdot, "same", _linalg)
+    add("outer", _outer, "same", _linalg)
+    add("searchsorted", _int_of, "same")
+    add("tril triu", _same, "as is")
+    ops["where"] = Op("where", _where, _namespace("where"))
+    ops["permute_dims"] = Op("permute_dims", _permute, _run_axes)
+    ops["reshape"] = Op("reshape", _reshape, _run_shape("reshape"))
+    ops["broadcast_to"] = Op("broadcast_to", _broadcast_to, _run_shape("broadcast_to"))
+    ops["getitem"] = Op("getitem", _getitem, _run_getitem)
+    ops["take"] = Op("take", _take, lambda xp, x, i, *, axis: xp.take(x, i, axis=axis, mode="clip"))
+    ops["astype"] = Op("astype", _astype, _run_astype)
+    return ops
+
+
+OPS = _table()
+"""All instructions by name."""
+
+
+def bound_attrs(op: str, attrs: dict[str, Any], real: Any) -> dict[str, Any]:
+    """The attributes with kinds of number replaced by concrete dtypes; `real` is float64 or float32."""
+    if "dtype" not in attrs:
+        return attrs
+    name = attrs["dtype"]
+    return {**attrs, "dtype": real if name == "real" else DTYPES[name]}

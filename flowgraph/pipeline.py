@@ -1,0 +1,482 @@
+"""The pipeline: a fixed-size description of a graph that runs without the Python that made it.
+
+Values are numbered and assigned once. Inputs, registers and constants give the first values, stages of
+typed instructions the rest; outputs name values, and each register names the value written back at the end
+of a tick. Whether a source is present in a tick is a Boolean input like any other, and every stage names
+the value that enables it. The JSON form holds the same, whole, with a version and a JSON Schema.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flowgraph.errors import PipelineError
+from flowgraph.ops import OPS, Spec
+from flowgraph.symbolic import Instruction
+from flowgraph.types import DTYPES, ArrayType, StructType, Type
+
+if TYPE_CHECKING:
+    from flowgraph.result import Result
+
+FORMAT, VERSION = "flowgraph-pipeline", 1
+_FILE = "pipeline.json"
+_SCHEMA = Path(__file__).with_name("pipeline.schema.json")
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of a port: its value number, shape, dtype, unit and frame."""
+
+    name: str
+    value: int
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str | None = None
+    frame: str | None = None
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or output: `present` is the number of a Boolean value."""
+
+    name: str
+    type: str
+    clock: str
+    present: int
+    leaves: tuple[Leaf, ...]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One array of a register: `read` is its value in a tick, `write` what it becomes at the end of it."""
+
+    name: str
+    read: int
+    write: int
+    shape: tuple[int, ...]
+    dtype: str
+    reset: Any
+    unit: str | None = None
+    frame: str | None = None
+
+
+@dataclass(frozen=True)
+class Register:
+    """Memory between ticks: `role` is "latest", "delay", "state" or "stamp"."""
+
+    path: str
+    role: str
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one block does in a tick, when the value `enable` is true.
+
+    Args:
+        path, block: of the call in the graph.
+        enable: number of a Boolean value.
+        reads, writes: paths of registers.
+        instructions: in order.
+    """
+
+    path: str
+    block: str
+    enable: int
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    instructions: tuple[Instruction, ...]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A register cell that holds the time (ns) at which a bound was exceeded, or the smallest int64."""
+
+    path: str
+    register: str
+    cell: str
+    message: str
+    bound: int
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """A lowered graph. `run` plays it, `save` and `load` keep it.
+
+    Args:
+        name, doc: of the graph.
+        time: number of the value that holds the tick's time (int64, ns).
+        inputs, outputs, registers, constants, stages, faults: see their classes.
+    """
+
+    name: str
+    doc: str
+    time: int
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    registers: tuple[Register, ...]
+    constants: Mapping[int, np.ndarray]
+    stages: tuple[Stage, ...]
+    faults: tuple[Fault, ...] = ()
+
+    @cached_property
+    def instructions(self) -> tuple[Instruction, ...]:
+        """All instructions in order."""
+        return tuple(i for stage in self.stages for i in stage.instructions)
+
+    def run(self, inputs: Mapping[str, Any], **options: Any) -> Result:
+        """Play the pipeline over recorded events.
+
+        Args:
+            inputs: for each input a `Series`, or `(times, {leaf: array})` with int64 ns and a leading axis.
+            **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress` as in `simulate`.
+        """
+        from flowgraph.playback import run_pipeline
+
+        return run_pipeline(self, inputs, **options)
+
+    def totals(self) -> dict[str, int]:
+        """Scalar operations of a tick in which everything fires, bytes of memory, and the longest chain."""
+        depth: dict[int, int] = {}
+        for i in self.instructions:
+            depth[i.out] = 1 + max((depth.get(a, 0) for a in i.args), default=0)
+        cells = [c for r in self.registers for c in r.cells]
+        return {
+            "stages": len(self.stages),
+            "instructions": len(self.instructions),
+            "operations": sum(work(i, self.specs) for i in self.instructions),
+            "register_bytes": sum(math.prod(c.shape) * np.dtype(DTYPES[c.dtype]).itemsize for c in cells),
+            "constant_bytes": sum(int(a.nbytes) for a in self.constants.values()),
+            "critical_path": max(depth.values(), default=0),
+        }
+
+    def latency(self) -> dict[str, int]:
+        """For each input, the longest chain of instructions from it to an output."""
+        found = {}
+        for port in self.inputs:
+            depth = {leaf.value: 0 for leaf in port.leaves} | {port.present: 0}
+            for i in self.instructions:
+                reached = [depth[a] for a in i.args if a in depth]
+                if reached:
+                    depth[i.out] = 1 + max(reached)
+            found[port.name] = max(
+                (depth.get(leaf.value, 0) for o in self.outputs for leaf in o.leaves), default=0
+            )
+        return found
+
+    @cached_property
+    def specs(self) -> dict[int, Spec]:
+        """Shape and dtype of every value."""
+        specs = {self.time: Spec((), "int64")}
+        for port in self.inputs:
+            specs[port.present] = Spec((), "bool")
+            specs.update({leaf.value: Spec(leaf.shape, leaf.dtype) for leaf in port.leaves})
+        for register in self.registers:
+            specs.update({c.read: Spec(c.shape, c.dtype) for c in register.cells})
+        specs.update({n: Spec(a.shape, _kind(a)) for n, a in self.constants.items()})
+        specs.update({i.out: i.spec for i in self.instructions})
+        return specs
+
+    # -- JSON ----------------------------------------------------------------------------------------
+
+    def to_json(self) -> dict[str, Any]:
+        """The whole description as plain JSON values."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": self.name,
+            "doc": self.doc,
+            "time": self.time,
+            "inputs": [_plain(p) for p in self.inputs],
+            "outputs": [_plain(p) for p in self.outputs],
+            "registers": [_plain(r) for r in self.registers],
+            "constants": [
+                {"value": n, "shape": list(a.shape), "dtype": _kind(a), "data": _numbers(a)}
+                for n, a in self.constants.items()
+            ],
+            "stages": [
+                {
+                    "path": s.path,
+                    "block": s.block,
+                    "enable": s.enable,
+                    "reads": list(s.reads),
+                    "writes": list(s.writes),
+                    "instructions": [_instruction(i) for i in s.instructions],
+                }
+                for s in self.stages
+            ],
+            "faults": [_plain(f) for f in self.faults],
+            "totals": self.totals(),
+            "latency": self.latency(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Any, *, path: str = "pipeline") -> Pipeline:
+        """A pipeline from `to_json`'s form, checked against the schema and for single assignment.
+
+        Raises:
+            PipelineError: saying where it is malformed.
+        """
+        _check_version(data, path)
+        _check_schema(data, path)
+        pipeline = cls(
+            name=data["name"],
+            doc=data["doc"],
+            time=data["time"],
+            inputs=tuple(_port(p) for p in data["inputs"]),
+            outputs=tuple(_port(p) for p in data["outputs"]),
+            registers=tuple(
+                Register(r["path"], r["role"], tuple(_cell(c) for c in r["cells"])) for r in data["registers"]
+            ),
+            constants={c["value"]: _array(c["data"], c["shape"], c["dtype"]) for c in data["constants"]},
+            stages=tuple(
+                Stage(
+                    s["path"],
+                    s["block"],
+                    s["enable"],
+                    tuple(s["reads"]),
+                    tuple(s["writes"]),
+                    tuple(_from_instruction(i) for i in s["instructions"]),
+                )
+                for s in data["stages"]
+            ),
+            faults=tuple(Fault(**f) for f in data["faults"]),
+        )
+        pipeline._check_values(path)
+        return pipeline
+
+    def _check_values(self, path: str) -> None:
+        """Every value is assigned once, before it is used, with the shape that its instruction gives."""
+        specs = {n: s for n, s in self.specs.items() if n not in {i.out for i in self.instructions}}
+        for stage in self.stages:
+            for i in stage.instructions:
+                where = f"{path}: stage {stage.path}, value {i.out}"
+                missing = [a for a in i.args if a not in specs]
+                if i.op not in OPS or missing or i.out in specs:
+                    raise PipelineError(
+                        "an instruction is malformed",
+                        path=where,
+                        expected="a known operation on values assigned before",
+                        got=f"{i.op}{list(i.args)}",
+                        fix="lower the graph again",
+                    )
+                try:
+                    derived = OPS[i.op].rule(*(specs[a] for a in i.args), **i.attrs)
+                except (ValueError, TypeError, IndexError) as error:
+                    derived = Spec((-1,), str(error))
+                if derived != i.spec:
+                    raise PipelineError(
+                        "an instruction's result does not have the shape it claims",
+                        path=where,
+                        expected=str(derived),
+                        got=str(i.spec),
+                        fix="lower the graph again",
+                    )
+                specs[i.out] = i.spec
+        ends = [leaf.value for o in self.outputs for leaf in o.leaves] + [o.present for o in self.outputs]
+        for n in [
+            *ends,
+            *(c.write for r in self.registers for c in r.cells),
+            *(s.enable for s in self.stages),
+        ]:
+            if n not in specs:
+                raise PipelineError(
+                    f"value {n} is never assigned",
+                    path=path,
+                    expected="outputs and writes that exist",
+                    got=str(n),
+                    fix="lower the graph again",
+                )
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `pipeline.json` and a listing `pipeline.txt` into a folder (made if missing); returns the folder.
+
+        Raises:
+            PipelineError: where the folder holds another pipeline; nothing is overwritten in silence.
+        """
+        target = Path(folder)
+        text = json.dumps(self.to_json(), indent=1, allow_nan=False)
+        file = target / _FILE
+        if file.exists() and file.read_text() != text:
+            raise PipelineError(
+                "another pipeline is already here",
+                path=str(file),
+                expected="an empty folder, or the same pipeline",
+                got=f"a different {_FILE}",
+                fix="choose another folder, or remove the old one first",
+            )
+        target.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        (target / "pipeline.txt").write_text(self.listing())
+        return target
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Pipeline:
+        """Read a pipeline that `save` wrote.
+
+        Raises:
+            PipelineError: where it is missing, malformed or of another version.
+        """
+        file = Path(folder)
+        file = file / _FILE if file.is_dir() else file
+        try:
+            data = json.loads(file.read_text())
+        except (OSError, json.JSONDecodeError) as error:
+            raise PipelineError(
+                "no pipeline can be read here",
+                path=str(file),
+                expected=f"a {_FILE} written by Pipeline.save",
+                got=f"{type(error).__name__}: {error}",
+                fix="lower the graph: lower(graph).save(folder)",
+            ) from None
+        return cls.from_json(data, path=str(file))
+
+    def listing(self) -> str:
+        """The pipeline as text for a person: registers, then stages with one instruction a line."""
+        from flowgraph.listing import listing
+
+        return listing(self)
+
+    def __repr__(self) -> str:
+        t = self.totals()
+        return f"<Pipeline {self.name}: {t['stages']} stages, {t['instructions']} instructions, {t['register_bytes']} B>"
+
+
+def work(i: Instruction, specs: Mapping[int, Spec]) -> int:
+    """About how many scalar operations an instruction takes."""
+    size = math.prod(i.spec.shape)
+    if i.op == "matmul":
+        return size * specs[i.args[0]].shape[-1]
+    if i.op == "cholesky":
+        return math.ceil(size * i.spec.shape[-1] / 3)
+    if i.op == "solve":
+        n = specs[i.args[0]].shape[-1]
+        return size * n + math.ceil(math.prod(specs[i.args[0]].shape) * n / 3)
+    if i.op in ("sum", "prod", "max", "min", "mean", "any", "all", "argmax", "argmin"):
+        return math.prod(specs[i.args[0]].shape)
+    return (
+        0
+        if i.op
+        in ("getitem", "reshape", "broadcast_to", "concat", "stack", "matrix_transpose", "permute_dims")
+        else size
+    )
+
+
+def type_of_leaves(name: str, leaves: tuple[Leaf, ...] | tuple[Cell, ...]) -> Type:
+    """A type whose values are nested dicts (or one array), from dotted leaf names."""
+    if len(leaves) == 1 and leaves[0].name == "value":
+        one = leaves[0]
+        return ArrayType(one.shape, one.dtype, one.unit, one.frame)
+    groups: dict[str, list[Any]] = {}
+    for leaf in leaves:
+        head, _, rest = leaf.name.partition(".")
+        groups.setdefault(head, []).append((rest, leaf))
+    fields = []
+    for head, members in groups.items():
+        if members[0][0] == "":
+            leaf = members[0][1]
+            fields.append((head, ArrayType(leaf.shape, leaf.dtype, leaf.unit, leaf.frame)))
+        else:
+            inner = tuple(
+                Leaf(rest, m.value if isinstance(m, Leaf) else m.read, m.shape, m.dtype, m.unit, m.frame)
+                for rest, m in members
+            )
+            fields.append((head, type_of_leaves(head, inner)))  # type: ignore[arg-type]
+    return StructType(name, tuple(fields), dict)
+
+
+@lru_cache(maxsize=1)
+def schema() -> dict[str, Any]:
+    """The JSON Schema of the description."""
+    found: dict[str, Any] = json.loads(_SCHEMA.read_text())
+    return found
+
+
+def _check_version(data: Any, path: str) -> None:
+    if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+        got = (
+            {k: data.get(k) for k in ("format", "version")} if isinstance(data, dict) else type(data).__name__
+        )
+        raise PipelineError(
+            "this is not a pipeline of a known version",
+            path=path,
+            expected=f"format {FORMAT!r}, version {VERSION}",
+            got=got,
+            fix="lower the graph again with this version of flowgraph",
+        )
+
+
+def _check_schema(data: Any, path: str) -> None:
+    import jsonschema
+
+    error = jsonschema.Draft202012Validator(schema()).iter_errors(data)
+    first = next(iter(error), None)
+    if first is not None:
+        place = "/".join(map(str, first.absolute_path)) or "the top"
+        raise PipelineError(
+            "the description does not keep to its schema",
+            path=f"{path}, at {place}",
+            expected=json.dumps(first.schema)[:200],
+            got=first.message[:200],
+            fix="lower the graph again",
+        )
+
+
+def _kind(array: np.ndarray) -> str:
+    return "real" if array.dtype.kind == "f" else "bool" if array.dtype.kind == "b" else array.dtype.name
+
+
+def _numbers(array: Any) -> Any:
+    """Nested lists; numbers that JSON lacks as text."""
+    flat = np.asarray(array)
+    if flat.dtype.kind == "f" and not np.isfinite(flat).all():
+        spelled = np.array([x if math.isfinite(x) else str(x) for x in flat.ravel().tolist()], dtype=object)
+        return spelled.reshape(flat.shape).tolist()
+    return flat.tolist()
+
+
+def _array(data: Any, shape: list[int], dtype: str) -> np.ndarray:
+    array = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
+    return array.astype(DTYPES[dtype]).reshape(shape)
+
+
+def _plain(record: Any) -> Any:
+    data = asdict(record)
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: clean(v) for k, v in value.items()}
+        if isinstance(value, list | tuple):
+            return [clean(v) for v in value]
+        return _numbers(value) if isinstance(value, np.ndarray | np.generic) else value
+
+    return clean(data)
+
+
+def _instruction(i: Instruction) -> dict[str, Any]:
+    record: dict[str, Any] = {"value": i.out, "op": i.op, "args": list(i.args)}
+    if i.attrs:
+        record["attrs"] = i.attrs
+    return record | {"shape": list(i.spec.shape), "dtype": i.spec.dtype, "line": i.line}
+
+
+def _from_instruction(r: Mapping[str, Any]) -> Instruction:
+    spec = Spec(tuple(r["shape"]), r["dtype"])
+    return Instruction(r["op"], tuple(r["args"]), r.get("attrs", {}), r["value"], spec, r["line"])
+
+
+def _port(r: Mapping[str, Any]) -> Port:
+    leaves = tuple(Leaf(**{**leaf, "shape": tuple(leaf["shape"])}) for leaf in r["leaves"])
+    return Port(r["name"], r["type"], r["clock"], r["present"], leaves)
+
+
+def _cell(r: Mapping[str, Any]) -> Cell:
+    return Cell(**{**r, "shape": tuple(r["shape"]), "reset": _array(r["reset"], r["shape"], r["dtype"])})

@@ -1,0 +1,88 @@
+"""The reference interpreter: plays a pipeline's instructions in NumPy, one after the other.
+
+It is the definition that every backend is tested against. A singular factorization gives NaN, as in a
+compiled backend, and never an exception.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flowgraph.ops import OPS, bound_attrs
+from flowgraph.pipeline import Pipeline
+from flowgraph.program import Program, specialise
+
+
+class _LinearAlgebra:
+    """`numpy.linalg`, with NaN in place of an exception."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        function = getattr(np.linalg, name)
+
+        def total(*args: Any, **attrs: Any) -> Any:
+            try:
+                return function(*args, **attrs)
+            except np.linalg.LinAlgError:
+                return np.full_like(args[-1], np.nan)
+
+        return total if name in ("cholesky", "solve") else function  # type: ignore[no-any-return]
+
+
+class _Numpy:
+    linalg = _LinearAlgebra()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+
+NUMPY = _Numpy()
+
+
+class Player:
+    """Plays ticks of one pipeline, keeping its registers.
+
+    Args:
+        pipeline: what to play.
+        cells: the value of each register cell, in order.
+        dtype: what `real` is.
+    """
+
+    def __init__(self, pipeline: Pipeline, cells: list[Any], dtype: Any) -> None:
+        self.pipeline, self.cells, self.dtype = pipeline, cells, dtype
+        self._reads = [c.read for r in pipeline.registers for c in r.cells]
+        self._leaves = [[leaf.value for leaf in port.leaves] for port in pipeline.inputs]
+        self._programs: dict[int, tuple[Program, list[Any]]] = {}
+
+    def tick(self, time: int, key: int, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...] | None]:
+        """One tick: `values` are the leaves of the present inputs; returns the leaves of each output, or None."""
+        if key not in self._programs:
+            program = specialise(self.pipeline, key)
+            self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions]
+        program, steps = self._programs[key]
+        env: dict[int, Any] = {n: _as(a, self.dtype) for n, a in program.constants.items()}
+        env[self.pipeline.time] = np.int64(time)
+        env.update(zip(self._reads, self.cells, strict=True))
+        present = iter(values)
+        for k, numbers in enumerate(self._leaves):
+            if key >> k & 1:
+                env.update(zip(numbers, next(present), strict=True))
+        for run, args, out in steps:
+            env[out] = run(*[env[a] for a in args])
+        self.cells = [env[n] for n in program.writes]
+        return [
+            None if flag is None or not env.get(flag, True) else tuple(env[n] for n in leaves)
+            for flag, leaves in program.outputs
+        ]
+
+
+def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:
+    return partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
+
+
+def _as(array: Any, real: Any) -> Any:
+    found = np.asarray(array)
+    return found.astype(real) if found.dtype.kind == "f" else found

@@ -1,0 +1,123 @@
+"""Finding graphs and flights by name, through entry points: the engine imports none of them itself.
+
+A package offers a graph under the entry point group `flowgraph.graphs` (a `@graph` function with
+`on_flight`), and a source of flights under `flowgraph.flights` (a function `load(argument, *, seed,
+settings)`). Ours are found the same way as a user's.
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
+
+from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.graph import Graph
+from flowgraph.inputs import Inputs
+from flowgraph.result import Result
+from flowgraph.series import Flight
+
+if typing.TYPE_CHECKING:
+    from flowgraph.declare import GraphFunction
+
+
+@dataclass(frozen=True)
+class Case:
+    """A graph made ready for one flight.
+
+    Args:
+        graph: built, with the start and the noise for this flight.
+        inputs: the flight's streams by source name.
+        score: `result -> {metric: value}`, against the flight's truth.
+    """
+
+    graph: Graph
+    inputs: Inputs
+    score: Callable[[Result], dict[str, float]]
+
+
+def graph_names() -> list[str]:
+    """The names of all installed graphs."""
+    return sorted(e.name for e in entry_points(group="flowgraph.graphs"))
+
+
+def flight_names() -> list[str]:
+    """The kinds of flight that can be loaded."""
+    return sorted(e.name for e in entry_points(group="flowgraph.flights"))
+
+
+def find_graph(name: str) -> GraphFunction:
+    """The installed graph of that name.
+
+    Raises:
+        UnknownNameError: listing the names that exist.
+    """
+    found: GraphFunction = _find("flowgraph.graphs", "graph", name, graph_names())
+    return found
+
+
+def _find(group: str, kind: str, name: str, valid: list[str]) -> Any:
+    for entry in entry_points(group=group):
+        if entry.name == name:
+            return entry.load()
+    raise UnknownNameError(kind, name, valid)
+
+
+def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
+    """Load the flight that a text such as "sim" or "euroc:PATH" names.
+
+    Raises:
+        UnknownNameError: for a kind that is not installed; DataError: from the loader.
+    """
+    kind, _, argument = spec.partition(":")
+    load: Callable[..., Flight] = _find("flowgraph.flights", "kind of flight", kind, flight_names())
+    return load(argument, seed=seed, settings=dict(settings or {}))
+
+
+def flight_settings(spec: str) -> list[str]:
+    """The settings that the loader of a kind of flight understands."""
+    load = _find("flowgraph.flights", "kind of flight", spec.partition(":")[0], flight_names())
+    module = inspect.getmodule(load)
+    return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
+
+
+def parsed_settings(
+    function: Callable[..., Any], given: Mapping[str, str], *, also: list[str], path: str
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Split `--set` texts into keyword arguments of `function`, as its annotations say, and those of `also`.
+
+    Raises:
+        UnknownNameError: for a key that is in neither; DeclarationError: for a text that is no such value.
+    """
+    hints = typing.get_type_hints(function)
+    own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    mine: dict[str, Any] = {}
+    rest: dict[str, str] = {}
+    for key, text in given.items():
+        if key in also:
+            rest[key] = text
+        elif key in own:
+            mine[key] = _parse(text, hints.get(key, str), f"{path}.{key}")
+        else:
+            raise UnknownNameError("setting", key, [*own, *also], path=path)
+    return mine, rest
+
+
+def _parse(text: str, annotation: Any, path: str) -> Any:
+    kinds = [k for k in (typing.get_args(annotation) or (annotation,)) if k is not type(None)]
+    if text.lower() == "none" and type(None) in typing.get_args(annotation):
+        return None
+    words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+    try:
+        return words[text.lower()] if kinds[0] is bool else kinds[0](text)
+    except (KeyError, TypeError, ValueError):
+        raise DeclarationError(
+            "this setting cannot be read",
+            path=path,
+            expected=" or ".join(k.__name__ for k in kinds),
+            got=repr(text),
+            fix=f"write --set {path.rsplit('.', 1)[-1]}=VALUE",
+        ) from None

@@ -1,0 +1,196 @@
+"""A recorded signal: integer times and one array a field, and the flights made of them.
+
+`Series` is the one form of recorded data: what a dataset loader returns, what a run consumes and what a
+run gives back. Signals are batch-first: each leaf has the time axis in front.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.types import (
+    DTYPES,
+    ArrayType,
+    Signal,
+    StructType,
+    Type,
+    flatten,
+    leaves_of,
+    struct_type,
+    type_of,
+    unflatten,
+)
+
+
+class Series:
+    """`n` values of one signal with their times.
+
+    Args:
+        time: (n,) int64 nanoseconds, increasing.
+        values: a `Signal`, tuple or array whose leaves have a leading axis of length n.
+        type: the type of one value; found from `values` where it is left out.
+        name: what to call it in messages.
+
+    A leaf is an attribute (`series.position`) or an item (`series["pose.position"]`).
+
+    Raises:
+        DataError: when lengths differ.
+    """
+
+    def __init__(
+        self, time: npt.ArrayLike, values: Any, *, type: Type | None = None, name: str = "series"
+    ) -> None:
+        stamps = np.asarray(time)
+        if stamps.dtype.kind not in "iu":
+            raise DataError(
+                "times must be integer nanoseconds",
+                path=name,
+                expected="an int64 array",
+                got=f"dtype {stamps.dtype}",
+                fix="round float seconds once, at the source: Series.from_seconds(seconds, values)",
+            )
+        self.time = stamps.astype(np.int64)
+        self.name = name
+        self.type = type if type is not None else _one_of(values)
+        self._leaves: list[np.ndarray] = []
+        for leaf, (leaf_name, leaf_type) in zip(
+            flatten(values, self.type), leaves_of(self.type), strict=True
+        ):
+            array = np.asarray(leaf, dtype=DTYPES[leaf_type.dtype])
+            if array.shape != (len(self.time), *leaf_type.shape):
+                raise DataError(
+                    f"field {leaf_name!r} does not have one value a time stamp",
+                    path=name,
+                    expected=f"shape {(len(self.time), *leaf_type.shape)}",
+                    got=f"shape {array.shape}",
+                    fix="give every field a leading axis of the same length as time",
+                )
+            self._leaves.append(array)
+
+    @classmethod
+    def from_seconds(cls, seconds: npt.ArrayLike, values: Any, **more: Any) -> Series:
+        """A series from float seconds, each rounded once to the nearest nanosecond."""
+        return cls(np.rint(np.asarray(seconds, dtype=np.float64) * 1e9).astype(np.int64), values, **more)
+
+    @property
+    def leaves(self) -> dict[str, np.ndarray]:
+        """The leaf arrays by dotted name, in declaration order; a lone leaf is called "value"."""
+        return {name: a for (name, _), a in zip(leaves_of(self.type), self._leaves, strict=True)}
+
+    @property
+    def values(self) -> Any:
+        """All values at once: one signal with a leading time axis on each field."""
+        return unflatten(self.type, iter(self._leaves))
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(n,) times in seconds since the first."""
+        return (self.time - self.time[0]) * 1e-9 if len(self.time) else np.zeros(0)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __getitem__(self, key: Any) -> Any:
+        """A leaf or inner struct by dotted name, one value by index, or a part by slice or mask."""
+        if isinstance(key, str):
+            part: Any = self.values
+            type_: Type = self.type
+            if isinstance(type_, ArrayType) and key == "value":
+                return part
+            for name in key.split("."):
+                names = [n for n, _ in type_.fields] if isinstance(type_, StructType) else []
+                if name not in names:
+                    raise UnknownNameError("field", key, self.leaves, path=self.name)
+                index = names.index(name)
+                part = (
+                    part[index]
+                    if isinstance(part, tuple)
+                    else part[name]
+                    if isinstance(part, dict)
+                    else getattr(part, name)
+                )
+                type_ = type_.fields[index][1] if isinstance(type_, StructType) else type_
+            return part
+        picked = [leaf[key] for leaf in self._leaves]
+        if np.ndim(self.time[key]) == 0:
+            return unflatten(self.type, iter(picked))
+        return Series(self.time[key], unflatten(self.type, iter(picked)), type=self.type, name=self.name)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except UnknownNameError as error:
+            raise AttributeError(str(error)) from None
+
+    def __iter__(self) -> Iterator[Any]:
+        """One value after the other, as a block sees them."""
+        if (
+            isinstance(self.type, StructType)
+            and issubclass(self.type.cls, Signal)
+            and not any(isinstance(t, StructType) for _, t in self.type.fields)
+        ):
+            return map(self.type.cls, *self._leaves)  # the common case, at the speed of map
+        if isinstance(self.type, ArrayType):
+            return iter(self._leaves[0])
+        return (unflatten(self.type, iter(row)) for row in zip(*self._leaves, strict=True))
+
+    def __repr__(self) -> str:
+        span = f"{(self.time[-1] - self.time[0]) * 1e-9:.3f} s" if len(self) else "empty"
+        return f"<Series {self.name}: {len(self)} x {self.type}, {span}>"
+
+
+def _one_of(values: Any) -> Type:
+    """The type of one value, given values with a leading axis."""
+    if isinstance(values, Signal):
+        declared = struct_type(type(values))
+        parts = tuple(
+            (
+                n,
+                _one_of(getattr(values, n))
+                if isinstance(t, StructType)
+                else _drop_axis(t, getattr(values, n)),
+            )
+            for n, t in declared.fields
+        )
+        return StructType(declared.name, parts, declared.cls)
+    if isinstance(values, tuple):
+        return StructType("tuple", tuple((str(i), _one_of(v)) for i, v in enumerate(values)), tuple)
+    return _drop_axis(None, values)
+
+
+def _drop_axis(declared: ArrayType | None, values: Any) -> ArrayType:
+    array = np.asarray(values)
+    if array.dtype.kind in "iu" and declared is not None and declared.dtype == "real":
+        array = array.astype(np.float64)
+    batch = type_of(array)
+    assert isinstance(batch, ArrayType)
+    if declared is not None:
+        return ArrayType(batch.shape[1:], declared.dtype, declared.unit, declared.frame)
+    return ArrayType(batch.shape[1:], batch.dtype)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A recording: named streams, the truth where it is known, and what else its source says.
+
+    Args:
+        name: what to call it.
+        streams: a `Series` for each sensor.
+        truth: a `Series` with at least `position` and `attitude`, or None.
+        info: calibration and noise, by name.
+        notes: what was dropped, shifted or assumed when it was read, a sentence each.
+    """
+
+    name: str
+    streams: Mapping[str, Series]
+    truth: Series | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,54 @@
+"""Run a graph over recorded events, in the engine of your choice: the answer is the same in each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from flowgraph.errors import UnknownNameError
+from flowgraph.graph import Graph
+from flowgraph.inputs import Inputs
+from flowgraph.result import Result
+from flowgraph.run import Meter, Run
+
+ENGINES = ("python", "reference", "xla")
+
+
+def simulate(
+    graph: Graph,
+    inputs: Inputs,
+    *,
+    engine: str = "python",
+    dtype: str = "float64",
+    init: Mapping[str, Any] | None = None,
+    state: Mapping[str, Any] | None = None,
+    progress: Meter | None = None,
+) -> Result:
+    """Run a graph over its inputs to their end.
+
+    Args:
+        graph: a built graph.
+        inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of `(time, value)`.
+        engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy)
+            or "xla" (the same instructions in one compiled scan; needs JAX).
+        dtype: what `real` is, "float64" or "float32"; the Python engine has float64 only.
+        init: other initial values, by register path.
+        state: a `run.state` or `result.state` to go on from.
+        progress: an object that is told how far the run is.
+
+    Raises:
+        UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
+        FifoOverflowError: where a queue of a join overflows.
+        MissingDependencyError: for "xla" without JAX.
+    """
+    if engine not in ENGINES:
+        raise UnknownNameError("engine", engine, ENGINES)
+    if dtype not in ("float64", "float32"):
+        raise UnknownNameError("dtype", dtype, ("float64", "float32"))
+    if engine == "python":
+        if dtype != "float64":
+            raise UnknownNameError("dtype of the Python engine", dtype, ["float64"])
+        return Run(graph, inputs, init=init, state=state).to_end(progress).result()
+    from flowgraph.playback import play
+
+    return play(graph, inputs, engine=engine, dtype=dtype, init=init, state=state, progress=progress)

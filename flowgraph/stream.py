@@ -1,0 +1,153 @@
+"""Streams and held values: what a graph function handles while a graph is declared.
+
+A `Stream` stands for values that will flow, present at the ticks of its clock; a `Held` for a register read,
+which is always there and fires nothing. Neither carries a value itself.
+"""
+
+from __future__ import annotations
+
+import operator
+import typing
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from flowgraph.block import Block
+from flowgraph.clock import Clock, clock_of
+from flowgraph.errors import DeclarationError
+from flowgraph.graph import OutputPort, Wire
+from flowgraph.types import Type, annotation_type
+
+if TYPE_CHECKING:
+    from flowgraph.builder import Builder
+
+T = TypeVar("T")
+
+
+class Stream(Generic[T]):
+    """Values that flow: present, with one value, at the ticks of `clock`."""
+
+    __hash__ = object.__hash__
+
+    def __init__(self, builder: Builder, wire: Wire, port: OutputPort, label: str) -> None:
+        self.builder, self.wire, self.type, self.clock, self.label = (
+            builder,
+            wire,
+            port.type,
+            port.clock,
+            label,
+        )
+
+    def map(self, function: Callable[..., Any], *, name: str | None = None, out: Any = None) -> Stream[Any]:
+        """Apply a function to each value; `out` is the type of the result where it cannot be traced."""
+        return apply(function, self, name=name, out=out)
+
+    def filter(self, predicate: Callable[..., Any], *, name: str | None = None) -> Stream[T]:
+        """The values for which the predicate is true; the result has a clock of its own."""
+        from flowgraph.joins import filter_
+
+        return typing.cast("Stream[T]", filter_(self, predicate=predicate, name=name))
+
+    def every(self, n: int, *, phase: int = 0) -> Stream[T]:
+        """Each n-th value, starting with value number `phase`."""
+        from flowgraph.joins import every
+
+        return typing.cast("Stream[T]", every(n, self, phase=phase))
+
+    def delay(self, init: Any, *, name: str | None = None) -> Held[T]:
+        """The value of an earlier tick, held: what was last written before this tick."""
+        from flowgraph.declare import delay
+
+        register = delay(init, name=name, type=self.type)
+        register.feed(self)
+        return register
+
+    def __or__(self, other: object) -> Clock:
+        return self.clock | clock_of(other)
+
+    def __and__(self, other: object) -> Clock:
+        return self.clock & clock_of(other)
+
+    def __add__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.add, self, other)
+
+    def __sub__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.sub, self, other)
+
+    def __mul__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.mul, self, other)
+
+    def __truediv__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.truediv, self, other)
+
+    def __matmul__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.matmul, self, other)
+
+    def __neg__(self) -> Stream[Any]:
+        return apply(operator.neg, self)
+
+    def __bool__(self) -> bool:
+        raise DeclarationError(
+            "a stream has no truth value when the graph is declared",
+            path=self.label,
+            expected="a test on the values, at run time",
+            got="if, and, or, not on a stream",
+            fix="use .filter(predicate), or `is not None` for an optional source",
+        )
+
+    def __iter__(self) -> typing.NoReturn:
+        raise DeclarationError(
+            "a stream cannot be unpacked",
+            path=self.label,
+            expected="one stream",
+            got="unpacking",
+            fix="take the parts with .map(lambda v: v[0])",
+        )
+
+    def __repr__(self) -> str:
+        return f"<Stream {self.label}: {self.type} at {self.clock}>"
+
+
+class Held(Generic[T]):
+    """A value that is always there: a register read. It fires nothing."""
+
+    def __init__(self, builder: Builder, register: int, type_: Type, label: str) -> None:
+        self.builder, self.register, self.type, self.label = builder, register, type_, label
+
+    def at(self, clock: object, *, name: str | None = None) -> Stream[T]:
+        """A stream that samples this value at a clock."""
+        return typing.cast("Stream[T]", _SAMPLE(self, at=clock, name=name or "sample"))
+
+    def feed(self, stream: Stream[T]) -> None:
+        """Write `stream` into this register at the end of each tick in which it is present."""
+        self.builder.feed(self, stream)
+
+    def __repr__(self) -> str:
+        return f"<Held {self.label}: {self.type}>"
+
+
+_SAMPLE: Block[Any] = Block(lambda value: value, name="sample")
+
+
+def _operate(function: Callable[..., Any], left: Stream[Any], right: Any) -> Stream[Any]:
+    if isinstance(right, Stream | Held):
+        return apply(function, left, right)
+    return apply(lambda x: function(x, right), left, name=function.__name__)
+
+
+def apply(
+    function: Callable[..., Any],
+    *streams: Any,
+    name: str | None = None,
+    out: Any = None,
+    at: object = None,
+    **settings: Any,
+) -> Stream[Any]:
+    """A stream of `function(values...)`, present when all streams are: their clocks must be provably equal."""
+    named = getattr(function, "__name__", "map")
+    rule = None if out is None else (lambda types, settings: annotation_type(out))
+    block: Block[Any] = (
+        function
+        if isinstance(function, Block)
+        else Block(function, name="map" if named == "<lambda>" else named, output=rule)
+    )
+    return typing.cast("Stream[Any]", block(*streams, name=name, at=at, **settings))

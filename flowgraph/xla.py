@@ -1,0 +1,172 @@
+"""The XLA engine: a pipeline's instructions played in `jax.numpy` inside one compiled scan over the ticks.
+
+Few source patterns: each has its own specialised program, chosen by a switch. Many patterns, or programs so
+small that the switch would cost more than it saves: one program in which presence is data. Ticks go in
+chunks of a fixed size, so that one compilation serves recordings of any length and memory stays bounded;
+the last chunk is filled up with ticks in which nothing is present.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flowgraph.errors import MissingDependencyError
+from flowgraph.ops import OPS, bound_attrs
+from flowgraph.pipeline import Pipeline
+from flowgraph.program import Program, specialise
+
+_MOST_PATTERNS = 8
+_SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
+_CHUNK_BYTES = 64 * 2**20
+_LARGEST_CHUNK = 65536
+
+
+def import_jax() -> Any:
+    """The `jax` module.
+
+    Raises:
+        MissingDependencyError: with what to install.
+    """
+    try:
+        import jax
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the XLA engine needs JAX",
+            path='engine="xla"',
+            expected="an installed jax",
+            got=str(error),
+            fix='pip install "flowgraph-filters[xla]", or use engine="python"',
+        ) from None
+    return jax
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks."""
+
+    ticks: int
+    outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+
+
+class Scan:
+    """A compiled scan for one pipeline, dtype, set of patterns and chunk size."""
+
+    def __init__(self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int) -> None:
+        self.jax = import_jax()
+        self.pipeline, self.keys, self.dtype, self.chunk = pipeline, keys, dtype, chunk
+        shared = specialise(pipeline, None)
+        programs = [specialise(pipeline, key) for key in keys]
+        saved = shared.work - min((p.work for p in programs), default=0)
+        self.branches = None if len(keys) > _MOST_PATTERNS or saved < _SMALL_WORK else programs
+        self.shared = shared
+        with self.jax.enable_x64(True):
+            self.run = self.jax.jit(self._chunk)
+
+    def _chunk(self, cells: tuple[Any, ...], xs: Any) -> Any:
+        step = self._switched if self.branches is not None else self._flagged
+        return self.jax.lax.scan(step, cells, xs)
+
+    def _start(self, program: Program, cells: tuple[Any, ...], time: Any, inputs: Any) -> dict[int, Any]:
+        jnp = self.jax.numpy
+        env: dict[int, Any] = {n: jnp.asarray(_as(a, self.dtype)) for n, a in program.constants.items()}
+        env[self.pipeline.time] = time
+        env.update(zip((c.read for r in self.pipeline.registers for c in r.cells), cells, strict=True))
+        for port, leaves in zip(self.pipeline.inputs, inputs, strict=True):
+            env.update(zip((leaf.value for leaf in port.leaves), leaves, strict=True))
+        return env
+
+    def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
+        jnp = self.jax.numpy
+        for i in program.instructions:
+            env[i.out] = OPS[i.op].run(
+                jnp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
+            )
+        outputs = []
+        for (flag, leaves), port in zip(program.outputs, self.pipeline.outputs, strict=True):
+            if flag is None:
+                blank = tuple(jnp.zeros(x.shape, _dtype(x.dtype, self.dtype)) for x in port.leaves)
+                outputs.append((jnp.asarray(False), blank))
+            else:
+                outputs.append((jnp.asarray(env.get(flag, True)), tuple(env[n] for n in leaves)))
+        return tuple(env[n] for n in program.writes), outputs
+
+    def _switched(self, cells: tuple[Any, ...], x: Any) -> Any:
+        key, time, inputs = x
+        assert self.branches is not None
+
+        def branch(program: Program) -> Callable[..., Any]:
+            return lambda cells, time, inputs: self._play(program, self._start(program, cells, time, inputs))
+
+        nothing = specialise(self.pipeline, 0)
+        return self.jax.lax.switch(key, [branch(p) for p in [*self.branches, nothing]], cells, time, inputs)
+
+    def _flagged(self, cells: tuple[Any, ...], x: Any) -> Any:
+        key, time, inputs = x
+        env = self._start(self.shared, cells, time, inputs)
+        for k, port in enumerate(self.pipeline.inputs):
+            env[port.present] = (key >> k) & 1 == 1
+        return self._play(self.shared, env)
+
+    def __call__(
+        self, cells: list[Any], time: np.ndarray, key: np.ndarray, inputs: list[list[np.ndarray]]
+    ) -> Iterator[tuple[Chunk, list[Any]]]:
+        """Play all ticks; yields each chunk of outputs with the register cells after it.
+
+        Args:
+            cells: register cells before the first tick.
+            time, key: (T,) int64.
+            inputs: for each input port its leaves, dense: (T, ...), zero where absent.
+        """
+        place = {k: i for i, k in enumerate(self.keys)}
+        choice = (
+            key
+            if self.branches is None
+            else np.array([place[int(k)] for k in self.keys], np.int64)[np.searchsorted(self.keys, key)]
+        )
+        idle = 0 if self.branches is None else len(self.keys)
+        now: Any = tuple(_as(c, self.dtype) for c in cells)
+        for start in range(0, len(time), self.chunk):
+            here = slice(start, min(start + self.chunk, len(time)))
+            count = here.stop - here.start
+            xs = (
+                _padded(choice[here], self.chunk, idle).astype(np.int32),
+                _padded(time[here], self.chunk, int(time[here.stop - 1])),
+                tuple(tuple(_padded(leaf[here], self.chunk, 0) for leaf in leaves) for leaves in inputs),
+            )
+            with self.jax.enable_x64(True):
+                now, ys = self.run(now, xs)
+                outputs = [
+                    (np.asarray(mask)[:count], [np.asarray(leaf)[:count] for leaf in leaves])
+                    for mask, leaves in ys
+                ]
+            yield Chunk(count, outputs), [np.asarray(c) for c in now]
+
+
+def chunk_size(pipeline: Pipeline, ticks: int) -> int:
+    """A power of two that holds all ticks, or as many as keep the outputs of a chunk in bounds."""
+    per_tick = sum(
+        math.prod(leaf.shape) * 8 for port in (*pipeline.outputs, *pipeline.inputs) for leaf in port.leaves
+    )
+    most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(per_tick, 1)))
+    return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
+
+
+def _padded(array: np.ndarray, size: int, fill: int) -> np.ndarray:
+    if len(array) == size:
+        return array
+    tail = np.full((size - len(array), *array.shape[1:]), fill, array.dtype)
+    return np.concatenate([array, tail])
+
+
+def _dtype(kind: str, real: Any) -> Any:
+    return real if kind == "real" else kind
+
+
+def _as(array: Any, real: Any) -> Any:
+    found = np.asarray(array)
+    return found.astype(real) if found.dtype.kind == "f" else found
