@@ -1,0 +1,11 @@
+"""Flights: where recorded and simulated data come from.
+
+Each module has one entry point, `load(argument, *, seed=0, settings={}) -> Flight`; `simulated` makes a
+quadrotor flight, `euroc` reads a folder of the EuRoC MAV dataset.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.flights import euroc, simulated
+
+__all__ = ["euroc", "simulated"]

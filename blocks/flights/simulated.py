@@ -1,0 +1,226 @@
+"""A simulated quadrotor flight: 1 s at rest, then a smooth figure in space, with an IMU and a motion capture.
+
+Position and yaw are sums of sinusoids of a phase that starts slowly, so every derivative is exact. Thrust
+must carry gravity and the acceleration, which fixes the body's z axis; with the yaw that fixes the attitude,
+and the jerk fixes the body rate (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control
+for quadrotors", ICRA 2011, eqs. 5-9 and sec. III).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flowgraph import Flight, Series
+from flowgraph.blocks.geometry import from_rotation_vector, multiply
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.signals import Imu, NavigationState, Pose
+from flowgraph.errors import DataError, UnknownNameError
+
+__all__ = ["DEFAULTS", "load", "trajectory"]
+
+DEFAULTS: Mapping[str, float] = {
+    "duration": 20.0,
+    "imu.rate": 200.0,
+    "vicon.rate": 4.0,
+    "gyro.noise": 1e-3,
+    "accelerometer.noise": 1e-2,
+    "gyro.walk": 2e-5,
+    "accelerometer.walk": 3e-4,
+    "gyro.bias": 0.01,
+    "accelerometer.bias": 0.1,
+    "position.noise": 0.01,
+    "attitude.noise": 0.01,
+}
+"""Settings: seconds, Hz, continuous densities, standard deviations of the constant biases, and of the motion
+capture in m and rad."""
+
+_AT_REST, _RAMP = 1.0, 2.0  # seconds
+
+
+def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
+    """Make a flight with the streams `imu` (`Imu`) and `vicon` (`Pose`).
+
+    Args:
+        argument: "" or "quadrotor", the one shape there is.
+        seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
+            change of one setting does not change the draws of another.
+        settings: any of `DEFAULTS`.
+
+    Returns:
+        A `Flight`: truth is a `NavigationState` at the IMU's times; info has `imu_noise` (`ImuNoise`),
+        `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and `vicon_period_ns`.
+
+    Raises:
+        UnknownNameError: for another shape or an unknown setting.
+        DataError: for a setting that is not a number in its range.
+    """
+    if argument not in ("", "quadrotor"):
+        raise UnknownNameError("simulated flight", argument, ["quadrotor"], path="sim")
+    s = _settings(settings or {})
+    imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
+    end = round(s["duration"] * 1e9)
+    time = np.arange(0, end + 1, imu_period, dtype=np.int64)
+    draw = lambda name, *shape: _generator(seed, name).standard_normal(shape)
+
+    motion = trajectory(time * 1e-9, seed=seed)
+    n, rate = len(time), 1e9 / imu_period
+    biases = {}
+    for sensor in ("gyro", "accelerometer"):
+        start = draw(f"{sensor}.bias", 3) * s[f"{sensor}.bias"]
+        steps = draw(f"{sensor}.walk", n - 1, 3) * s[f"{sensor}.walk"] / math.sqrt(rate)
+        biases[sensor] = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    white = {name: draw(f"{name}.noise", n, 3) * s[f"{name}.noise"] * math.sqrt(rate) for name in biases}
+    imu = Imu(
+        gyro=motion["rate"] + biases["gyro"] + white["gyro"],
+        specific_force=motion["force"] + biases["accelerometer"] + white["accelerometer"],
+    )
+
+    seen = np.arange(0, end + 1, vicon_period, dtype=np.int64)
+    there = trajectory(seen * 1e-9, seed=seed)
+    turn = from_rotation_vector(draw("vicon.attitude", len(seen), 3) * s["attitude.noise"], xp=np)
+    vicon = Pose(
+        position=there["position"] + draw("vicon.position", len(seen), 3) * s["position.noise"],
+        attitude=multiply(there["attitude"], turn, xp=np),
+    )
+    truth = NavigationState(
+        position=motion["position"],
+        velocity=motion["velocity"],
+        attitude=motion["attitude"],
+        gyro_bias=biases["gyro"],
+        accelerometer_bias=biases["accelerometer"],
+    )
+    return Flight(
+        name=f"sim-{seed}",
+        streams={"imu": Series(time, imu, name="imu"), "vicon": Series(seen, vicon, name="vicon")},
+        truth=Series(time, truth, name="truth"),
+        info={
+            "imu_noise": ImuNoise(
+                s["gyro.noise"], s["accelerometer.noise"], s["gyro.walk"], s["accelerometer.walk"]
+            ),
+            "position_noise": s["position.noise"],
+            "attitude_noise": s["attitude.noise"],
+            "imu_period_ns": imu_period,
+            "vicon_period_ns": vicon_period,
+        },
+        notes=(f"simulated with seed {seed}: 1 s at rest, then a smooth figure",),
+    )
+
+
+def trajectory(seconds: np.ndarray, *, seed: int = 0) -> dict[str, np.ndarray]:
+    """The exact motion at times (n,) in s: arrays (n, 3), the attitude (n, 4).
+
+    Returns:
+        position, velocity (m, m/s, world); attitude (body to world); rate (rad/s) and force (specific force,
+        m/s^2), both in the body.
+    """
+    random = _generator(seed, "figure")
+    frequencies = np.array([0.75, 1.5, 2.2]) * random.uniform(0.85, 1.15, (3, 3))
+    sizes = np.array([[1.6], [1.6], [0.6]]) * np.array([1.0, 0.5, 0.25]) * random.uniform(0.7, 1.3, (3, 3))
+    phases = random.uniform(0.0, 2.0 * np.pi, (3, 3))
+    yaw_wave = (np.array([0.9, 0.3]), np.array([0.35, 0.9]), random.uniform(0.0, 2.0 * np.pi, 2))
+
+    t = np.asarray(seconds, dtype=float)
+    clock = _phase(t)
+    axes = [_through(_waves(clock[0], sizes[i], frequencies[i], phases[i]), clock) for i in range(3)]
+    position, velocity, acceleration, jerk = (np.stack([axis[k] for axis in axes], axis=-1) for k in range(4))
+    yaw, yaw_rate = _through(_waves(clock[0], *yaw_wave), clock)[:2]
+
+    thrust = acceleration - np.array(GRAVITY)
+    strength = np.linalg.norm(thrust, axis=-1, keepdims=True)
+    z = thrust / strength
+    dz = (jerk - z * _dot(z, jerk)) / strength
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=-1)
+    turning = np.stack([-np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=-1) * yaw_rate[:, None]
+    side = np.cross(z, ahead)
+    width = np.linalg.norm(side, axis=-1, keepdims=True)
+    y = side / width
+    d_side = np.cross(dz, ahead) + np.cross(z, turning)
+    dy = (d_side - y * _dot(y, d_side)) / width
+    x = np.cross(y, z)
+    dx = np.cross(dy, z) + np.cross(y, dz)
+    rate = np.concatenate([_dot(z, dy), _dot(x, dz), _dot(y, dx)], axis=-1)  # R^T dR/dt = skew(rate)
+    return {
+        "position": position,
+        "velocity": velocity,
+        "attitude": _quaternion(np.stack([x, y, z], axis=-1)),
+        "rate": rate,
+        "force": np.concatenate([_dot(x, thrust), _dot(y, thrust), _dot(z, thrust)], axis=-1),
+    }
+
+
+def _phase(t: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A time that stands still for `_AT_REST`, then speeds up to 1 over `_RAMP`; with three derivatives."""
+    u = np.clip((t - _AT_REST) / _RAMP, 0.0, 1.0)
+    after = np.maximum(t - _AT_REST - _RAMP, 0.0)
+    value = _RAMP * (2.5 * u**4 - 3.0 * u**5 + u**6) + after
+    first = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+    second = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / _RAMP
+    third = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / _RAMP**2
+    return value, first, second, third
+
+
+def _waves(
+    phase: np.ndarray, sizes: np.ndarray, frequencies: np.ndarray, phases: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A sum of sinusoids that starts at 0, and three derivatives with respect to `phase`, (n,) each."""
+    angle = frequencies * phase[:, None] + phases
+    sine, cosine = sizes * np.sin(angle), sizes * np.cos(angle)
+    return (
+        (sine - sizes * np.sin(phases)).sum(-1),
+        (cosine * frequencies).sum(-1),
+        (-sine * frequencies**2).sum(-1),
+        (-cosine * frequencies**3).sum(-1),
+    )
+
+
+def _through(f: tuple[np.ndarray, ...], s: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """The chain rule: f and its derivatives in time, given those of f in s and of s in time."""
+    return (
+        f[0],
+        f[1] * s[1],
+        f[2] * s[1] ** 2 + f[1] * s[2],
+        f[3] * s[1] ** 3 + 3.0 * f[2] * s[1] * s[2] + f[1] * s[3],
+    )
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray((a * b).sum(-1, keepdims=True))
+
+
+def _quaternion(R: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4) of rotation matrices (n, 3, 3), each with the sign nearest to the one before it."""
+    q = Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
+    flips = np.sign(np.einsum("ni,ni->n", q[1:], q[:-1]))
+    signs = np.cumprod(np.concatenate([[math.copysign(1.0, q[0, 0])], flips]))
+    return np.asarray(q * signs[:, None])
+
+
+def _generator(seed: int, name: str) -> np.random.Generator:
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())])))
+
+
+def _settings(given: Mapping[str, str | float]) -> dict[str, float]:
+    known = dict(DEFAULTS)
+    for name, text in given.items():
+        if name not in known:
+            raise UnknownNameError("setting", name, known, path="sim")
+        positive = name in ("duration", "imu.rate", "vicon.rate")
+        try:
+            number = float(text)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number) or number < 0.0 or (positive and number == 0.0):
+            raise DataError(
+                f"setting {name!r} is not usable",
+                path="sim",
+                expected="a positive number" if positive else "a number that is not negative",
+                got=repr(text),
+                fix=f"for example {name}={DEFAULTS[name]:g}",
+            )
+        known[name] = number
+    return known
