@@ -1,4 +1,4 @@
-"""Aiding: correct an inertial belief with positions, attitudes and poses, where there are any.
+"""Aiding: correct an inertial belief with positions and attitudes, where there are any.
 
 Each block takes a prior and an optional measurement. Without one the prior passes through and there is no
 innovation. With one, the error state is estimated by a Kalman update in Joseph form, folded into the nominal
@@ -23,9 +23,9 @@ from flowgraph.blocks.geometry import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.signals import Attitude, Belief, Innovation, Pose, PoseInnovation, Position
+from flowgraph.blocks.signals import Attitude, Belief, Innovation, Position
 
-__all__ = ["aid_attitude", "aid_pose", "aid_position"]
+__all__ = ["aid_attitude", "aid_position"]
 
 Spread = float | tuple[float, float, float]
 """A standard deviation: one number for three axes, or one each."""
@@ -80,7 +80,7 @@ def aid_position(
     residual = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    posterior, S, nis = _correct(prior, residual, H, _variance((noise,), kind, xp), gate, xp)
+    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
     return posterior, Innovation(residual=residual, covariance=S, nis=nis)
 
 
@@ -114,56 +114,13 @@ def aid_attitude(
     residual = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * (residual[..., :, None] * residual[..., None, :])
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    posterior, S, nis = _correct(prior, residual, H, _variance((noise,), kind, xp), gate, xp)
+    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
     return posterior, Innovation(residual=residual, covariance=S, nis=nis)
 
 
-@block
-def aid_pose(
-    prior: Belief,
-    pose: Pose | None,
-    *,
-    position_noise: Spread,
-    attitude_noise: Spread,
-    lever: tuple[float, float, float] = ORIGIN,
-    mount: tuple[float, float, float, float] = ALIGNED,
-    gate: float | None = None,
-    xp: Any,
-) -> tuple[Belief, PoseInnovation | None]:
-    """Correct a belief with a measured pose: `aid_position` and `aid_attitude` in one update of six parts.
-
-    Args:
-        prior: the belief at the time of the measurement.
-        pose: position of the sensor (m, world) and its attitude (sensor to world); or absent.
-        position_noise: standard deviation, m.
-        attitude_noise: standard deviation about the body axes, rad.
-        lever: where the sensor is in the body, m.
-        mount: the sensor's attitude in the body, a unit quaternion.
-        gate: as in `aid_position`; for six parts 22.5 is 99.9 %.
-
-    Returns:
-        The posterior, and the innovation (m in the world, rad in the body) where there was a measurement.
-    """
-    if pose is None:
-        return prior, None
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    arm = xp.asarray(lever, dtype=kind)
-    shift = pose.position - prior.position - (R @ arm[..., None])[..., 0]
-    residual = xp.concat([shift, _attitude_residual(prior.attitude, pose.attitude, mount, xp)], axis=-1)
-    zero = 0.0 * R
-    one = zero + xp.eye(3, dtype=kind)
-    place = xp.concat([one, zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    turn = xp.concat([zero, zero, one, zero, zero], axis=-1)
-    H = xp.concat([place, turn], axis=-2)
-    variance = _variance((position_noise, attitude_noise), kind, xp)
-    posterior, S, nis = _correct(prior, residual, H, variance, gate, xp)
-    return posterior, PoseInnovation(residual=residual, covariance=S, nis=nis)
-
-
-def _variance(noise: tuple[Spread, ...], kind: Any, xp: Any) -> Array:
-    spread = [s for part in noise for s in (part if isinstance(part, tuple) else (part,) * 3)]
-    return xp.eye(len(spread), dtype=kind) * xp.asarray([s * s for s in spread], dtype=kind)
+def _variance(noise: Spread, kind: Any, xp: Any) -> Array:
+    spread = noise if isinstance(noise, tuple) else (noise,) * 3
+    return xp.eye(3, dtype=kind) * xp.asarray([s * s for s in spread], dtype=kind)
 
 
 def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) -> Array:

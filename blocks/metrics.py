@@ -39,7 +39,7 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
         settle: seconds after the estimate's first tick that are left out.
 
     Returns:
-        position_rmse_m, attitude_rmse_deg, tilt_rmse_deg, heading_rmse_deg, ticks (how many were compared);
+        position_rmse_m, attitude_rmse_deg, tilt_rmse_deg, heading_rmse_deg, compared_ticks (how many);
         with a covariance also position_3sigma and tilt_3sigma, the fraction of errors within three standard
         deviations over all axes (99.7 % when the filter is honest), and heading_3sigma.
 
@@ -65,7 +65,7 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
         "attitude_rmse_deg": _rms(geodesic_angle(chosen["attitude"], attitude)),
         "tilt_rmse_deg": _rms(tilt),
         "heading_rmse_deg": _rms(heading),
-        "ticks": float(len(chosen)),
+        "compared_ticks": float(len(chosen)),
     }
     if "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9:
         P = chosen["covariance"]

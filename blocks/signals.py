@@ -24,7 +24,6 @@ __all__ = [
     "NavigationState",
     "Belief",
     "Innovation",
-    "PoseInnovation",
 ]
 
 
@@ -118,12 +117,4 @@ class Innovation(Signal):
 
     residual: Array = real(3)
     covariance: Array = real(3, 3)
-    nis: Array = real()
-
-
-class PoseInnovation(Signal):
-    """An `Innovation` with six parts: position (m, world), then attitude (rad, body); nis is 6 on average."""
-
-    residual: Array = real(6)
-    covariance: Array = real(6, 6)
     nis: Array = real()

@@ -1,4 +1,4 @@
-"""The drawing in plain text, for a terminal, a log or a review, and the words that both drawings use.
+"""The drawing in plain text, for a terminal, a log or a review; and what all drawings share: words, arrows.
 
 What a reader wants to know of a graph is: what comes in and how often, in which order the blocks run, what
 each of them sees when it runs (a fresh value, a held one, perhaps none), and what is remembered until the
@@ -11,13 +11,17 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from flowgraph.clock import Condition, Counted, either
 from flowgraph.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.types import StructType, Type, flatten
+
+if TYPE_CHECKING:
+    import networkx
 
 WIDTH = 100
 
@@ -96,6 +100,69 @@ def block_words(call: CallNode, name: str) -> str:
     """The name of a call's block where it is not the call's own name, else nothing."""
     own = re.fullmatch(re.escape(call.block.name) + r"(_\d+)?", name)
     return "" if own else call.block.name
+
+
+class Link(NamedTuple):
+    """One arrow: from an output (or a register, where `output` is None) to a port of a node."""
+
+    tail: int
+    output: int | None
+    head: int
+    port: str
+    optional: bool
+    feedback: bool
+
+
+def links(graph: Graph) -> Iterator[Link]:
+    """All arrows between sources, blocks and the registers that are seen; a state belongs to its block."""
+    for index, node in enumerate(graph.nodes):
+        if isinstance(node, CallNode):
+            for port, argument in zip(node.block.ports, node.arguments, strict=True):
+                if argument.wire is not None:
+                    yield Link(*argument.wire, index, port.name, argument.optional, False)
+                elif argument.register is not None:
+                    yield Link(argument.register, None, index, port.name, argument.optional, False)
+        elif isinstance(node, RegisterNode) and node.feed is not None:
+            yield Link(*node.feed, index, "", False, node.role == "delay")
+
+
+def to_networkx(graph: Graph) -> networkx.MultiDiGraph:
+    """The graph for analysis by networkx.
+
+    Nodes, by path: `kind` ("source", "block", "latest", "delay" or "state"), `type` (a block's: of its
+    first output), `clock` (a block's: at which it fires) and `outputs` (names under which it is collected).
+    Edges: `type`, `clock` (None: held), `output` and `port` (names of the two ends), `optional`, and
+    `feedback`: whether it writes what is read a tick later. Without the feedback edges there is no cycle.
+    """
+    import networkx
+
+    made = networkx.MultiDiGraph(name=graph.name)
+    for index, node in enumerate(graph.nodes):
+        names = tuple(c.name for c in graph.collected if c.wire.node == index)
+        if isinstance(node, CallNode):
+            first = str(node.outputs[0].type) if node.outputs else None
+            made.add_node(node.path, kind="block", type=first, clock=str(node.firing), outputs=names)
+        elif isinstance(node, SourceNode):
+            made.add_node(node.path, kind="source", type=str(node.type), clock=str(node.clock), outputs=names)
+        elif node.role != "stamp":
+            made.add_node(node.path, kind=node.role, type=str(node.type), clock=None, outputs=())
+    for link in links(graph):
+        tail, head = graph.nodes[link.tail], graph.nodes[link.head]
+        end = graph.port(Wire(link.tail, link.output)) if link.output is not None else None
+        type_ = end.type if end is not None else tail.type if isinstance(tail, RegisterNode) else None
+        made.add_edge(
+            tail.path, head.path, type=str(type_), clock=None if end is None else str(end.clock),
+            output=end.name if end is not None else "", port=link.port, optional=link.optional,
+            feedback=link.feedback,
+        )  # fmt: skip
+    for _, call in graph.calls:
+        if call.state is not None:
+            state = graph.nodes[call.state]
+            assert isinstance(state, RegisterNode)
+            common = {"type": str(state.type), "output": "", "port": "state", "optional": False}
+            made.add_edge(state.path, call.path, clock=None, feedback=False, **common)
+            made.add_edge(call.path, state.path, clock=str(call.firing), feedback=True, **common)
+    return made
 
 
 def scope_of(graph: Graph, path: str) -> str:

@@ -128,6 +128,13 @@ def prepare(graph: Graph, inputs: Inputs) -> dict[str, Series | Iterator[tuple[i
     return found
 
 
+def event_count(inputs: Inputs) -> int | None:
+    """How many events the inputs hold, or None where an iterable does not tell."""
+    given = inputs.streams if isinstance(inputs, Flight) else inputs
+    sizes = [len(s) if isinstance(s, Series) else None for s in given.values()]
+    return None if None in sizes else sum(s for s in sizes if s is not None)
+
+
 def _typed(name: str, series: Series, wanted: Type) -> Series:
     if series.type == wanted:
         return series

@@ -234,14 +234,13 @@ class _Lowering:
             if isinstance(variant, LoweringError):
                 raise variant
         given = [self.argument(a) for a in call.arguments]  # registers that are read get their stage first
-        firing = self.when(call.firing)
+        firing, dt = self.clock(call)
         memory = self.reads[call.state] if call.state is not None else []
         options = [
             self.when(self.graph.port(a.wire).clock)
             for a in call.arguments
             if a.optional and a.wire is not None
         ]
-        dt = self.duration(call.stamp) if call.stamp is not None else None
         played = {
             c: self.inline(v, given, memory, dt) for c, v in call.variants.items() if isinstance(v, StepTrace)
         }
@@ -255,18 +254,22 @@ class _Lowering:
         if call.state is not None:
             new = self.choose(options, {c: state for c, (_, state) in played.items()})
             self.writes[call.state] = [self.select(firing, n, o) for n, o in zip(new, memory, strict=True)]
+        registers = [a.register for a in call.arguments if a.register is not None]
+        memory_of = [] if call.state is None else [self.graph.nodes[call.state].path]
+        reads = [self.graph.nodes[i].path for i in registers] + memory_of
+        self.close(call.path, call.block.name, firing, reads, memory_of)
+
+    def clock(self, call: CallNode) -> tuple[int, int | None]:
+        """When a call fires, and the seconds since it last did, in a stage of their own."""
+        firing = self.when(call.firing)
+        dt, stamp = None, []
         if call.stamp is not None:
-            self.writes[call.stamp] = [self.select(firing, self.time, self.reads[call.stamp][0])]
-        read = [a.register for a in call.arguments if a.register is not None]
-        touched = [i for i in (call.state, call.stamp) if i is not None]
-        nodes = self.graph.nodes
-        self.close(
-            call.path,
-            call.block.name,
-            firing,
-            [nodes[i].path for i in [*read, *touched]],
-            [nodes[i].path for i in touched],
-        )
+            dt = self.duration(call.stamp)
+            if call.stamp not in self.writes:
+                self.writes[call.stamp] = [self.select(firing, self.time, self.reads[call.stamp][0])]
+                stamp = [self.graph.nodes[call.stamp].path]
+        self.close(f"clock({call.firing})", "clock", self.constant(np.True_), stamp, stamp)
+        return firing, dt
 
     def argument(self, argument: Any) -> list[int]:
         if argument.wire is not None:

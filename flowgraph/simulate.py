@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flowgraph.errors import UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
 from flowgraph.inputs import Inputs
 from flowgraph.result import Result
@@ -47,7 +47,13 @@ def simulate(
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
     if engine == "python":
         if dtype != "float64":
-            raise UnknownNameError("dtype of the Python engine", dtype, ["float64"])
+            raise DeclarationError(
+                "the Python engine computes in float64",
+                path='engine="python"',
+                expected="float64",
+                got=dtype,
+                fix='use engine="reference" or "xla" for float32',
+            )
         return Run(graph, inputs, init=init, state=state).to_end(progress).result()
     from flowgraph.playback import play
 

@@ -1,0 +1,303 @@
+"""The `flowgraph` command: list, show, run and lower graphs from a terminal.
+
+Results go to standard output, as a table or with `--json` as one object; everything else goes to standard
+error. Exit status 2 means that the command was used wrongly, 1 that it failed.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError
+from flowgraph.inputs import event_count
+from flowgraph.lowering import lower as lower_graph
+from flowgraph.registry import (
+    Case,
+    find_graph,
+    flight_names,
+    flight_settings,
+    graph_names,
+    load_flight,
+    parsed_settings,
+)
+from flowgraph.result import Result
+from flowgraph.series import Flight
+from flowgraph.simulate import ENGINES, simulate
+
+app = typer.Typer(
+    help="Declare a filter once as a graph; draw it, simulate it, and lower it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+_out = Console(soft_wrap=True)
+_err = Console(stderr=True, soft_wrap=True, highlight=False)
+
+Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+Data = Annotated[str, typer.Option("--data", metavar="SPEC", help="sim, or euroc:PATH.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
+]
+Seed = Annotated[int, typer.Option(help="Seed of a simulated flight.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def main() -> None:
+    """The entry point of the `flowgraph` command."""
+    app()
+
+
+def _reports_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """Errors of this package become a message on standard error and an exit status."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **options: Any) -> None:
+        try:
+            command(*args, **options)
+        except FlowgraphError as error:
+            _err.print(f"error: {error}", markup=False)
+            raise typer.Exit(2 if isinstance(error, UnknownNameError | DeclarationError) else 1) from None
+        except BrokenPipeError:
+            raise typer.Exit(1) from None
+
+    return run
+
+
+@app.command("list")
+@_reports_errors
+def list_(as_json: AsJson = False) -> None:
+    """List the graphs, with a line each."""
+    rows = [{"graph": n, "what": _first_line(find_graph(n).__doc__ or "")} for n in graph_names()]
+    if as_json:
+        return _print_json({"rows": rows, "data": flight_names()})
+    _out.print(_table(rows))
+    _out.print(f"data: {', '.join(flight_names())}")
+
+
+@app.command()
+@_reports_errors
+def show(
+    graph: Name,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
+    ] = None,
+    data: Data = "sim",
+    settings: Settings = None,
+    seed: Seed = 0,
+) -> None:
+    """Draw a graph: in the terminal, or to a file."""
+    case, _ = _case(graph, data, settings, seed)
+    if output is None:
+        print(case.graph.text())
+        return
+    with _writing(output):
+        case.graph.draw(str(output))
+
+
+@app.command()
+@_reports_errors
+def run(
+    graph: Name,
+    data: Data,
+    engine: Annotated[str, typer.Option(help=", ".join(ENGINES))] = "python",
+    dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+    seed: Seed = 0,
+    settings: Settings = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a graph on a flight and compare it with the truth."""
+    case, flight = _case(graph, data, settings, seed)
+    for note in flight.notes:
+        _err.print(f"note: {note}", markup=False)
+    result, row = _measure(case, graph, engine, dtype, quiet=as_json)
+    report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    if out is not None:
+        _write_report(out, case, flight, result, report)
+    if as_json:
+        return _print_json(report)
+    _out.print(_runs_table([row]))
+
+
+@app.command()
+@_reports_errors
+def lower(
+    graph: Name,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="For the pipeline.")],
+    data: Data = "sim",
+    settings: Settings = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Lower a graph to a fixed-size pipeline description."""
+    case, _ = _case(graph, data, settings, seed)
+    pipeline = lower_graph(case.graph)
+    pipeline.save(output)
+    totals = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
+    if as_json:
+        return _print_json({**totals, "output": str(output)})
+    for key, value in totals.items():
+        _out.print(f"{key:<16}{value}", highlight=False)
+    _err.print(f"wrote {output / 'pipeline.json'} and {output / 'pipeline.txt'}", markup=False)
+
+
+@app.command()
+@_reports_errors
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="For diagrams and plots.")] = Path("out"),
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Run the filters on the simulated flight in both engines, and draw them."""
+    rows = []
+    for name in graph_names():
+        case, flight = _case(name, "sim", None, seed)
+        for engine in ("python", "xla"):
+            try:
+                result, row = _measure(case, name, engine, "float64", quiet=as_json)
+            except FlowgraphError as error:
+                if engine == "python":
+                    raise
+                _err.print(f"note: {error}", markup=False)
+                continue
+            rows.append(row)
+            if engine == "python":
+                _write_report(out / name, case, flight, result, row)
+    if as_json:
+        return _print_json({"rows": rows})
+    _out.print(_runs_table(rows))
+
+
+def _case(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
+    graph = find_graph(name)
+    given = dict(_pair(text) for text in settings or [])
+    if graph.prepare is None:
+        return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
+    mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
+    flight = load_flight(spec, seed=seed, settings=rest)
+    return graph.case(flight, **mine), flight
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise DeclarationError(
+            "a setting is KEY=VALUE",
+            path="--set",
+            expected="KEY=VALUE",
+            got=repr(text),
+            fix=f"write --set {key}=...",
+        )
+    return key.strip(), value.strip()
+
+
+def _measure(case: Case, name: str, engine: str, dtype: str, *, quiet: bool) -> tuple[Result, dict[str, Any]]:
+    start = perf_counter()
+    with _meter(event_count(case.inputs), name, engine, quiet) as meter:
+        result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, progress=meter)
+    total = perf_counter() - start
+    row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
+    return result, {**row, "setup_s": total - result.wall_s, **case.score(result), **result.stats}
+
+
+class _Bar:
+    def __init__(self, progress: Progress, task: Any) -> None:
+        self._progress, self._task = progress, task
+
+    def update(self, ticks: int, time: int) -> None:
+        self._progress.update(self._task, completed=ticks)
+
+
+@contextmanager
+def _meter(total: int | None, name: str, engine: str, quiet: bool) -> Iterator[_Bar | None]:
+    if quiet or not _err.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_err, transient=True) as progress:
+        yield _Bar(progress, progress.add_task(f"{name} ({engine})", total=total))
+
+
+def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
+    from flowgraph.plot import plot_navigation
+
+    out.mkdir(parents=True, exist_ok=True)
+    with _writing(out / "diagram.svg") as file:
+        case.graph.draw(str(file))
+    with _writing(out / "metrics.json") as file:
+        file.write_text(json.dumps(report, indent=1) + "\n")
+    if "belief" in result.series:
+        with _writing(out / "navigation.png") as file:
+            plot_navigation(result["belief"], flight.truth, file)
+
+
+@contextmanager
+def _writing(file: Path) -> Iterator[Path]:
+    """Say what is written, and whether something was there before."""
+    before = file.exists()
+    yield file
+    _err.print(f"{'replaced' if before else 'wrote'} {file}", markup=False)
+
+
+def _first_line(doc: str) -> str:
+    return doc.strip().partition("\n")[0].rstrip(".")
+
+
+def _print_json(value: Any) -> None:
+    json.dump(value, sys.stdout, indent=1)
+    print()
+
+
+_WORDS = {
+    "position_rmse_m": ("position RMSE [mm]", lambda v: f"{1e3 * v:.2f}"),
+    "attitude_rmse_deg": ("attitude [deg]", lambda v: f"{v:.3f}"),
+    "tilt_rmse_deg": ("tilt [deg]", lambda v: f"{v:.3f}"),
+    "heading_rmse_deg": ("heading [deg]", lambda v: f"{v:.3f}"),
+    "position_3sigma": ("position in 3 sigma", lambda v: f"{100 * v:.1f} %"),
+    "tilt_3sigma": ("tilt in 3 sigma", lambda v: f"{100 * v:.1f} %"),
+    "wall_s": ("time [s]", lambda v: f"{v:.2f}"),
+    "setup_s": ("set-up [s]", lambda v: f"{v:.2f}"),
+}
+_HIDDEN = ("graph", "engine", "compared_ticks", "heading_3sigma")
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    """A column a key, for lists."""
+    table = Table(box=None, pad_edge=False)
+    for key in dict.fromkeys(k for row in rows for k in row):
+        table.add_column(key)
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    return table
+
+
+def _runs_table(rows: list[dict[str, Any]]) -> Table:
+    """A column a run and a line a measure, so that it fits a terminal."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for row in rows:
+        table.add_column(f"{row['graph']}\n{row['engine']}", justify="right")
+    for key in dict.fromkeys(k for row in rows for k in row if k not in _HIDDEN):
+        label = _WORDS[key][0] if key in _WORDS else key
+        table.add_row(escape(label), *(_cell(key, row[key]) if key in row else "" for row in rows))
+    return table
+
+
+def _cell(key: str, value: Any) -> str:
+    if key in _WORDS and value is not None:
+        return _WORDS[key][1](value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
