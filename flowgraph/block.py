@@ -1,8 +1,8 @@
 """Blocks: immutable objects with typed ports and one pure step.
 
 A block is a plain function. Its positional parameters are ports, its keyword-only parameters settings;
-four names are handed in by the engine: `dt` (float seconds since this block last fired, 0 at first), `t`
-(the tick's time, int64 ns), `xp` (the array namespace) and `path`. A port annotated `X | None` is an
+five names are handed in by the engine: `dt` (float seconds since this block last fired, 0 at first), `t`
+(the tick's time, int64 ns), `xp` (the array namespace), `draw` (random numbers) and `path`. A port annotated `X | None` is an
 optional input. The return annotation types the outputs; an output annotated `| None` has a clock of its
 own: the step returns None, or `when(condition, value)`, where it is absent.
 
@@ -22,6 +22,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
 from flowgraph.ops import Spec
+from flowgraph.random import Site, site
 from flowgraph.symbolic import Symbolic, Trace, namespace
 from flowgraph.types import (
     ArrayType,
@@ -40,7 +41,7 @@ from flowgraph.types import (
 
 R = TypeVar("R")
 
-HANDED_IN = ("dt", "t", "xp", "path")
+HANDED_IN = ("dt", "t", "xp", "path", "draw")
 """Keyword-only parameters that the engine supplies; all others are settings."""
 
 REQUIRED: Any = inspect.Parameter.empty
@@ -85,6 +86,34 @@ class StepTrace:
     dt: int
     outputs: tuple[StepOutput, ...]
     next_state: tuple[int, ...]
+    sites: tuple[tuple[Site, int], ...] = ()
+
+
+class SymbolicDraw:
+    """`draw` while a step is recorded: each site becomes a value that comes from outside."""
+
+    def __init__(self, trace: Trace, prefix: str) -> None:
+        self._trace, self._prefix = trace, prefix
+        self.sites: dict[Site, Symbolic] = {}
+
+    def normal(self, name: str, shape: tuple[int, ...]) -> Symbolic:
+        return self._at(site(self._prefix, "normal", name, shape))
+
+    def uniform(self, name: str, shape: tuple[int, ...]) -> Symbolic:
+        return self._at(site(self._prefix, "uniform", name, shape))
+
+    def _at(self, found: Site) -> Symbolic:
+        if any(known.name == found.name and known != found for known in self.sites):
+            raise DeclarationError(
+                "a random stream is drawn in two shapes",
+                path=found.name,
+                expected="one draw a name",
+                got=f"{found.kind}{found.shape} and another",
+                fix="give each draw a name of its own",
+            )
+        if found not in self.sites:
+            self.sites[found] = self._trace.input(Spec(found.shape, "real"))
+        return self.sites[found]
 
 
 class Block(Generic[R]):
@@ -210,7 +239,7 @@ class Block(Generic[R]):
 
     @property
     def handed(self) -> frozenset[str]:
-        """Which of `dt`, `t`, `xp`, `path` the step asks for."""
+        """Which of `dt`, `t`, `xp`, `draw`, `path` the step asks for."""
         return self._signature_parts[2]
 
     @property
@@ -224,7 +253,12 @@ class Block(Generic[R]):
         return self._init(*types, **settings)
 
     def record(
-        self, types: Sequence[Type | None], settings: Mapping[str, Any], state: Type | None, path: str
+        self,
+        types: Sequence[Type | None],
+        settings: Mapping[str, Any],
+        state: Type | None,
+        path: str,
+        draws: str = "",
     ) -> StepTrace:
         """Run the step on symbolic arguments (None: absent) and return what it did.
 
@@ -247,7 +281,8 @@ class Block(Generic[R]):
         }
         values = [None if a is None else a[0] for a in args]
         memory = symbolic(state) if state is not None else None
-        handed = {"dt": dt, "t": time, "xp": namespace, "path": path}
+        draw = SymbolicDraw(trace, draws or self.name)
+        handed = {"dt": dt, "t": time, "xp": namespace, "path": path, "draw": draw}
         try:
             result = self.step(
                 *([memory[0]] if memory else []), *values, **settings, **{h: handed[h] for h in self.handed}
@@ -282,6 +317,7 @@ class Block(Generic[R]):
             dt.number,
             outputs,
             next_state,
+            tuple((known, value.number) for known, value in draw.sites.items()),
         )
 
     def _split(self, result: Any, path: str) -> tuple[Any, Any]:

@@ -42,6 +42,7 @@ class Builder:
         self._scope: tuple[str, ...] = ()
         self._taken: set[str] = set()
         self._stamps: dict[Clock, int] = {}
+        self._draws: dict[str, str] = {}
 
     def path(self, name: str, *, given: bool = False) -> str:
         """A unique path in the current scope; a name that the user gave must be free."""
@@ -108,6 +109,19 @@ class Builder:
             node = RegisterNode(f"last({firing})", "stamp", ArrayType((), "int64", "ns"), np.int64(NEVER))
             self._stamps[firing] = self.add(node)
         return self._stamps[firing]
+
+    def random_streams(self, prefix: str, path: str) -> str:
+        """Claim the names that begin with `prefix` for one node, so that no two nodes draw the same numbers."""
+        if prefix in self._draws:
+            raise DeclarationError(
+                f"the random streams {prefix!r} are taken by {self._draws[prefix]}",
+                path=path,
+                expected="one node a name, since equal names draw equal numbers",
+                got=prefix,
+                fix=f'name them: draws="{prefix}_2"',
+            )
+        self._draws[prefix] = path
+        return prefix
 
     def feed(self, held: Held[Any], stream: Stream[Any]) -> None:
         node = self.nodes[held.register]

@@ -226,7 +226,8 @@ class _Diagram:
 
     def source_node(self, node: SourceNode) -> str:
         tip = f"source {node.path}: {node.type}, {node.clock.timing}"
-        return self.node(node.path, "source", f"<b>{_escaped(node.path)}</b>", "cds", tip, margin="0.14,0.08")
+        shape = {"TB": "invhouse", "BT": "house"}.get(self.rankdir, "cds")
+        return self.node(node.path, "source", f"<b>{_escaped(node.path)}</b>", shape, tip, margin="0.14,0.08")
 
     def register_node(self, node: RegisterNode, scope: str) -> str:
         name = name_in(scope, node.path)

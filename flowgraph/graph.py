@@ -66,6 +66,7 @@ class CallNode:
         dynamic: for each output, whether its presence is known only when the step has run.
         variants: by presence of the optional inputs: the recorded step, or why it cannot be recorded.
         state: index of its state register, and `stamp` of the register of its last firing, or None.
+        draws: the first part of the names of its random streams.
     """
 
     path: str
@@ -78,6 +79,7 @@ class CallNode:
     variants: Mapping[tuple[bool, ...], StepTrace | LoweringError]
     state: int | None = None
     stamp: int | None = None
+    draws: str = ""
 
 
 @dataclass(frozen=True)

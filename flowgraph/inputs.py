@@ -88,6 +88,24 @@ class Tape:
     key: np.ndarray
     series: tuple[Series, ...]
 
+    @classmethod
+    def of(cls, series: tuple[Series, ...]) -> Tape:
+        """The ticks of series that are each in order: their times merged, equal ones made one."""
+        time = np.concatenate([np.zeros(0, np.int64), *(s.time for s in series)])
+        time.sort(kind="stable")  # merges runs that are sorted already
+        if len(time):
+            time = time[np.concatenate([[True], time[1:] != time[:-1]])]
+        key = np.zeros(len(time), np.int64)
+        for k, s in enumerate(series):
+            key[... if len(s) == len(time) else np.searchsorted(time, s.time)] |= 1 << k
+        return cls(time, key, series)
+
+    @property
+    def patterns(self) -> tuple[int, ...]:
+        """The keys that occur, in order."""
+        few = len(self.series) <= 16
+        return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
+
 
 def prepare(graph: Graph, inputs: Inputs) -> dict[str, Series | Iterator[tuple[int, Any]]]:
     """The inputs by source name, in declaration order: checked `Series`, or iterators read as they go.
@@ -212,7 +230,7 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
                 fix=f'declare what is true: {name}=periodic(..., jitter="...") or {name}=aperiodic(max_rate=...)',
             )
         if timing.phase is not None and not timing.jitter:
-            off = (time - timing.phase) % timing.period != 0
+            off = (time[:1] - timing.phase) % timing.period != 0  # the others follow it by whole periods
             if off.any():
                 row = int(np.flatnonzero(off)[0])
                 raise ClockError(
@@ -276,11 +294,7 @@ def tape(prepared: Mapping[str, Series | Iterator[tuple[int, Any]]], graph: Grap
         s if isinstance(s, Series) else read_all(name, s, graph.sources[name].type)
         for name, s in prepared.items()
     )
-    time = np.unique(np.concatenate([s.time for s in series])) if series else np.zeros(0, np.int64)
-    key = np.zeros(len(time), np.int64)
-    for k, s in enumerate(series):
-        key[np.searchsorted(time, s.time)] |= 1 << k
-    return Tape(time, key, series)
+    return Tape.of(series)
 
 
 def read_all(name: str, events: Iterable[tuple[int, Any]], type_: Type) -> Series:
@@ -327,11 +341,11 @@ def merged(
     """
     if all(isinstance(s, Series) for s in prepared.values()):
         recorded = [s for s in prepared.values() if isinstance(s, Series)]
-        time = np.unique(np.concatenate([s.time for s in recorded])) if recorded else np.zeros(0, np.int64)
-        key = np.zeros(len(time), np.int64)
-        for k, s in enumerate(recorded):
-            key[np.searchsorted(time, s.time)] |= 1 << k
-        return zip(time.tolist(), key.tolist(), strict=True), [iter(s).__next__ for s in recorded]
+        ticks_ = Tape.of(tuple(recorded))
+        return (
+            zip(ticks_.time.tolist(), ticks_.key.tolist(), strict=True),
+            [iter(s).__next__ for s in recorded],
+        )
     feeds = [zip(s.time.tolist(), s, strict=True) if isinstance(s, Series) else s for s in prepared.values()]
     waiting: list[Any] = [None] * len(feeds)
 

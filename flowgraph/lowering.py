@@ -18,8 +18,9 @@ from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
 from flowgraph.errors import LoweringError
 from flowgraph.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.ops import OPS, Spec
-from flowgraph.pipeline import Cell, Fault, Leaf, Pipeline, Port, Register, Stage
-from flowgraph.symbolic import Instruction
+from flowgraph.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
+from flowgraph.random import Site
+from flowgraph.symbolic import Instruction, Trace, namespace
 from flowgraph.types import DTYPES, Type, flatten, leaves_of
 
 
@@ -46,6 +47,8 @@ class _Lowering:
         self.pending: list[Instruction] = []
         self.place = graph.name
         self.time = self.value(Spec((), "int64"))
+        self.seed = self.value(Spec((2,), "uint32"))
+        self.sites: dict[Site, int] = {}
         self.leaves: dict[Wire, list[int]] = {}
         self.sources: dict[Clock, int] = {}
         self.flags: dict[Wire, int] = {}
@@ -91,12 +94,14 @@ class _Lowering:
             graph.name,
             graph.doc,
             self.time,
+            self.seed,
             tuple(inputs),
             tuple(outputs),
             tuple(self.registers()),
             self.constants,
             tuple(self.stages),
             tuple(self.faults()),
+            tuple(RandomSite(s.name, s.kind, s.shape, s.hash, n) for s, n in self.sites.items()),
         )
 
     # -- values --------------------------------------------------------------------------------------
@@ -241,6 +246,9 @@ class _Lowering:
             for a in call.arguments
             if a.optional and a.wire is not None
         ]
+        for variant in call.variants.values():
+            for site, _ in variant.sites if isinstance(variant, StepTrace) else ():
+                self.random(site, firing)
         played = {
             c: self.inline(v, given, memory, dt) for c, v in call.variants.items() if isinstance(v, StepTrace)
         }
@@ -271,6 +279,24 @@ class _Lowering:
         self.close(f"clock({call.firing})", "clock", self.constant(np.True_), stamp, stamp)
         return firing, dt
 
+    def random(self, site: Site, firing: int) -> None:
+        """A stage that draws a site's numbers, once for all that use them."""
+        if site in self.sites:
+            return
+        trace = Trace()
+        time, seed = trace.input(Spec((), "int64")), trace.input(Spec((2,), "uint32"))
+        drawn = trace.apply("materialise", site.numbers(time, seed, xp=namespace))
+        renamed = {time.number: self.time, seed.number: self.seed}
+        self.copy(trace, renamed)
+        self.sites[site] = renamed[drawn.number]
+        self.close(f"random({site.name})", "random", firing, (), ())
+
+    def copy(self, trace: Trace, renamed: dict[int, int]) -> None:
+        """Append a trace's instructions, under this pipeline's numbers."""
+        renamed.update({n: self.constant(a) for n, a in trace.constants.items()})
+        for i in trace.instructions:
+            renamed[i.out] = self.emit(i.op, *(renamed[a] for a in i.args), line=i.line, **i.attrs)
+
     def argument(self, argument: Any) -> list[int]:
         if argument.wire is not None:
             return self.leaves[argument.wire]
@@ -287,9 +313,8 @@ class _Lowering:
         for numbers, actual in zip(step.arguments, given, strict=True):
             if numbers is not None:
                 renamed.update(zip(numbers, actual, strict=True))
-        renamed.update({n: self.constant(a) for n, a in step.trace.constants.items()})
-        for i in step.trace.instructions:
-            renamed[i.out] = self.emit(i.op, *(renamed[a] for a in i.args), line=i.line, **i.attrs)
+        renamed.update({n: self.sites[site] for site, n in step.sites})
+        self.copy(step.trace, renamed)
         outputs = []
         for out in step.outputs:
             flag = (

@@ -43,7 +43,7 @@ class Op:
     operands: str = "as is"
 
 
-_RANK = {"bool": 0, "uint32": 1, "int32": 1, "int64": 2, "real": 3}
+_RANK = {"bool": 0, "uint32": 1, "int32": 1, "int64": 2, "uint64": 3, "real": 4}
 
 
 def promote(*dtypes: str) -> str:
@@ -215,6 +215,12 @@ def _astype(x: Spec, *, dtype: str) -> Spec:
     return Spec(x.shape, dtype)
 
 
+def _float32_bits(x: Spec) -> Spec:
+    if x.dtype != "int32":
+        raise ShapeError(f"float32_bits needs int32, not {x.dtype}")
+    return x
+
+
 def _same(x: Spec, **_: Any) -> Spec:
     return x
 
@@ -309,6 +315,8 @@ def _table() -> dict[str, Op]:
     ops["broadcast_to"] = Op("broadcast_to", _broadcast_to, _run_shape("broadcast_to"))
     ops["getitem"] = Op("getitem", _getitem, _run_getitem)
     ops["take"] = Op("take", _take, lambda xp, x, i, *, axis: xp.take(x, i, axis=axis, mode="clip"))
+    ops["float32_bits"] = Op("float32_bits", _float32_bits, _namespace("float32_bits"))
+    ops["materialise"] = Op("materialise", _same, _namespace("materialise"))
     ops["astype"] = Op("astype", _astype, _run_astype)
     return ops
 

@@ -107,6 +107,17 @@ class Fault:
     bound: int
 
 
+@dataclass(frozen=True)
+class RandomSite:
+    """Random numbers of one name: `value` is their number, `hash` the word that stands for the name."""
+
+    name: str
+    kind: str
+    shape: tuple[int, ...]
+    hash: int
+    value: int
+
+
 @dataclass(frozen=True, eq=False)
 class Pipeline:
     """A lowered graph. `run` plays it, `save` and `load` keep it.
@@ -114,18 +125,21 @@ class Pipeline:
     Args:
         name, doc: of the graph.
         time: number of the value that holds the tick's time (int64, ns).
-        inputs, outputs, registers, constants, stages, faults: see their classes.
+        seed: number of the value that holds the run's seed (two uint32 words, low first).
+        inputs, outputs, registers, constants, stages, faults, random: see their classes.
     """
 
     name: str
     doc: str
     time: int
+    seed: int
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
     registers: tuple[Register, ...]
     constants: Mapping[int, np.ndarray]
     stages: tuple[Stage, ...]
     faults: tuple[Fault, ...] = ()
+    random: tuple[RandomSite, ...] = ()
 
     @cached_property
     def instructions(self) -> tuple[Instruction, ...]:
@@ -175,7 +189,7 @@ class Pipeline:
     @cached_property
     def specs(self) -> dict[int, Spec]:
         """Shape and dtype of every value."""
-        specs = {self.time: Spec((), "int64")}
+        specs = {self.time: Spec((), "int64"), self.seed: Spec((2,), "uint32")}
         for port in self.inputs:
             specs[port.present] = Spec((), "bool")
             specs.update({leaf.value: Spec(leaf.shape, leaf.dtype) for leaf in port.leaves})
@@ -195,6 +209,7 @@ class Pipeline:
             "name": self.name,
             "doc": self.doc,
             "time": self.time,
+            "seed": self.seed,
             "inputs": [_plain(p) for p in self.inputs],
             "outputs": [_plain(p) for p in self.outputs],
             "registers": [_plain(r) for r in self.registers],
@@ -214,6 +229,7 @@ class Pipeline:
                 for s in self.stages
             ],
             "faults": [_plain(f) for f in self.faults],
+            "random": [_plain(r) for r in self.random],
             "totals": self.totals(),
             "latency": self.latency(),
         }
@@ -231,6 +247,7 @@ class Pipeline:
             name=data["name"],
             doc=data["doc"],
             time=data["time"],
+            seed=data["seed"],
             inputs=tuple(_port(p) for p in data["inputs"]),
             outputs=tuple(_port(p) for p in data["outputs"]),
             registers=tuple(
@@ -249,6 +266,7 @@ class Pipeline:
                 for s in data["stages"]
             ),
             faults=tuple(Fault(**f) for f in data["faults"]),
+            random=tuple(RandomSite(**{**r, "shape": tuple(r["shape"])}) for r in data["random"]),
         )
         pipeline._check_values(path)
         return pipeline

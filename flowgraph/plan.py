@@ -11,8 +11,10 @@ from __future__ import annotations
 import linecache
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import CodeType
+from types import CodeType, ModuleType
 from typing import Any
+
+import numpy as np
 
 from flowgraph.block import StepTrace, When
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
@@ -159,7 +161,13 @@ class _Writer:
         for handed in sorted(call.block.handed):
             inputs.append(
                 f"{handed}="
-                + {"t": "t", "xp": "xp", "path": repr(call.path), "dt": self.dt(call.stamp)}[handed]
+                + {
+                    "t": "t",
+                    "xp": "xp",
+                    "path": repr(call.path),
+                    "dt": self.dt(call.stamp),
+                    "draw": f"d{index}(t)",
+                }[handed]
             )
         target = ", ".join(outputs) or "_"
         if call.state is not None:
@@ -189,13 +197,23 @@ class _Writer:
         return f"(t - r[{stamp}]) * 1e-9 if r[{stamp}] != NEVER else 0.0"
 
 
+def _reshape(x: Any, /, shape: Any, *, copy: bool | None = None) -> Any:
+    """`numpy.reshape` without its search for a method: small arrays are reshaped often."""
+    return x.reshape(shape) if type(x) is np.ndarray and copy is None else np.reshape(x, shape, copy=copy)
+
+
+NUMPY = ModuleType("numpy")
+"""What blocks are handed as `xp`: NumPy, with the functions replaced whose Python wrappers cost more than they do."""
+NUMPY.__dict__.update(vars(np), reshape=_reshape)
+NUMPY.__dict__["linalg"] = ModuleType("numpy.linalg")
+NUMPY.linalg.__dict__.update(vars(np.linalg), vecdot=np.vecdot)
+
+
 def bindings(graph: Graph) -> dict[str, Any]:
     """The names that every reaction of a graph uses and no run changes: steps, settings, namespace."""
-    import numpy as np
-
     from flowgraph.graph import NEVER
 
-    names: dict[str, Any] = {"xp": np, "NEVER": NEVER, "presence": presence}
+    names: dict[str, Any] = {"xp": NUMPY, "NEVER": NEVER, "presence": presence}
     for index, call in graph.calls:
         names[f"f{index}"] = call.block.step
         for key, value in call.settings.items():

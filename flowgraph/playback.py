@@ -18,6 +18,7 @@ from flowgraph.graph import NEVER, Graph
 from flowgraph.inputs import Inputs, Tape, check_times, prepare, tape
 from flowgraph.lowering import lower
 from flowgraph.pipeline import Pipeline, type_of_leaves
+from flowgraph.random import seed_words
 from flowgraph.reference import Player
 from flowgraph.result import Result
 from flowgraph.run import Meter
@@ -36,18 +37,26 @@ class _Outcome:
 
 
 def play(
-    graph: Graph, inputs: Inputs, *, engine: str, dtype: str, init: Any, state: Any, progress: Meter | None
+    graph: Graph,
+    inputs: Inputs,
+    *,
+    engine: str,
+    dtype: str,
+    init: Any,
+    state: Any,
+    seed: int,
+    progress: Meter | None,
 ) -> Result:
     """Lower a graph and play it; the result has the graph's own signal types."""
     pipeline = lower(graph)
     if state is None:
         slots, last = initial_registers(graph, init), dict.fromkeys(graph.sources, NEVER)
     else:
-        slots, last = load_registers(graph, state)
+        slots, last, seed = load_registers(graph, state)
     cells = [leaf for index, node in graph.registers for leaf in flatten(slots[index], node.type)]
     events = tape(prepare(graph, inputs), graph)
     types = [graph.port(c.wire).type for c in graph.collected]
-    return _result(pipeline, events, cells, last, types, engine, dtype, progress)
+    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress)
 
 
 def run_pipeline(
@@ -58,6 +67,7 @@ def run_pipeline(
     dtype: str = "float64",
     init: Mapping[str, Any] | None = None,
     state: Mapping[str, Any] | None = None,
+    seed: int = 0,
     progress: Meter | None = None,
 ) -> Result:
     """Play a pipeline without its graph; see `Pipeline.run`."""
@@ -70,14 +80,11 @@ def run_pipeline(
         if name not in names:
             raise UnknownNameError("input", name, names, path=pipeline.name)
     series = tuple(_input(pipeline, port, inputs) for port in pipeline.inputs)
-    time = np.unique(np.concatenate([s.time for s in series])) if series else np.zeros(0, np.int64)
-    key = np.zeros(len(time), np.int64)
-    for k, s in enumerate(series):
-        key[np.searchsorted(time, s.time)] |= 1 << k
     cells = _initial_cells(pipeline, init, state)
+    seed = seed if state is None else int(state["seed"])
     last = dict.fromkeys(names, NEVER) if state is None else {n: int(state["sources"][n]) for n in names}
     types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
-    return _result(pipeline, Tape(time, key, series), cells, last, types, engine, dtype, progress)
+    return _result(pipeline, Tape.of(series), cells, last, types, engine, dtype, seed, progress)
 
 
 def _input(pipeline: Pipeline, port: Any, inputs: Mapping[str, Any]) -> Series:
@@ -145,17 +152,20 @@ def _result(
     types: list[Type],
     engine: str,
     dtype: str,
+    seed: int,
     progress: Meter | None,
 ) -> Result:
     real = np.dtype(dtype)
-    outcome = (_reference if engine == "reference" else _xla)(pipeline, events, cells, real, progress)
+    outcome = (_reference if engine == "reference" else _xla)(
+        pipeline, events, cells, real, seed_words(seed), progress
+    )
     _check_faults(pipeline, outcome.cells)
     series = {}
     for port, type_, (times, leaves) in zip(pipeline.outputs, types, outcome.outputs, strict=True):
         series[port.name] = Series(times, unflatten(type_, iter(leaves)), type=type_, name=port.name)
     for name, s in zip(last, events.series, strict=True):
         last[name] = int(s.time[-1]) if len(s) else last[name]
-    state = _state(pipeline, outcome.cells, last)
+    state = _state(pipeline, outcome.cells, last, seed)
     stats = {
         f"{f.path}.{name}": int(count)
         for f in pipeline.faults
@@ -165,7 +175,7 @@ def _result(
     return Result(pipeline.name, engine, series, state, stats, len(events.time), outcome.wall_s)
 
 
-def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int]) -> dict[str, Any]:
+def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
     values = iter(cells)
     registers: dict[str, Any] = {}
     for register in pipeline.registers:
@@ -190,13 +200,15 @@ def _check_faults(pipeline: Pipeline, cells: list[Any]) -> None:
 
 
 def _leaves(series: Series, real: Any) -> list[np.ndarray]:
-    return [a.astype(real) if a.dtype.kind == "f" else a for a in series.leaves.values()]
+    return [a.astype(real, copy=False) if a.dtype.kind == "f" else a for a in series.leaves.values()]
 
 
 def _reference(
-    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, progress: Meter | None
+    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None
 ) -> _Outcome:
-    player = Player(pipeline, [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells], real)
+    player = Player(
+        pipeline, [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells], real, seed
+    )
     rows = [_rows(_leaves(s, real)) for s in events.series]
     outputs: list[tuple[list[int], list[tuple[Any, ...]]]] = [([], []) for _ in pipeline.outputs]
     start = perf_counter()
@@ -225,11 +237,13 @@ def _rows(leaves: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
     return zip(*leaves, strict=True)
 
 
-def _xla(pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, progress: Meter | None) -> _Outcome:
+def _xla(
+    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None
+) -> _Outcome:
     from flowgraph.xla import Scan, chunk_size, import_jax
 
     import_jax()
-    keys = tuple(int(k) for k in np.unique(events.key))
+    keys = events.patterns
     chunk = chunk_size(pipeline, len(events.time))
     which = (keys, real.name, chunk)
     compiled: dict[Any, Scan] = _compiled(pipeline)
@@ -242,7 +256,7 @@ def _xla(pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, progress
     parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in pipeline.outputs]
     done = 0
     start = perf_counter()
-    for part, after in compiled[which](cells, events.time, events.key, dense):
+    for part, after in compiled[which](cells, seed, events.time, events.key, dense):
         cells = after
         times = events.time[done : done + part.ticks]
         for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
@@ -271,6 +285,8 @@ def _compiled(pipeline: Pipeline) -> dict[Any, Any]:
 
 
 def _dense(leaf: np.ndarray, at: np.ndarray) -> np.ndarray:
+    if len(leaf) == len(at):
+        return leaf
     full = np.zeros((len(at), *leaf.shape[1:]), leaf.dtype)
     full[at] = leaf
     return full

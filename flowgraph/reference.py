@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.namespaces import NumpyNamespace
 from flowgraph.ops import OPS, bound_attrs
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import Program, specialise
@@ -32,14 +33,11 @@ class _LinearAlgebra:
         return total if name in ("cholesky", "solve") else function  # type: ignore[no-any-return]
 
 
-class _Numpy:
+class _TotalNumpy(NumpyNamespace):
     linalg = _LinearAlgebra()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(np, name)
 
-
-NUMPY = _Numpy()
+TOTAL_NUMPY = _TotalNumpy()
 
 
 class Player:
@@ -49,10 +47,11 @@ class Player:
         pipeline: what to play.
         cells: the value of each register cell, in order.
         dtype: what `real` is.
+        seed: (2,) uint32.
     """
 
-    def __init__(self, pipeline: Pipeline, cells: list[Any], dtype: Any) -> None:
-        self.pipeline, self.cells, self.dtype = pipeline, cells, dtype
+    def __init__(self, pipeline: Pipeline, cells: list[Any], dtype: Any, seed: np.ndarray) -> None:
+        self.pipeline, self.cells, self.dtype, self.seed = pipeline, cells, dtype, seed
         self._reads = [c.read for r in pipeline.registers for c in r.cells]
         self._leaves = [[leaf.value for leaf in port.leaves] for port in pipeline.inputs]
         self._programs: dict[int, tuple[Program, list[Any]]] = {}
@@ -65,6 +64,7 @@ class Player:
         program, steps = self._programs[key]
         env: dict[int, Any] = {n: _as(a, self.dtype) for n, a in program.constants.items()}
         env[self.pipeline.time] = np.int64(time)
+        env[self.pipeline.seed] = self.seed
         env.update(zip(self._reads, self.cells, strict=True))
         present = iter(values)
         for k, numbers in enumerate(self._leaves):
@@ -80,7 +80,7 @@ class Player:
 
 
 def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:
-    return partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
+    return partial(OPS[i.op].run, TOTAL_NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
 
 
 def _as(array: Any, real: Any) -> Any:

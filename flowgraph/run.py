@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn, Protocol
 
@@ -15,6 +16,7 @@ from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, CallNode, Graph
 from flowgraph.inputs import Inputs, batches, check_event, merged, prepare, stack
 from flowgraph.plan import bindings, bound, plan
+from flowgraph.random import NumpyDraw, seed_words
 from flowgraph.result import Result, statistics
 from flowgraph.state import initial_registers, load_registers, state_tree
 
@@ -37,6 +39,7 @@ class Run:
         inputs: a `Flight`, or events by source name; left out for a run that is fed with `push`.
         init: other initial values, by register path.
         state: a `run.state` from which to go on; give it the inputs that come after.
+        seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
     """
 
     engine = "python"
@@ -48,12 +51,14 @@ class Run:
         *,
         init: Mapping[str, Any] | None = None,
         state: Mapping[str, Any] | None = None,
+        seed: int = 0,
     ) -> None:
         self.graph = graph
         self.ticks = 0
         self.wall_s = 0.0
         self._registers = initial_registers(graph, init)
         self._last = dict.fromkeys(graph.sources, NEVER)
+        self.seed = seed
         if state is not None:
             self.state = state
         self._values: list[list[Any]] = [[] for _ in graph.collected]
@@ -70,6 +75,11 @@ class Run:
             **bindings(graph),
             "r": self._registers,
             "overflow": self._overflow,
+            **{
+                f"d{index}": partial(NumpyDraw, call.draws, seed_words(self.seed))
+                for index, call in graph.calls
+                if "draw" in call.block.handed
+            },
             **{f"n{k}": feed for k, feed in enumerate(feeds)},
             **{f"c{k}": values.append for k, values in enumerate(self._values)},
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
@@ -168,11 +178,11 @@ class Run:
     @property
     def state(self) -> dict[str, Any]:
         """All registers by path, and the last time of each source: a tree of arrays."""
-        return state_tree(self.graph, self._registers, self._last)
+        return state_tree(self.graph, self._registers, self._last, self.seed)
 
     @state.setter
     def state(self, tree: Mapping[str, Any]) -> None:
-        self._registers[:], self._last = load_registers(self.graph, tree)
+        self._registers[:], self._last, self.seed = load_registers(self.graph, tree)
 
     @property
     def stats(self) -> dict[str, int]:

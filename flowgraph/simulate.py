@@ -22,6 +22,7 @@ def simulate(
     dtype: str = "float64",
     init: Mapping[str, Any] | None = None,
     state: Mapping[str, Any] | None = None,
+    seed: int = 0,
     progress: Meter | None = None,
 ) -> Result:
     """Run a graph over its inputs to their end.
@@ -34,6 +35,7 @@ def simulate(
         dtype: what `real` is, "float64" or "float32"; the Python engine has float64 only.
         init: other initial values, by register path.
         state: a `run.state` or `result.state` to go on from.
+        seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
         progress: an object that is told how far the run is.
 
     Raises:
@@ -54,7 +56,9 @@ def simulate(
                 got=dtype,
                 fix='use engine="reference" or "xla" for float32',
             )
-        return Run(graph, inputs, init=init, state=state).to_end(progress).result()
+        return Run(graph, inputs, init=init, state=state, seed=seed).to_end(progress).result()
     from flowgraph.playback import play
 
-    return play(graph, inputs, engine=engine, dtype=dtype, init=init, state=state, progress=progress)
+    return play(
+        graph, inputs, engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress
+    )

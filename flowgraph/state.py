@@ -42,16 +42,17 @@ def to_tree(value: Any, type_: Type) -> Any:
     }
 
 
-def state_tree(graph: Graph, registers: list[Any], last: Mapping[str, int]) -> dict[str, Any]:
-    """`{"registers": {path: arrays}, "sources": {name: last time}}`."""
+def state_tree(graph: Graph, registers: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
+    """`{"registers": {path: arrays}, "sources": {name: last time}, "seed": number}`."""
     return {
         "registers": {node.path: to_tree(registers[index], node.type) for index, node in graph.registers},
         "sources": {name: np.asarray(time, dtype=np.int64) for name, time in last.items()},
+        "seed": np.asarray(seed, dtype=np.uint64),
     }
 
 
-def load_registers(graph: Graph, tree: Mapping[str, Any]) -> tuple[list[Any], dict[str, int]]:
-    """Register slots and last times from a state tree of this graph.
+def load_registers(graph: Graph, tree: Mapping[str, Any]) -> tuple[list[Any], dict[str, int], int]:
+    """Register slots, last times and seed from a state tree of this graph.
 
     Raises:
         DataError: where the tree is of another graph.
@@ -75,13 +76,16 @@ def load_registers(graph: Graph, tree: Mapping[str, Any]) -> tuple[list[Any], di
         )
         value = unflatten(node.type, iter(np.asarray(leaf)[()] for leaf in leaves))
         slots[index] = int(value) if node.role == "stamp" else as_value(value, node.type, path=node.path)
-    return slots, {name: int(tree["sources"][name]) for name in graph.sources}
+    return slots, {name: int(tree["sources"][name]) for name in graph.sources}, int(tree.get("seed", 0))
 
 
 def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
     """Write a state tree to an .npz file, exactly."""
     flat: dict[str, np.ndarray] = {}
     for group, members in tree.items():
+        if not isinstance(members, Mapping):
+            flat[group] = np.asarray(members)
+            continue
         for path, part in members.items():
             leaves = part.items() if isinstance(part, Mapping) else [("", part)]
             flat.update({f"{group}\n{path}\n{leaf}": np.asarray(a) for leaf, a in leaves})
@@ -100,6 +104,9 @@ def load_state(file: str | Path) -> dict[str, Any]:
             flat = {name: archive[name] for name in archive.files}
         tree: dict[str, Any] = {"registers": {}, "sources": {}}
         for name, array in flat.items():
+            if name == "seed":
+                tree[name] = array
+                continue
             group, path, leaf = name.split("\n")
             if leaf:
                 tree[group].setdefault(path, {})[leaf] = array

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from flowgraph.errors import LoweringError
+from flowgraph.namespaces import NUMPY
 from flowgraph.ops import OPS, ShapeError, Spec, promote
 from flowgraph.types import DTYPES, dtype_name
 
@@ -370,7 +371,7 @@ def _recorder(name: str, plain: Any = np) -> Callable[..., Any]:
     def call(*args: Any, **attrs: Any) -> Any:
         trace = _trace_of(args)
         if trace is None:
-            return getattr(plain, name)(*args, **attrs)
+            return getattr(NUMPY if plain is np else plain, name)(*args, **attrs)
         return trace.apply(name, *args, **attrs)
 
     return call
@@ -460,7 +461,20 @@ def _trace_sum(x: Any, /) -> Any:
 
 
 _CREATION = ("zeros", "ones", "full", "eye", "arange", "linspace", "zeros_like", "ones_like")
-_CONSTANTS = ("pi", "inf", "nan", "e", "newaxis", "float64", "float32", "int32", "int64", "uint32", "bool")
+_CONSTANTS = (
+    "pi",
+    "inf",
+    "nan",
+    "e",
+    "newaxis",
+    "float64",
+    "float32",
+    "int32",
+    "int64",
+    "uint32",
+    "uint64",
+    "bool",
+)
 _COMPOSED: dict[str, Callable[..., Any]] = {
     "concat": _along("concat"),
     "stack": _along("stack"),

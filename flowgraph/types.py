@@ -25,7 +25,14 @@ from flowgraph.errors import DeclarationError, TypeMismatchError
 Array: TypeAlias = Any
 """An array of any array-API namespace: NumPy in simulation, symbolic when lowered."""
 
-DTYPES = {"real": np.float64, "bool": np.bool_, "int32": np.int32, "int64": np.int64, "uint32": np.uint32}
+DTYPES = {
+    "real": np.float64,
+    "bool": np.bool_,
+    "int32": np.int32,
+    "int64": np.int64,
+    "uint32": np.uint32,
+    "uint64": np.uint64,
+}
 
 
 @dataclass(frozen=True)
@@ -228,7 +235,7 @@ def map_leaves(type_: Type, change: typing.Callable[[ArrayType], ArrayType]) -> 
 
 
 def dtype_name(array: Any) -> str:
-    """The kind of number of an array or Python scalar: "real", "bool", "int32", "int64" or "uint32"."""
+    """The kind of number of an array or Python scalar: "real", "bool", "int32", "int64", "uint32", "uint64"."""
     kind = np.dtype(getattr(array, "dtype", None) or np.asarray(array).dtype)
     if kind.kind == "f":
         return "real"
@@ -238,7 +245,7 @@ def dtype_name(array: Any) -> str:
         return kind.name
     raise DeclarationError(
         "a signal cannot carry this kind of number",
-        expected="float, bool, int32, int64 or uint32",
+        expected="float, bool, int32, int64, uint32 or uint64",
         got=kind.name,
         fix="convert it with astype",
     )

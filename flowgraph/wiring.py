@@ -23,7 +23,7 @@ from flowgraph.types import Type, check_fits
 def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
     """Add a call of `block` to the graph under construction; returns its output stream or streams."""
     build = builder(block.name)
-    at, name = keywords.pop("at", None), keywords.pop("name", None)
+    at, name, draws = (keywords.pop(k, None) for k in ("at", "name", "draws"))
     path = build.path(name or block.name, given=name is not None)
     given = _match_ports(block, path, streams, keywords)
     settings = _match_settings(block, path, keywords)
@@ -43,11 +43,15 @@ def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) 
             "state", f"{path.rsplit('/', 1)[-1]}.state", block.initial(types, settings), None
         ).register
     state_type = None if state is None else typing.cast(RegisterNode, build.nodes[state]).type
-    variants = _variants(block, path, clocked, given, firing, settings, state_type)
+    if "draw" in block.handed:
+        draws = build.random_streams(draws or block.name, path)
+    variants = _variants(block, path, clocked, given, firing, settings, state_type, draws or "")
     outputs, dynamic = _outputs(block, path, firing, clocked, variants, types, settings)
     stamp = build.stamp(firing) if "dt" in block.handed else None
     index = build.add(
-        CallNode(path, block, arguments, settings, firing, outputs, dynamic, variants, state, stamp)
+        CallNode(
+            path, block, arguments, settings, firing, outputs, dynamic, variants, state, stamp, draws or ""
+        )
     )
     made = tuple(build.stream(Wire(index, k)) for k in range(len(outputs)))
     return made[0] if len(made) == 1 else made or None
@@ -91,7 +95,7 @@ def _match_ports(
 def _match_settings(block: Block[Any], path: str, keywords: dict[str, Any]) -> dict[str, Any]:
     for key in keywords:
         if key not in block.settings:
-            raise UnknownNameError("setting", key, [*block.settings, "at", "name"], path=path)
+            raise UnknownNameError("setting", key, [*block.settings, "at", "name", "draws"], path=path)
     settings = {k: keywords.get(k, default) for k, default in block.settings.items()}
     missing = [k for k, v in settings.items() if v is REQUIRED]
     if missing:
@@ -195,6 +199,7 @@ def _variants(
     firing: Clock,
     settings: dict[str, Any],
     state: Type | None,
+    draws: str,
 ) -> dict[tuple[bool, ...], StepTrace | LoweringError]:
     """Record the step once for each possible presence of its optional streams."""
     options = [s for p, s in clocked if p.optional]
@@ -220,7 +225,7 @@ def _variants(
             )
             continue
         try:
-            found[choice] = block.record(types, settings, state, path)
+            found[choice] = block.record(types, settings, state, path, draws)
         except LoweringError as error:
             found[choice] = error
     return found

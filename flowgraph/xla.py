@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,23 @@ def import_jax() -> Any:
     return jax
 
 
+class _JaxNamespace:
+    """`jax.numpy` with the two operations that pipelines add to it."""
+
+    def __init__(self, jax: Any) -> None:
+        self._jax = jax
+
+    def float32_bits(self, x: Any) -> Any:
+        jnp = self._jax.numpy
+        return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
+
+    def materialise(self, x: Any) -> Any:
+        return self._jax.lax.optimization_barrier(x)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jax.numpy, name)
+
+
 @dataclass(frozen=True)
 class Chunk:
     """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks."""
@@ -67,24 +85,26 @@ class Scan:
         with self.jax.enable_x64(True):
             self.run = self.jax.jit(self._chunk)
 
-    def _chunk(self, cells: tuple[Any, ...], xs: Any) -> Any:
+    def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
         step = self._switched if self.branches is not None else self._flagged
-        return self.jax.lax.scan(step, cells, xs)
+        return self.jax.lax.scan(partial(step, seed), cells, xs)
 
-    def _start(self, program: Program, cells: tuple[Any, ...], time: Any, inputs: Any) -> dict[int, Any]:
+    def _start(
+        self, program: Program, cells: tuple[Any, ...], seed: Any, time: Any, inputs: Any
+    ) -> dict[int, Any]:
         jnp = self.jax.numpy
         env: dict[int, Any] = {n: jnp.asarray(_as(a, self.dtype)) for n, a in program.constants.items()}
-        env[self.pipeline.time] = time
+        env[self.pipeline.time], env[self.pipeline.seed] = time, seed
         env.update(zip((c.read for r in self.pipeline.registers for c in r.cells), cells, strict=True))
         for port, leaves in zip(self.pipeline.inputs, inputs, strict=True):
             env.update(zip((leaf.value for leaf in port.leaves), leaves, strict=True))
         return env
 
     def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
-        jnp = self.jax.numpy
+        jnp, xp = self.jax.numpy, _JaxNamespace(self.jax)
         for i in program.instructions:
             env[i.out] = OPS[i.op].run(
-                jnp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
+                xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
             )
         outputs = []
         for (flag, leaves), port in zip(program.outputs, self.pipeline.outputs, strict=True):
@@ -95,30 +115,38 @@ class Scan:
                 outputs.append((jnp.asarray(env.get(flag, True)), tuple(env[n] for n in leaves)))
         return tuple(env[n] for n in program.writes), outputs
 
-    def _switched(self, cells: tuple[Any, ...], x: Any) -> Any:
+    def _switched(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
         key, time, inputs = x
         assert self.branches is not None
 
         def branch(program: Program) -> Callable[..., Any]:
-            return lambda cells, time, inputs: self._play(program, self._start(program, cells, time, inputs))
+            return lambda cells, time, inputs: self._play(
+                program, self._start(program, cells, seed, time, inputs)
+            )
 
         nothing = specialise(self.pipeline, 0)
         return self.jax.lax.switch(key, [branch(p) for p in [*self.branches, nothing]], cells, time, inputs)
 
-    def _flagged(self, cells: tuple[Any, ...], x: Any) -> Any:
+    def _flagged(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
         key, time, inputs = x
-        env = self._start(self.shared, cells, time, inputs)
+        env = self._start(self.shared, cells, seed, time, inputs)
         for k, port in enumerate(self.pipeline.inputs):
             env[port.present] = (key >> k) & 1 == 1
         return self._play(self.shared, env)
 
     def __call__(
-        self, cells: list[Any], time: np.ndarray, key: np.ndarray, inputs: list[list[np.ndarray]]
+        self,
+        cells: list[Any],
+        seed: np.ndarray,
+        time: np.ndarray,
+        key: np.ndarray,
+        inputs: list[list[np.ndarray]],
     ) -> Iterator[tuple[Chunk, list[Any]]]:
         """Play all ticks; yields each chunk of outputs with the register cells after it.
 
         Args:
             cells: register cells before the first tick.
+            seed: (2,) uint32.
             time, key: (T,) int64.
             inputs: for each input port its leaves, dense: (T, ...), zero where absent.
         """
@@ -139,7 +167,7 @@ class Scan:
                 tuple(tuple(_padded(leaf[here], self.chunk, 0) for leaf in leaves) for leaves in inputs),
             )
             with self.jax.enable_x64(True):
-                now, ys = self.run(now, xs)
+                now, ys = self.run(now, seed, xs)
                 outputs = [
                     (np.asarray(mask)[:count], [np.asarray(leaf)[:count] for leaf in leaves])
                     for mask, leaves in ys

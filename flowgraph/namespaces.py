@@ -1,0 +1,29 @@
+"""NumPy as the engines use it: the array API, and the two operations that pipelines add to it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class NumpyNamespace:
+    """`numpy` with `float32_bits` and `materialise`."""
+
+    @staticmethod
+    def float32_bits(x: Any) -> Any:
+        """The bits of the IEEE binary32 number nearest to each int32, as int32: octave and leading bits."""
+        return np.asarray(x).astype(np.float32).view(np.int32)
+
+    @staticmethod
+    def materialise(x: Any) -> Any:
+        """The value itself; tells a compiler to compute it once and keep it."""
+        return x
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(np, name)
+        setattr(self, name, found)
+        return found
+
+
+NUMPY = NumpyNamespace()
