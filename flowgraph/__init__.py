@@ -20,6 +20,7 @@ from flowgraph.graph import Graph
 from flowgraph.inputs import arrays, timing_of
 from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
 from flowgraph.lowering import lower
+from flowgraph.many import Batch, simulate_many
 from flowgraph.pipeline import Pipeline
 from flowgraph.registry import Case, find_graph, load_flight
 from flowgraph.result import Result
@@ -32,6 +33,7 @@ from flowgraph.types import Array, Scalar, Signal, boolean, integer, real
 
 __all__ = [
     "Array",
+    "Batch",
     "Block",
     "Case",
     "ClockError",
@@ -76,6 +78,7 @@ __all__ = [
     "real",
     "save_state",
     "simulate",
+    "simulate_many",
     "sink",
     "timing_of",
     "when",

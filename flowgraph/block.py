@@ -17,7 +17,7 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
@@ -416,7 +416,12 @@ def _reals(wanted: Type, given: Type) -> Type:
 
 def _with_units(given: Type, named: Type) -> Type:
     if isinstance(given, ArrayType) and isinstance(named, ArrayType):
-        return ArrayType(given.shape, given.dtype, named.unit or given.unit, named.frame or given.frame)
+        return replace(
+            given,
+            unit=named.unit or given.unit,
+            frame=named.frame or given.frame,
+            axes=named.axes or given.axes,
+        )
     if isinstance(given, StructType) and isinstance(named, StructType):
         pairs = zip(given.fields, named.fields, strict=True)
         return StructType(given.name, tuple((n, _with_units(g, w)) for (n, g), (_, w) in pairs), given.cls)

@@ -29,7 +29,7 @@ def nanoseconds(duration: str | int, *, what: str = "duration") -> int:
     """
     if isinstance(duration, int) and not isinstance(duration, bool):
         return duration
-    match = re.fullmatch(r"\s*([0-9.]+)\s*(ns|us|ms|s)\s*", str(duration))
+    match = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*(ns|us|ms|s)\s*", str(duration))
     if match is None or isinstance(duration, float):
         raise DeclarationError(
             f"{what} is not understood",
@@ -72,15 +72,24 @@ def periodic(period: str | int, *, phase: str | int | None = None, jitter: str |
         raise DeclarationError(
             "a period must be positive", expected="more than 0 ns", got=length, fix='write periodic("5ms")'
         )
+    spread = nanoseconds(jitter, what="jitter")
+    if spread < 0:
+        raise DeclarationError(
+            "a jitter cannot be negative", expected="0 ns or more", got=spread, fix='write jitter="100us"'
+        )
     return Timing(
         period=length,
         phase=None if phase is None else nanoseconds(phase, what="phase") % length,
-        jitter=nanoseconds(jitter, what="jitter"),
+        jitter=spread,
     )
 
 
 def aperiodic(*, max_rate: float | None = None) -> Timing:
     """A source whose events come when they come, at most `max_rate` times a second if given."""
+    if max_rate is not None and not max_rate > 0:
+        raise DeclarationError(
+            "a highest rate must be positive", expected="more than 0 Hz", got=max_rate, fix="leave it out"
+        )
     return Timing(max_rate=max_rate)
 
 

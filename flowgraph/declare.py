@@ -92,7 +92,7 @@ class GraphFunction:
         """Nest this graph in the one under construction; returns what its function returns."""
         build = builder(self.name)
         with build.scope(name or self.name, given=name is not None):
-            bound = inspect.signature(self.function).bind(*streams, **keywords)
+            bound = self._bound(build, streams, keywords)
             for source, (type_, optional) in self.parameters[0].items():
                 value = bound.arguments.get(source)
                 if value is None and optional:
@@ -109,6 +109,24 @@ class GraphFunction:
                     value.type, type_, given_at=value.label, wanted_at=f"{self.name}.{source}", sizes={}
                 )
             return self.function(*streams, **keywords)
+
+    def _bound(
+        self, build: Builder, streams: tuple[Any, ...], keywords: dict[str, Any]
+    ) -> inspect.BoundArguments:
+        sources, settings = self.parameters
+        for key in keywords:
+            if key not in sources and key not in settings:
+                raise UnknownNameError("source or setting", key, [*sources, *settings], path=self.name)
+        try:
+            return inspect.signature(self.function).bind(*streams, **keywords)
+        except TypeError as error:
+            raise DeclarationError(
+                f"this graph is called wrongly: {error}",
+                path=f"{build.name}/{self.name}",
+                expected=f"{self.name}({', '.join([*sources, *(f'{k}=...' for k in settings)])})",
+                got=f"{len(streams)} streams, {', '.join(keywords) or 'no settings'}",
+                fix="give each source a stream, and each setting without a default a value",
+            ) from None
 
     def build(self, *, sizes: Mapping[str, int] | None = None, **declared: Any) -> Graph:
         """Run the function once and freeze the graph.

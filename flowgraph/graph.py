@@ -202,13 +202,21 @@ class Graph:
 def firing_order(nodes: list[Node]) -> tuple[int, ...]:
     """Sources and calls such that each comes after what it reads in the same tick.
 
-    A delay adds no edge: it is read before it is written. A latest does: it is written before it is read.
+    A delay adds no edge: it is read before it is written. A latest does: it is written before it is read. A
+    block that fires at a clock known only at run time comes after the block that decides it.
 
     Raises:
         CycleError: with the whole chain of ports.
     """
     done: dict[int, None] = {}
     trail: list[tuple[int, str]] = []
+
+    decides: dict[Clock, int] = {}  # for each clock known only at run time, the call that decides it
+    for index, node in enumerate(nodes):
+        if isinstance(node, CallNode):
+            for output, dynamic in zip(node.outputs, node.dynamic, strict=True):
+                if dynamic:
+                    decides.setdefault(output.clock, index)
 
     def needs(index: int) -> list[tuple[str, int]]:
         node = nodes[index]
@@ -222,6 +230,7 @@ def firing_order(nodes: list[Node]) -> tuple[int, ...]:
                 edges.append((port.name, arg.wire.node))
             if arg.register is not None:
                 edges.append((port.name, arg.register))
+        edges.extend(("at", decides[atom]) for atom in atoms(node.firing) if atom in decides)
         return edges
 
     def visit(index: int) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -57,7 +58,7 @@ def timing_of(series: Series) -> Timing:
     steps = np.diff(series.time)
     if not len(steps):
         return aperiodic()
-    typical = int(np.median(steps))
+    typical = max(int(np.median(steps)), 1)
     spread = int(np.abs(steps - typical).max())
     if spread == 0:
         return periodic(typical, phase=int(series.time[0]) % typical)
@@ -91,13 +92,16 @@ class Tape:
     @classmethod
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
-        time = np.concatenate([np.zeros(0, np.int64), *(s.time for s in series)])
-        time.sort(kind="stable")  # merges runs that are sorted already
-        if len(time):
+        time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
+        rows = [None if len(s) == len(time) else np.searchsorted(time, s.time) for s in series]
+        if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
+            time = np.concatenate([s.time for s in series])
+            time.sort(kind="stable")  # merges runs that are sorted already
             time = time[np.concatenate([[True], time[1:] != time[:-1]])]
+            rows = [np.searchsorted(time, s.time) for s in series]
         key = np.zeros(len(time), np.int64)
-        for k, s in enumerate(series):
-            key[... if len(s) == len(time) else np.searchsorted(time, s.time)] |= 1 << k
+        for k, r in enumerate(rows):
+            key[... if r is None else r] |= 1 << k
         return cls(time, key, series)
 
     @property
@@ -107,8 +111,17 @@ class Tape:
         return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
 
 
-def prepare(graph: Graph, inputs: Inputs) -> dict[str, Series | Iterator[tuple[int, Any]]]:
+def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
+    """`time[rows]`; all of it without rows, and the last where a row is past the end."""
+    return time if rows is None else time.take(rows, mode="clip")
+
+
+def prepare(
+    graph: Graph, inputs: Inputs, last: Mapping[str, int] | None = None
+) -> dict[str, Series | Iterator[tuple[int, Any]]]:
     """The inputs by source name, in declaration order: checked `Series`, or iterators read as they go.
+
+    `last` holds the last time of each source in a run that goes on; nothing may come before the last of them.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
@@ -119,6 +132,8 @@ def prepare(graph: Graph, inputs: Inputs) -> dict[str, Series | Iterator[tuple[i
             if name not in graph.sources:
                 raise UnknownNameError("source", name, graph.sources, path=graph.name)
     found: dict[str, Series | Iterator[tuple[int, Any]]] = {}
+    before = dict(last or dict.fromkeys(graph.sources, NEVER))
+    resumed = max(before.values(), default=NEVER)
     for name, node in graph.sources.items():
         if name not in given:
             raise DataError(
@@ -132,9 +147,12 @@ def prepare(graph: Graph, inputs: Inputs) -> dict[str, Series | Iterator[tuple[i
         if isinstance(value, tuple) and len(value) == 2:
             value = Series(value[0], value[1], name=name)
         if isinstance(value, Series):
-            found[name] = _checked(name, _typed(name, value, node.type), node.clock.timing)
+            series = _typed(name, value, node.type)
+            if len(series):
+                _check_after(name, int(series.time[0]), resumed)
+            found[name] = _checked(name, series, node.clock.timing, before[name])
         elif isinstance(value, Iterable):
-            found[name] = _events(name, value, node.type, node.clock.timing)
+            found[name] = _events(name, value, node.type, node.clock.timing, before[name], resumed)
         else:
             raise DataError(
                 f"source {name!r} is given something that holds no events",
@@ -177,12 +195,23 @@ def _as_wanted(given: Type, wanted: Type) -> Type:
     return type(given)(given.shape, kind, given.unit, given.frame)
 
 
-def _checked(name: str, series: Series, timing: Timing) -> Series:
-    broken = _broken_rows(series)
-    if broken.any():
+def _check_after(name: str, time: int, resumed: int) -> None:
+    if time <= resumed:
+        raise DataError(
+            "time goes backwards",
+            path=f"{name}, event 0",
+            expected=f"events after {resumed} ns, where the state was saved",
+            got=f"t = {time} ns",
+            fix="give a resumed run the inputs that come after: series[series.time > time]",
+        )
+
+
+def _checked(name: str, series: Series, timing: Timing, before: int = NEVER) -> Series:
+    if not all(np.isfinite(leaf).all() for leaf in series.leaves.values() if leaf.dtype.kind == "f"):
+        broken = _broken_rows(series)
         row = int(np.flatnonzero(broken)[0])
         _not_finite(name, int(series.time[row]), f"row {row} ({int(broken.sum())} in all)")
-    check_times(name, series.time, timing)
+    check_times(name, series.time, timing, before)
     return series
 
 
@@ -204,7 +233,8 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
     """
     stamps = time if before == NEVER else np.r_[before, time]
     steps = np.diff(stamps)
-    if (steps <= 0).any():
+    least, most = int(steps.min(initial=2**63 - 1)), int(steps.max(initial=0))
+    if least <= 0:
         row = int(np.flatnonzero(steps <= 0)[0])
         twice = steps[row] == 0
         raise DataError(
@@ -217,9 +247,8 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
             else "sort the events at the source, or drop the late one",
         )
     if timing.period is not None:
-        off = np.abs(steps - timing.period) > timing.jitter
-        if off.any():
-            row = int(np.flatnonzero(off)[0])
+        if max(timing.period - least, most - timing.period) > timing.jitter:
+            row = int(np.flatnonzero(np.abs(steps - timing.period) > timing.jitter)[0])
             raise ClockError(
                 "the data do not keep the declared period",
                 path=f"{name}, event {row + 1}",
@@ -230,20 +259,18 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
                 fix=f'declare what is true: {name}=periodic(..., jitter="...") or {name}=aperiodic(max_rate=...)',
             )
         if timing.phase is not None and not timing.jitter:
-            off = (time[:1] - timing.phase) % timing.period != 0  # the others follow it by whole periods
-            if off.any():
-                row = int(np.flatnonzero(off)[0])
+            # whole periods after the first stamp, the others are in phase if it is
+            if len(time) and (int(time[0]) - timing.phase) % timing.period != 0:
                 raise ClockError(
                     "the data do not keep the declared phase",
-                    path=f"{name}, event {row}",
+                    path=f"{name}, event 0",
                     expected=f"a multiple of {timing.period} ns plus {timing.phase} ns",
-                    got=f"t = {int(time[row])} ns",
+                    got=f"t = {int(time[0])} ns",
                     fix="leave the phase out, or shift the stamps",
                 )
     if timing.max_rate is not None:
-        close = steps < int(1e9 / timing.max_rate)
-        if close.any():
-            row = int(np.flatnonzero(close)[0])
+        if least < int(1e9 / timing.max_rate):
+            row = int(np.flatnonzero(steps < int(1e9 / timing.max_rate))[0])
             raise ClockError(
                 "events come closer than the declared highest rate",
                 path=f"{name}, event {row + 1}",
@@ -273,8 +300,9 @@ def check_event(
     return int(time), made
 
 
-def _events(name: str, events: Iterable[Any], type_: Type, timing: Timing) -> Iterator[tuple[int, Any]]:
-    before = NEVER
+def _events(
+    name: str, events: Iterable[Any], type_: Type, timing: Timing, before: int, resumed: int
+) -> Iterator[tuple[int, Any]]:
     for event in events:
         if not isinstance(event, tuple) or len(event) != 2:
             raise DataError(
@@ -285,6 +313,7 @@ def _events(name: str, events: Iterable[Any], type_: Type, timing: Timing) -> It
                 fix="yield (nanoseconds, value)",
             )
         before, value = check_event(name, event[0], event[1], type_, timing, before)
+        _check_after(name, before, resumed)
         yield before, value
 
 
@@ -347,10 +376,7 @@ def merged(
             [iter(s).__next__ for s in recorded],
         )
     feeds = [zip(s.time.tolist(), s, strict=True) if isinstance(s, Series) else s for s in prepared.values()]
-    waiting: list[Any] = [None] * len(feeds)
-
-    def take(k: int) -> Any:
-        return waiting[k]
+    waiting: list[deque[Any]] = [deque() for _ in feeds]  # ticks may be read ahead of the values
 
     def ticks() -> Iterator[tuple[int, int]]:
         heads = [next(f, None) for f in feeds]
@@ -360,11 +386,11 @@ def merged(
             for k, head in enumerate(heads):
                 if head is not None and head[0] == now:
                     key |= 1 << k
-                    waiting[k] = head[1]
+                    waiting[k].append(head[1])
             yield now, key
             heads = [next(feeds[k], None) if key >> k & 1 else h for k, h in enumerate(heads)]
 
-    return ticks(), [lambda k=k: take(k) for k in range(len(feeds))]  # type: ignore[misc]
+    return ticks(), [queue.popleft for queue in waiting]
 
 
 def batches(ticks: Iterator[tuple[int, int]], size: int) -> Iterator[list[tuple[int, int]]]:

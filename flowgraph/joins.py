@@ -27,6 +27,18 @@ from flowgraph.types import ArrayType, Type, annotation_type, flatten, tuple_typ
 T = TypeVar("T")
 
 
+def _need_streams(join: str, **given: Any) -> None:
+    for port, value in given.items():
+        if not isinstance(value, Stream):
+            raise DeclarationError(
+                f"{join} needs a stream as {port!r}",
+                path=join,
+                expected="a Stream",
+                got=repr(value),
+                fix="a held value is always there and has no times: read it with map or apply, or sample it with .at(clock)",
+            )
+
+
 def latest(
     stream: Stream[T] | None = None,
     *,
@@ -145,6 +157,7 @@ def merge(a: Stream[T], b: Stream[T], *, tie: Any = None, name: str | None = Non
     Raises:
         ClockError: where the clocks can coincide and no `tie` is named.
     """
+    _need_streams(name or "merge", a=a, b=b)
     if tie is None and not clocks.disjoint(a.clock, b.clock):
         raise ClockError(
             f"{a.label} and {b.label} can be present together",
@@ -311,6 +324,7 @@ def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[An
     Raises:
         ClockError: where rates are unequal (use `latest`) or only nominally equal (use `match`).
     """
+    _need_streams(name or "zip", a=a, b=b)
     label = name or f"zip({a.label}, {b.label})"
     if clocks.equal(a.clock, b.clock):
         return typing.cast("Stream[Any]", _pair(a, b, name=name))
@@ -320,6 +334,7 @@ def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[An
 
 def zip_latest(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
     """Pairs whenever either comes, with the last value of the other; `init` is the pair before the first."""
+    _need_streams(name or "zip_latest", a=a, b=b)
     first, second = init
     left, right = latest(a, init=first), latest(b, init=second)
     return typing.cast("Stream[Any]", _pair(left, right, at=a | b, name=name or "zip_latest"))
@@ -410,6 +425,7 @@ def match(
     Raises:
         DeclarationError: without a size.
     """
+    _need_streams(name or "match", a=a, b=b)
     if not isinstance(size, int) or size < 1:
         raise DeclarationError(
             "match needs the size of its queues",

@@ -21,7 +21,7 @@ from flowgraph.ops import OPS, Spec
 from flowgraph.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
 from flowgraph.random import Site
 from flowgraph.symbolic import Instruction, Trace, namespace
-from flowgraph.types import DTYPES, Type, flatten, leaves_of
+from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 
 
 def lower(graph: Graph) -> Pipeline:
@@ -134,10 +134,20 @@ class _Lowering:
     def select(self, condition: int, yes: int, no: int) -> int:
         return yes if yes == no else self.emit("where", condition, yes, no)
 
-    def close(self, path: str, block: str, enable: int, reads: Sequence[str], writes: Sequence[str]) -> None:
+    def close(
+        self,
+        path: str,
+        block: str,
+        enable: int,
+        reads: Sequence[str],
+        writes: Sequence[str],
+        axis: str | None = None,
+    ) -> None:
         """End a stage with what has been emitted since the last."""
         if self.pending or writes:
-            self.stages.append(Stage(path, block, enable, tuple(reads), tuple(writes), tuple(self.pending)))
+            self.stages.append(
+                Stage(path, block, enable, tuple(reads), tuple(writes), tuple(self.pending), axis)
+            )
         self.pending = []
 
     # -- presence ------------------------------------------------------------------------------------
@@ -184,7 +194,9 @@ class _Lowering:
         present = self.when(self.graph.port(register.feed).clock)
         fresh = zip(self.leaves[register.feed], self.reads[index], strict=True)
         self.writes[index] = [self.select(present, new, old) for new, old in fresh]
-        self.close(register.path, register.role, present, [register.path], [register.path])
+        self.close(
+            register.path, register.role, present, [register.path], [register.path], _axis([register.type])
+        )
         self.pending, self.place = kept, outer
 
     def duration(self, stamp: int) -> int:
@@ -212,6 +224,7 @@ class _Lowering:
                     np.asarray(reset, DTYPES[t.dtype]),
                     t.unit,
                     t.frame,
+                    axis_names(t),
                 )
                 for (name, t), read, write, reset in zip(
                     leaves_of(node.type), self.reads[index], written, initial, strict=True
@@ -265,7 +278,13 @@ class _Lowering:
         registers = [a.register for a in call.arguments if a.register is not None]
         memory_of = [] if call.state is None else [self.graph.nodes[call.state].path]
         reads = [self.graph.nodes[i].path for i in registers] + memory_of
-        self.close(call.path, call.block.name, firing, reads, memory_of)
+        self.close(call.path, call.block.name, firing, reads, memory_of, self.axis(call))
+
+    def axis(self, call: CallNode) -> str | None:
+        given = [self.graph.port(a.wire).type for a in call.arguments if a.wire is not None]
+        held = [self.graph.nodes[a.register] for a in call.arguments if a.register is not None]
+        types = [n.type for n in held if isinstance(n, RegisterNode)]
+        return _axis([*(p.type for p in call.outputs), *given, *types])
 
     def clock(self, call: CallNode) -> tuple[int, int | None]:
         """When a call fires, and the seconds since it last did, in a stage of their own."""
@@ -340,10 +359,16 @@ class _Lowering:
 
     def port(self, name: str, type_: Type, clock: str, present: int, numbers: list[int]) -> Port:
         leaves = [
-            Leaf(leaf, n, _fixed(t.shape), t.dtype, t.unit, t.frame)
+            Leaf(leaf, n, _fixed(t.shape), t.dtype, t.unit, t.frame, axis_names(t))
             for (leaf, t), n in zip(leaves_of(type_), numbers, strict=True)
         ]
         return Port(name, str(type_), clock, present, tuple(leaves))
+
+
+def _axis(types: Sequence[Type]) -> str | None:
+    """The first named axis of these types."""
+    names = (name for type_ in types for _, leaf in leaves_of(type_) for name in axis_names(leaf))
+    return next((n for n in names if n is not None), None)
 
 
 def _fixed(shape: tuple[int | str, ...]) -> tuple[int, ...]:

@@ -33,7 +33,7 @@ _SCHEMA = Path(__file__).with_name("pipeline.schema.json")
 
 @dataclass(frozen=True)
 class Leaf:
-    """One array of a port: its value number, shape, dtype, unit and frame."""
+    """One array of a port: its value number, shape, dtype, unit, frame, and names of parallel axes."""
 
     name: str
     value: int
@@ -41,6 +41,7 @@ class Leaf:
     dtype: str
     unit: str | None = None
     frame: str | None = None
+    axes: tuple[str | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class Cell:
     reset: Any
     unit: str | None = None
     frame: str | None = None
+    axes: tuple[str | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class Stage:
         path, block: of the call in the graph.
         enable: number of a Boolean value.
         reads, writes: paths of registers.
+        axis: name of the axis along which its work is parallel, such as "particles", or None.
         instructions: in order.
     """
 
@@ -94,6 +97,7 @@ class Stage:
     reads: tuple[str, ...]
     writes: tuple[str, ...]
     instructions: tuple[Instruction, ...]
+    axis: str | None = None
 
 
 @dataclass(frozen=True)
@@ -224,6 +228,7 @@ class Pipeline:
                     "enable": s.enable,
                     "reads": list(s.reads),
                     "writes": list(s.writes),
+                    "axis": s.axis,
                     "instructions": [_instruction(i) for i in s.instructions],
                 }
                 for s in self.stages
@@ -262,6 +267,7 @@ class Pipeline:
                     tuple(s["reads"]),
                     tuple(s["writes"]),
                     tuple(_from_instruction(i) for i in s["instructions"]),
+                    s["axis"],
                 )
                 for s in data["stages"]
             ),
@@ -492,9 +498,18 @@ def _from_instruction(r: Mapping[str, Any]) -> Instruction:
 
 
 def _port(r: Mapping[str, Any]) -> Port:
-    leaves = tuple(Leaf(**{**leaf, "shape": tuple(leaf["shape"])}) for leaf in r["leaves"])
+    leaves = tuple(
+        Leaf(**{**leaf, "shape": tuple(leaf["shape"]), "axes": tuple(leaf["axes"])}) for leaf in r["leaves"]
+    )
     return Port(r["name"], r["type"], r["clock"], r["present"], leaves)
 
 
 def _cell(r: Mapping[str, Any]) -> Cell:
-    return Cell(**{**r, "shape": tuple(r["shape"]), "reset": _array(r["reset"], r["shape"], r["dtype"])})
+    return Cell(
+        **{
+            **r,
+            "shape": tuple(r["shape"]),
+            "axes": tuple(r["axes"]),
+            "reset": _array(r["reset"], r["shape"], r["dtype"]),
+        }
+    )

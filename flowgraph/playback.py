@@ -54,7 +54,7 @@ def play(
     else:
         slots, last, seed = load_registers(graph, state)
     cells = [leaf for index, node in graph.registers for leaf in flatten(slots[index], node.type)]
-    events = tape(prepare(graph, inputs), graph)
+    events = tape(prepare(graph, inputs, last), graph)
     types = [graph.port(c.wire).type for c in graph.collected]
     return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress)
 
@@ -159,7 +159,7 @@ def _result(
     outcome = (_reference if engine == "reference" else _xla)(
         pipeline, events, cells, real, seed_words(seed), progress
     )
-    _check_faults(pipeline, outcome.cells)
+    check_faults(pipeline, outcome.cells)
     series = {}
     for port, type_, (times, leaves) in zip(pipeline.outputs, types, outcome.outputs, strict=True):
         series[port.name] = Series(times, unflatten(type_, iter(leaves)), type=type_, name=port.name)
@@ -184,7 +184,7 @@ def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: 
     return {"registers": registers, "sources": {n: np.asarray(t, dtype=np.int64) for n, t in last.items()}}
 
 
-def _check_faults(pipeline: Pipeline, cells: list[Any]) -> None:
+def check_faults(pipeline: Pipeline, cells: list[Any]) -> None:
     values = iter(cells)
     found = {(r.path, c.name): next(values) for r in pipeline.registers for c in r.cells}
     for fault in pipeline.faults:
@@ -199,7 +199,7 @@ def _check_faults(pipeline: Pipeline, cells: list[Any]) -> None:
             )
 
 
-def _leaves(series: Series, real: Any) -> list[np.ndarray]:
+def real_leaves(series: Series, real: Any) -> list[np.ndarray]:
     return [a.astype(real, copy=False) if a.dtype.kind == "f" else a for a in series.leaves.values()]
 
 
@@ -209,7 +209,7 @@ def _reference(
     player = Player(
         pipeline, [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells], real, seed
     )
-    rows = [_rows(_leaves(s, real)) for s in events.series]
+    rows = [_rows(real_leaves(s, real)) for s in events.series]
     outputs: list[tuple[list[int], list[tuple[Any, ...]]]] = [([], []) for _ in pipeline.outputs]
     start = perf_counter()
     with np.errstate(all="ignore"):
@@ -249,14 +249,17 @@ def _xla(
     compiled: dict[Any, Scan] = _compiled(pipeline)
     if which not in compiled:
         compiled[which] = Scan(pipeline, keys, real, chunk)
-    dense = []
+    columns = []
     for k, series in enumerate(events.series):
-        at = (events.key >> k & 1).astype(bool)
-        dense.append([_dense(leaf, at) for leaf in _leaves(series, real)])
+        leaves = real_leaves(series, real)
+        everywhere = len(series) == len(events.time)
+        columns.append(leaves if everywhere else [dense(x, events.key & (1 << k) != 0) for x in leaves])
+    scan = compiled[which]
+    scan.compile(cells, seed, columns)
     parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in pipeline.outputs]
     done = 0
     start = perf_counter()
-    for part, after in compiled[which](cells, seed, events.time, events.key, dense):
+    for part, after in scan(cells, seed, events.time, events.key, columns):
         cells = after
         times = events.time[done : done + part.ticks]
         for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
@@ -267,7 +270,8 @@ def _xla(
     wall = perf_counter() - start
     outputs = []
     for port, kept in zip(pipeline.outputs, parts, strict=True):
-        times = np.concatenate([t for t, _ in kept]) if kept else np.zeros(0, np.int64)
+        count = sum(len(t) for t, _ in kept)
+        times = events.time if count == len(events.time) else np.concatenate([t for t, _ in kept])
         arrays = [
             np.concatenate([leaves[k] for _, leaves in kept])
             if kept
@@ -284,7 +288,7 @@ def _compiled(pipeline: Pipeline) -> dict[Any, Any]:
     return kept
 
 
-def _dense(leaf: np.ndarray, at: np.ndarray) -> np.ndarray:
+def dense(leaf: np.ndarray, at: np.ndarray) -> np.ndarray:
     if len(leaf) == len(at):
         return leaf
     full = np.zeros((len(at), *leaf.shape[1:]), leaf.dtype)

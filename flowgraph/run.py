@@ -15,7 +15,7 @@ from typing import Any, NoReturn, Protocol
 from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, CallNode, Graph
 from flowgraph.inputs import Inputs, batches, check_event, merged, prepare, stack
-from flowgraph.plan import bindings, bound, plan
+from flowgraph.plan import Plan, bindings, bound, plan
 from flowgraph.random import NumpyDraw, seed_words
 from flowgraph.result import Result, statistics
 from flowgraph.state import initial_registers, load_registers, state_tree
@@ -69,7 +69,7 @@ class Run:
             self._ticks: Iterator[tuple[int, int]] = iter(())
             feeds: list[Callable[[], Any]] = [q.popleft for q in self._pushed]
         else:
-            self._prepared = prepare(graph, inputs)
+            self._prepared = prepare(graph, inputs, self._last)
             self._ticks, feeds = merged(self._prepared)
         self._names = {
             **bindings(graph),
@@ -144,27 +144,34 @@ class Run:
             for time, key in batch:
                 reactions[key](time)
         except Exception as error:
+            self._account([tick for tick in batch if tick[0] < time])  # the ticks before the one that failed
             self._explain(error, time)
             raise
+        self._account(batch)
+        self.wall_s += perf_counter() - start
+
+    def _account(self, batch: list[tuple[int, int]]) -> None:
         self.ticks += len(batch)
-        self.time = time
         keys = 0
         for time, key in reversed(batch):
+            self.time = max(self.time, time)
             for k, name in enumerate(self._last):
                 if key & ~keys & (1 << k):
                     self._last[name] = time
             keys |= key
             if keys == (1 << len(self._last)) - 1:
                 break
-        self.wall_s += perf_counter() - start
 
     def _explain(self, error: BaseException, time: int) -> None:
         """Add to an error from a block's step the graph path and the time."""
         trace = error.__traceback__
         while trace is not None:
             if trace.tb_frame.f_code.co_name == "react":
-                for known in self.graph.plans.values():
-                    if known.code.co_filename == trace.tb_frame.f_code.co_filename:
+                for known in list(self.graph.plans.values()):
+                    if (
+                        isinstance(known, Plan)
+                        and known.code.co_filename == trace.tb_frame.f_code.co_filename
+                    ):
                         error.add_note(
                             f"in {self.graph.name}, at {known.nodes.get(trace.tb_lineno)}, t = {time} ns"
                         )

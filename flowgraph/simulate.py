@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import typing
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
 from flowgraph.inputs import Inputs
+from flowgraph.many import Batch, simulate_many
 from flowgraph.result import Result
 from flowgraph.run import Meter, Run
 
 ENGINES = ("python", "reference", "xla")
 
 
+@typing.overload
+def simulate(graph: Graph, inputs: Inputs, *, seeds: None = None, **options: Any) -> Result: ...
+@typing.overload
+def simulate(graph: Graph, inputs: Inputs, *, seeds: Sequence[int], **options: Any) -> Batch: ...
 def simulate(
     graph: Graph,
     inputs: Inputs,
@@ -23,19 +29,22 @@ def simulate(
     init: Mapping[str, Any] | None = None,
     state: Mapping[str, Any] | None = None,
     seed: int = 0,
+    seeds: Sequence[int] | None = None,
     progress: Meter | None = None,
-) -> Result:
+) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
     Args:
         graph: a built graph.
-        inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of `(time, value)`.
+        inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of
+            `(time, value)`.
         engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy)
             or "xla" (the same instructions in one compiled scan; needs JAX).
         dtype: what `real` is, "float64" or "float32"; the Python engine has float64 only.
         init: other initial values, by register path.
         state: a `run.state` or `result.state` to go on from.
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
+        seeds: run once for each of them, and return a `Batch`; `simulate_many` has more to choose.
         progress: an object that is told how far the run is.
 
     Raises:
@@ -47,6 +56,16 @@ def simulate(
         raise UnknownNameError("engine", engine, ENGINES)
     if dtype not in ("float64", "float32"):
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
+    if seeds is not None:
+        if state is not None:
+            raise DeclarationError(
+                "many runs start anew",
+                path="simulate",
+                expected="seeds, or a state to go on from",
+                got="both",
+                fix="leave one of them out",
+            )
+        return simulate_many(graph, inputs, seeds, engine=engine, dtype=dtype, init=init, progress=progress)
     if engine == "python":
         if dtype != "float64":
             raise DeclarationError(

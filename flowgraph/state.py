@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -113,7 +114,7 @@ def load_state(file: str | Path) -> dict[str, Any]:
             else:
                 tree[group][path] = array
         return tree
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
         raise DataError(
             "this is no saved state",
             path=str(file),

@@ -27,6 +27,7 @@ class Stream(Generic[T]):
     """Values that flow: present, with one value, at the ticks of `clock`."""
 
     __hash__ = object.__hash__
+    __array_ufunc__ = None  # NumPy arrays on the left defer to this class
 
     def __init__(self, builder: Builder, wire: Wire, port: OutputPort, label: str) -> None:
         self.builder, self.wire, self.type, self.clock, self.label = (
@@ -82,6 +83,21 @@ class Stream(Generic[T]):
     def __matmul__(self, other: Any) -> Stream[Any]:
         return _operate(operator.matmul, self, other)
 
+    def __radd__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.add, self, other, swap=True)
+
+    def __rsub__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.sub, self, other, swap=True)
+
+    def __rmul__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.mul, self, other, swap=True)
+
+    def __rtruediv__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.truediv, self, other, swap=True)
+
+    def __rmatmul__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.matmul, self, other, swap=True)
+
     def __neg__(self) -> Stream[Any]:
         return apply(operator.neg, self)
 
@@ -128,10 +144,14 @@ class Held(Generic[T]):
 _SAMPLE: Block[Any] = Block(lambda value: value, name="sample")
 
 
-def _operate(function: Callable[..., Any], left: Stream[Any], right: Any) -> Stream[Any]:
-    if isinstance(right, Stream | Held):
-        return apply(function, left, right)
-    return apply(lambda x: function(x, right), left, name=function.__name__)
+def _operate(
+    function: Callable[..., Any], stream: Stream[Any], other: Any, *, swap: bool = False
+) -> Stream[Any]:
+    if isinstance(other, Stream | Held):
+        return apply(function, stream, other)
+    if swap:
+        return apply(Block(lambda x: function(other, x), name=function.__name__), stream)
+    return apply(Block(lambda x: function(x, other), name=function.__name__), stream)
 
 
 def apply(

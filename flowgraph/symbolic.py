@@ -83,7 +83,7 @@ class Trace:
         return out
 
     def _operands(self, kind: str, op: str, args: Sequence[Any]) -> list[Symbolic]:
-        peers = [a for a in args if isinstance(a, Symbolic)]
+        peers = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Symbolic)]
         lifted = []
         for arg in args:
             if isinstance(arg, Symbolic):
@@ -98,6 +98,8 @@ class Trace:
             elif isinstance(arg, bool | int | float) and not isinstance(arg, np.generic) and peers:
                 dtypes = [p.dtype_name for p in peers] + (["real"] if isinstance(arg, float) else [])
                 weak = promote(*dtypes)
+                if weak == "bool" and not isinstance(arg, bool):
+                    weak = "int64"  # True + 1 is a number
                 lifted.append(
                     self.constant(
                         np.asarray(arg, DTYPES["bool" if isinstance(arg, bool) and weak == "bool" else weak])
@@ -330,6 +332,36 @@ for _name, _op in {
     setattr(Symbolic, f"__{_name}__", _operator(_op))
 for _name, _op in {"neg": "negative", "pos": "positive", "abs": "abs", "invert": "bitwise_invert"}.items():
     setattr(Symbolic, f"__{_name}__", lambda self, _op=_op: self.trace.apply(_op, self))
+
+
+def _augmented(name: str) -> Callable[..., NoReturn]:
+    def method(self: Symbolic, other: Any) -> NoReturn:
+        refuse(
+            "in-place write",
+            "a new array",
+            f"x {name}= y",
+            f"write x = x {name} y: NumPy would change x itself",
+        )
+
+    return method
+
+
+for _name, _op in {
+    "add": "+",
+    "sub": "-",
+    "mul": "*",
+    "truediv": "/",
+    "floordiv": "//",
+    "mod": "%",
+    "pow": "**",
+    "matmul": "@",
+    "and": "&",
+    "or": "|",
+    "xor": "^",
+    "lshift": "<<",
+    "rshift": ">>",
+}.items():
+    setattr(Symbolic, f"__i{_name}__", _augmented(_op))
 
 
 def _trace_of(args: Sequence[Any]) -> Trace | None:

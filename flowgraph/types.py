@@ -15,7 +15,7 @@ from __future__ import annotations
 import types as _pytypes
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeAlias, dataclass_transform, get_args, get_origin
 
 import numpy as np
@@ -37,12 +37,16 @@ DTYPES = {
 
 @dataclass(frozen=True)
 class ArrayType:
-    """The type of one leaf: `shape`, kind of number, `unit` and `frame` (None: not stated, fits any)."""
+    """The type of one leaf: `shape`, kind of number, `unit` and `frame` (None: not stated, fits any).
+
+    `axes` keeps the names of symbolic sizes once they are bound: axes along which work is parallel.
+    """
 
     shape: tuple[int | str, ...] = ()
     dtype: str = "real"
     unit: str | None = None
     frame: str | None = None
+    axes: tuple[str | None, ...] = field(default=(), compare=False)
 
     def __str__(self) -> str:
         size = f"[{','.join(map(str, self.shape))}]" if self.shape else ""
@@ -119,9 +123,9 @@ class Signal:
                 )
             names.append(name)
         cls._fields, cls._leaf_types = tuple(names), leaves
-        body = "\n".join(["  d = self.__dict__", *(f"  d[{n!r}] = {n}" for n in names)])
+        body = "\n".join(["  __fields = __self.__dict__", *(f"  __fields[{n!r}] = {n}" for n in names)])
         scope: dict[str, Any] = {}
-        exec(f"def __init__(self, {', '.join(names)}):\n{body}", scope)  # as dataclasses does
+        exec(f"def __init__(__self, {', '.join(names)}):\n{body}", scope)  # as dataclasses does
         cls.__init__ = scope["__init__"]  # type: ignore[method-assign]
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -278,9 +282,15 @@ def _leaf_or_inner(value: Any, declared: Type, where: str) -> Type:
         raise TypeMismatchError(
             "a leaf must be an array", path=where, expected=declared, got=given, fix="pass an array"
         )
-    given = replace(given, unit=declared.unit, frame=declared.frame)
+    given = replace(given, unit=declared.unit, frame=declared.frame, axes=axis_names(declared))
     check_fits(given, declared, given_at=where, wanted_at=where, sizes={})
     return given
+
+
+def axis_names(leaf: ArrayType) -> tuple[str | None, ...]:
+    """The names of a leaf's axes; empty where none has one."""
+    names = tuple(d if isinstance(d, str) else None for d in leaf.shape)
+    return leaf.axes or (names if any(names) else ())
 
 
 def check_fits(given: Type, wanted: Type, *, given_at: str, wanted_at: str, sizes: dict[str, int]) -> None:
@@ -317,6 +327,7 @@ def check_fits(given: Type, wanted: Type, *, given_at: str, wanted_at: str, size
     if len(bound) != len(given.shape):
         refuse("the shape", "reshape it in a .map(...)")
     for size, want in zip(given.shape, bound, strict=True):
+        want = sizes.get(want, want) if isinstance(want, str) else want  # bound by an axis before
         if isinstance(want, str):
             if isinstance(size, int):
                 sizes[want] = size
@@ -337,7 +348,9 @@ def bind(type_: Type, sizes: Mapping[str, int]) -> Type:
     return map_leaves(
         type_,
         lambda leaf: replace(
-            leaf, shape=tuple(sizes.get(d, d) if isinstance(d, str) else d for d in leaf.shape)
+            leaf,
+            shape=tuple(sizes.get(d, d) if isinstance(d, str) else d for d in leaf.shape),
+            axes=axis_names(leaf),
         ),
     )
 

@@ -24,7 +24,7 @@ from flowgraph.program import Program, specialise
 _MOST_PATTERNS = 8
 _SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
 _CHUNK_BYTES = 64 * 2**20
-_LARGEST_CHUNK = 65536
+_LARGEST_CHUNK = 131072
 
 
 def import_jax() -> Any:
@@ -65,25 +65,67 @@ class _JaxNamespace:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks."""
+    """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks.
+
+    With a leading axis of runs, a mask that is the same in all runs has no such axis.
+    """
 
     ticks: int
     outputs: list[tuple[np.ndarray, list[np.ndarray]]]
 
 
 class Scan:
-    """A compiled scan for one pipeline, dtype, set of patterns and chunk size."""
+    """A compiled scan for one pipeline, dtype, set of patterns and chunk size.
 
-    def __init__(self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int) -> None:
+    Args:
+        pipeline: what to play.
+        keys: the source patterns that occur, in order.
+        dtype: what `real` is.
+        chunk: ticks a call.
+        runs: how many runs go at once, under `vmap`; None for one, without a leading axis.
+        shared: with `runs`, whether all runs have the same inputs.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int, *,
+        runs: int | None = None, shared: bool = True,
+    ) -> None:  # fmt: skip
         self.jax = import_jax()
         self.pipeline, self.keys, self.dtype, self.chunk = pipeline, keys, dtype, chunk
-        shared = specialise(pipeline, None)
+        shared_program = specialise(pipeline, None)
         programs = [specialise(pipeline, key) for key in keys]
-        saved = shared.work - min((p.work for p in programs), default=0)
+        saved = shared_program.work - min((p.work for p in programs), default=0)
         self.branches = None if len(keys) > _MOST_PATTERNS or saved < _SMALL_WORK else programs
-        self.shared = shared
-        with self.jax.enable_x64(True):
-            self.run = self.jax.jit(self._chunk)
+        self.shared = shared_program
+        self.follows = [_known_presence(programs, k) for k in range(len(pipeline.outputs))]
+        self._input_axis = 0 if shared or runs is None else 1
+        self._output_axis = 0 if runs is None else 1
+        play = self._chunk
+        if runs is not None:
+            play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
+        self._compiled: Any = None
+        self._play_chunk = self.jax.jit(play)
+
+    def compile(self, cells: list[Any], seed: np.ndarray, inputs: list[list[np.ndarray]]) -> None:
+        """Compile for these shapes, once."""
+        if self._compiled is None:
+            with self.jax.enable_x64(True):
+                now = tuple(_as(c, self.dtype) for c in cells)
+                xs = self._slice(np.zeros(1, np.int64), np.zeros(1, np.int64), inputs, 0)
+                self._compiled = self._play_chunk.lower(now, seed, xs).compile()
+
+    def _slice(self, choice: np.ndarray, time: np.ndarray, inputs: list[list[np.ndarray]], start: int) -> Any:
+        """The ticks of one chunk, filled up with ticks in which nothing is present."""
+        here = slice(start, min(start + self.chunk, len(time)))
+        axis = self._input_axis
+        part = (slice(None),) * axis + (here,)
+        leaves = tuple(tuple(_padded(x[part], self.chunk, 0, axis) for x in port) for port in inputs)
+        kind, idle = (np.int64, 0) if self.branches is None else (np.int32, len(self.keys))
+        return (
+            _padded(choice[here], self.chunk, idle).astype(kind, copy=False),
+            _padded(time[here], self.chunk, int(time[here.stop - 1])),
+            leaves,
+        )
 
     def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
         step = self._switched if self.branches is not None else self._flagged
@@ -107,12 +149,14 @@ class Scan:
                 xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
             )
         outputs = []
-        for (flag, leaves), port in zip(program.outputs, self.pipeline.outputs, strict=True):
+        ports = zip(program.outputs, self.pipeline.outputs, self.follows, strict=True)
+        for (flag, leaves), port, follows in ports:
+            mask = None if follows is not None else jnp.asarray(flag is not None and env.get(flag, True))
             if flag is None:
                 blank = tuple(jnp.zeros(x.shape, _dtype(x.dtype, self.dtype)) for x in port.leaves)
-                outputs.append((jnp.asarray(False), blank))
+                outputs.append((mask, blank))
             else:
-                outputs.append((jnp.asarray(env.get(flag, True)), tuple(env[n] for n in leaves)))
+                outputs.append((mask, tuple(env[n] for n in leaves)))
         return tuple(env[n] for n in program.writes), outputs
 
     def _switched(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
@@ -149,30 +193,52 @@ class Scan:
             seed: (2,) uint32.
             time, key: (T,) int64.
             inputs: for each input port its leaves, dense: (T, ...), zero where absent.
+
+        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs.
         """
-        place = {k: i for i, k in enumerate(self.keys)}
-        choice = (
-            key
-            if self.branches is None
-            else np.array([place[int(k)] for k in self.keys], np.int64)[np.searchsorted(self.keys, key)]
-        )
-        idle = 0 if self.branches is None else len(self.keys)
+        pattern = _places(self.keys, key)
+        choice = key if self.branches is None else pattern
+        self.compile(cells, seed, inputs)
         now: Any = tuple(_as(c, self.dtype) for c in cells)
         for start in range(0, len(time), self.chunk):
-            here = slice(start, min(start + self.chunk, len(time)))
-            count = here.stop - here.start
-            xs = (
-                _padded(choice[here], self.chunk, idle).astype(np.int32),
-                _padded(time[here], self.chunk, int(time[here.stop - 1])),
-                tuple(tuple(_padded(leaf[here], self.chunk, 0) for leaf in leaves) for leaves in inputs),
-            )
+            count = min(self.chunk, len(time) - start)
+            kept = (slice(None),) * self._output_axis + (slice(count),)
+            part = pattern[start : start + count]
+            xs = self._slice(choice, time, inputs, start)
             with self.jax.enable_x64(True):
-                now, ys = self.run(now, seed, xs)
+                now, ys = self._compiled(now, seed, xs)
                 outputs = [
-                    (np.asarray(mask)[:count], [np.asarray(leaf)[:count] for leaf in leaves])
-                    for mask, leaves in ys
+                    (
+                        np.asarray(mask)[kept] if known is None else _picked(known, part),
+                        [np.asarray(leaf)[kept] for leaf in leaves],
+                    )
+                    for (mask, leaves), known in zip(ys, self.follows, strict=True)
                 ]
             yield Chunk(count, outputs), [np.asarray(c) for c in now]
+
+
+def _places(keys: tuple[int, ...], key: np.ndarray) -> np.ndarray:
+    """For each of `key` its place in `keys`, which are in order."""
+    if max(keys, default=0) >= 2**16:
+        return np.searchsorted(keys, key)
+    table = np.zeros(max(keys, default=0) + 1, np.int32)
+    table[list(keys)] = range(len(keys))
+    return table[key]
+
+
+def _picked(known: np.ndarray, places: np.ndarray) -> np.ndarray:
+    return np.ones(len(places), bool) if known.all() else known[places]
+
+
+def _known_presence(programs: list[Program], k: int) -> np.ndarray | None:
+    """Whether output k is present, for each source pattern, where that is known beforehand."""
+    facts = []
+    for program in programs:
+        flag = program.outputs[k][0]
+        if flag is not None and flag not in program.constants:
+            return None
+        facts.append(flag is not None and bool(program.constants[flag]))
+    return np.array(facts, dtype=bool)
 
 
 def chunk_size(pipeline: Pipeline, ticks: int) -> int:
@@ -184,11 +250,12 @@ def chunk_size(pipeline: Pipeline, ticks: int) -> int:
     return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
 
 
-def _padded(array: np.ndarray, size: int, fill: int) -> np.ndarray:
-    if len(array) == size:
+def _padded(array: np.ndarray, size: int, fill: int, axis: int = 0) -> np.ndarray:
+    short = size - array.shape[axis]
+    if not short:
         return array
-    tail = np.full((size - len(array), *array.shape[1:]), fill, array.dtype)
-    return np.concatenate([array, tail])
+    shape = (*array.shape[:axis], short, *array.shape[axis + 1 :])
+    return np.concatenate([array, np.full(shape, fill, array.dtype)], axis=axis)
 
 
 def _dtype(kind: str, real: Any) -> Any:

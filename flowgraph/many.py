@@ -1,0 +1,312 @@
+"""Many runs of one graph at once: a leading batch of runs, in chunks of fixed size.
+
+In XLA a chunk of runs goes through one compiled scan under `vmap`; the other engines run them one by one.
+The size of a chunk is fixed and the last one is filled up, so memory is bounded and the result of a run does
+not depend on how many others are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.graph import Graph
+from flowgraph.inputs import Inputs, Tape, prepare, tape
+from flowgraph.lowering import lower
+from flowgraph.pipeline import Pipeline, Port
+from flowgraph.playback import check_faults, dense, real_leaves
+from flowgraph.random import seed_words
+from flowgraph.run import Meter
+from flowgraph.series import Series
+from flowgraph.state import initial_registers
+from flowgraph.types import ArrayType, StructType, Type, dtype_name, flatten, leaves_of
+
+if TYPE_CHECKING:
+    from flowgraph.xla import Chunk
+
+_TICKS_AT_ONCE = 512
+RUNS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Runs:
+    """One collected stream of many runs.
+
+    Args:
+        name: of the stream.
+        time: (n,) int64 ns, the same in all runs.
+        present: (runs, n): whether the stream was present; all true unless its clock depends on data.
+        leaves: by dotted name, (runs, n, ...); zero where absent. Also attributes and items.
+    """
+
+    name: str
+    time: np.ndarray
+    present: np.ndarray
+    leaves: Mapping[str, np.ndarray]
+
+    def __getitem__(self, leaf: str) -> np.ndarray:
+        if leaf not in self.leaves:
+            raise UnknownNameError("field", leaf, self.leaves, path=self.name)
+        return self.leaves[leaf]
+
+    def __getattr__(self, leaf: str) -> np.ndarray:
+        if leaf.startswith("_") or "leaves" not in self.__dict__:
+            raise AttributeError(leaf)
+        try:
+            return self[leaf]
+        except UnknownNameError as error:
+            raise AttributeError(str(error)) from None
+
+    def run(self, index: int) -> Series:
+        """One run's stream, as a single run gives it (of the fields that were kept)."""
+        at = self.present[index]
+        fields = {n: a[index][at] for n, a in self.leaves.items()}
+        if list(fields) == ["value"]:
+            return Series(self.time[at], fields["value"], name=self.name)
+        type_ = StructType(self.name, tuple((n, _leaf_type(a)) for n, a in fields.items()), dict)
+        return Series(self.time[at], fields, type=type_, name=self.name)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The outcome of many runs: `batch["pose"].position` is (runs, n, 3).
+
+    Args:
+        graph, engine: names.
+        seeds: of the runs, in the order asked for.
+        series: the collected streams by name.
+        ticks: of one run.
+        wall_s: seconds spent in the engine's loop, without set-up.
+    """
+
+    graph: str
+    engine: str
+    seeds: tuple[int, ...]
+    series: Mapping[str, Runs]
+    ticks: int
+    wall_s: float
+
+    def __getitem__(self, name: str) -> Runs:
+        if name not in self.series:
+            raise UnknownNameError("output", name, self.series, path=self.graph)
+        return self.series[name]
+
+
+PerSeed = Callable[[int], Any]
+
+
+def simulate_many(
+    graph: Graph,
+    inputs: Inputs | PerSeed,
+    seeds: Sequence[int],
+    *,
+    engine: str = "xla",
+    dtype: str = "float64",
+    init: Mapping[str, Any] | PerSeed | None = None,
+    keep: Sequence[str] | None = None,
+    runs_at_once: int = RUNS_AT_ONCE,
+    progress: Meter | None = None,
+) -> Batch:
+    """Run a graph once for each seed.
+
+    Args:
+        graph: a built graph.
+        inputs: as for `simulate`, shared by all runs; or a function of the seed that gives them.
+        seeds: one a run.
+        engine, dtype: as for `simulate`.
+        init: other initial values, shared or a function of the seed.
+        keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out.
+        runs_at_once: size of a chunk of runs in XLA.
+        progress: told the number of finished runs.
+
+    Raises:
+        DataError: where, in XLA, two runs have events at different times.
+    """
+    kept = _kept(graph, keep)
+    if engine == "xla":
+        return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress)
+    return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress)
+
+
+def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
+    """The leaf names to keep of each output."""
+    every = {c.name: [n for n, _ in leaves_of(graph.port(c.wire).type)] for c in graph.collected}
+    if keep is None:
+        return every
+    found: dict[str, list[str]] = {}
+    for name in keep:
+        output, _, leaf = name.partition(".")
+        if output not in every or (leaf and leaf not in every[output]):
+            raise UnknownNameError(
+                "output", name, [*every, *(f"{o}.{x}" for o, leaves in every.items() for x in leaves)]
+            )
+        found.setdefault(output, []).extend([leaf] if leaf else every[output])
+    return found
+
+
+def _for_seed(given: Any, seed: int) -> Any:
+    return given(seed) if callable(given) else given
+
+
+def _one_by_one(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], engine: str, dtype: str, init: Any,
+    kept: dict[str, list[str]], progress: Meter | None,
+) -> Batch:  # fmt: skip
+    from flowgraph.simulate import simulate
+
+    parts: dict[str, list[Series]] = {name: [] for name in kept}
+    wall, ticks = 0.0, 0
+    for n, seed in enumerate(seeds):
+        result = simulate(
+            graph, _for_seed(inputs, seed), engine=engine, dtype=dtype, init=_for_seed(init, seed), seed=seed
+        )
+        wall, ticks = wall + result.wall_s, result.ticks
+        for name in kept:
+            parts[name].append(result[name])
+        if progress is not None:
+            progress.update(n + 1, 0)
+    return Batch(
+        graph.name, engine, seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall
+    )
+
+
+def _joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
+    """Series of several runs on the union of their times."""
+    time = np.unique(np.concatenate([p.time for p in parts]))
+    present = np.stack([np.isin(time, p.time) for p in parts])
+    made = {}
+    for leaf in leaves:
+        arrays = [p.leaves[leaf] for p in parts]
+        full = np.zeros((len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype)
+        full[present] = np.concatenate(arrays)
+        made[leaf] = full
+    return Runs(name, time, present, made)
+
+
+def _vectorised(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
+    kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None,
+) -> Batch:  # fmt: skip
+    from flowgraph.xla import Scan, import_jax
+
+    import_jax()
+    real = np.dtype(dtype)
+    pipeline = _pruned(lower(graph), kept)
+    shared = not callable(inputs)
+    first = tape(prepare(graph, inputs if shared else inputs(seeds[0])), graph)
+    keys = tuple(int(k) for k in np.unique(first.key))
+    scan = Scan(
+        pipeline, keys, real, min(_TICKS_AT_ONCE, max(len(first.time), 1)), runs=runs_at_once, shared=shared
+    )
+    dense_first = _columns([first], True, real)
+    chunks: list[list[Chunk]] = []
+    wall = 0.0
+    for n, members in enumerate(_chunks(seeds, runs_at_once)):
+        columns = dense_first if shared else _columns(_tapes(graph, inputs, members, first), False, real)
+        cells = _cells(graph, init, members)
+        words = np.stack([seed_words(s) for s in members])
+        scan.compile(cells, words, columns)
+        start = perf_counter()
+        played = list(scan(cells, words, first.time, first.key, columns))
+        wall += perf_counter() - start
+        chunks.append([part for part, _ in played])
+        done = min((n + 1) * runs_at_once, len(seeds))
+        for row in range(done - n * runs_at_once):
+            check_faults(pipeline, [cell[row] for cell in played[-1][1]])
+        if progress is not None:
+            progress.update(done, 0)
+    series = {
+        port.name: _collected(port, k, first.time, chunks, len(seeds), runs_at_once)
+        for k, port in enumerate(pipeline.outputs)
+    }
+    return Batch(graph.name, "xla", seeds, series, len(first.time), wall)
+
+
+def _pruned(pipeline: Pipeline, kept: dict[str, list[str]]) -> Pipeline:
+    ports = tuple(
+        replace(port, leaves=tuple(leaf for leaf in port.leaves if leaf.name in kept[port.name]))
+        for port in pipeline.outputs
+        if port.name in kept
+    )
+    return replace(pipeline, outputs=ports)
+
+
+def _chunks(seeds: tuple[int, ...], size: int) -> Iterator[tuple[int, ...]]:
+    """Seeds in chunks of one size; the last is filled up with its last seed."""
+    for start in range(0, len(seeds), size):
+        part = seeds[start : start + size]
+        yield part + (part[-1],) * (size - len(part))
+
+
+def _tapes(graph: Graph, inputs: PerSeed, members: tuple[int, ...], first: Tape) -> list[Tape]:
+    made: dict[int, Tape] = {}
+    for seed in members:
+        if seed not in made:
+            made[seed] = tape(prepare(graph, inputs(seed)), graph)
+            _same_ticks(graph, first, made[seed], seed)
+    return [made[seed] for seed in members]
+
+
+def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
+    if np.array_equal(first.time, other.time) and np.array_equal(first.key, other.key):
+        return
+    raise DataError(
+        "runs in one batch must have their events at the same times",
+        path=f"{graph.name}, seed {seed}",
+        expected=f"the {len(first.time)} ticks of the first run",
+        got=f"{len(other.time)} ticks, or others",
+        fix='run them one by one: engine="python", or a simulate(...) each',
+    )
+
+
+def _cells(graph: Graph, init: Any, members: tuple[int, ...]) -> list[np.ndarray]:
+    """Register cells with a leading axis of runs."""
+    slots = [initial_registers(graph, _for_seed(init, seed)) for seed in members]
+    types: list[tuple[int, Type]] = [(index, node.type) for index, node in graph.registers]
+    rows = [[leaf for index, type_ in types for leaf in flatten(slot[index], type_)] for slot in slots]
+    return [np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*rows, strict=True)]
+
+
+def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray]]:
+    """Dense leaves of each input; with a leading axis of runs where inputs differ."""
+    made = [
+        [
+            [dense(leaf, (t.key >> k & 1).astype(bool)) for leaf in real_leaves(s, real)]
+            for k, s in enumerate(t.series)
+        ]
+        for t in tapes
+    ]
+    if shared:
+        return made[0]
+    return [[np.stack(leaves) for leaves in zip(*ports, strict=True)] for ports in zip(*made, strict=True)]
+
+
+def _collected(
+    port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], runs: int, runs_at_once: int
+) -> Runs:
+    """One output of all runs, at the ticks in which it is present in any."""
+
+    def joined(pick: Callable[[Chunk], np.ndarray]) -> np.ndarray:
+        rows = [np.concatenate([pick(part) for part in parts], axis=1) for parts in chunks]
+        return np.concatenate(rows)[:runs]
+
+    def mask(part: Chunk) -> np.ndarray:
+        found = part.outputs[k][0]
+        return np.broadcast_to(found, (runs_at_once, part.ticks))
+
+    present = joined(mask)
+    some = present.any(axis=0)
+    leaves = {
+        leaf.name: joined(lambda part, n=n: part.outputs[k][1][n])[:, some]  # type: ignore[misc]
+        for n, leaf in enumerate(port.leaves)
+    }
+    return Runs(port.name, time[some], present[:, some], leaves)
+
+
+def _leaf_type(array: np.ndarray) -> Any:
+    return ArrayType(array.shape[1:], dtype_name(array))
