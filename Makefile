@@ -13,7 +13,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 # One thread for each process's linear algebra: the matrices are small, and pytest runs several processes.
 PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python -m pytest
 WORKERS = -n auto --maxprocesses 4
-SOURCES = $(wildcard flowgraph blocks graphs examples tests)
+SOURCES = $(wildcard flowgraph blocks graphs examples tests docs)
 TYPED   = $(wildcard flowgraph examples tests)
 
 .PHONY: help demo test test-slow lint bench docs clean
@@ -39,7 +39,7 @@ bench: $(VENV)/.with-bench+xla+test
 	$(BIN)/python -m tests.bench $(ARGS)
 
 docs: $(VENV)/.with-docs
-	$(BIN)/mkdocs build --strict --config-file $(firstword $(wildcard mkdocs.yml docs/mkdocs.yml) mkdocs.yml) \
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file $(firstword $(wildcard mkdocs.yml docs/mkdocs.yml) mkdocs.yml) \
 		--site-dir $(CURDIR)/out/site
 
 clean:

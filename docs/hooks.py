@@ -1,0 +1,83 @@
+"""Pictures and reference tables of the site, made when it is built and kept out of the tree.
+
+`generated/NAME.svg` is the diagram of each installed graph, started on the simulated flight. The pages named
+in `RUN` are run as programs, and the pictures that they write are taken as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import matplotlib
+from mkdocs.structure.files import File
+
+sys.path.insert(0, str(Path(__file__).parent))
+import library
+
+from flowgraph import FlowgraphError, find_graph, load_flight
+from flowgraph.registry import graph_names
+
+matplotlib.use("Agg")
+
+RUN = ("index.md", "tutorial.md")
+drawn: set[str] = set()
+log = logging.getLogger("mkdocs.hooks.pictures")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pictures to the files of the site."""
+    diagrams = dict(graphs())
+    drawn.update(diagrams)
+    pictures = {f"{name}.svg": svg for name, svg in diagrams.items()}
+    for name, content in {**pictures, **dict(written_by_pages(Path(config["docs_dir"])))}.items():
+        files.append(File.generated(config, f"generated/{name}", content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the reference tables where a page has a mark for them."""
+    return library.filled(markdown, drawn)
+
+
+def graphs() -> Iterator[tuple[str, bytes]]:
+    """The diagram of each installed graph."""
+    flight = load_flight("sim", seed=0)
+    for name in graph_names():
+        try:
+            yield name, find_graph(name).case(flight).graph.draw().encode()
+        except FlowgraphError as error:  # such as a graph that needs another flight
+            log.info("no diagram of %s: %s", name, error)
+
+
+def written_by_pages(docs: Path) -> Iterator[tuple[str, bytes]]:
+    """What the python blocks of some pages write."""
+    with tempfile.TemporaryDirectory() as folder:
+        for page in RUN:
+            module = ModuleType(f"docs_{Path(page).stem}")
+            sys.modules[module.__name__] = module
+            code = "\n".join(re.findall(r"^```python\n(.*?)^```$", (docs / page).read_text(), re.M | re.S))
+            with inside(folder), contextlib.redirect_stdout(None):
+                exec(compile(code, page, "exec"), module.__dict__)
+        for file in sorted(Path(folder).iterdir()):
+            if file.suffix in (".svg", ".png"):
+                yield file.name, file.read_bytes()
+
+
+@contextlib.contextmanager
+def inside(folder: str) -> Iterator[None]:
+    """Work in a folder for a while."""
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)

@@ -1,0 +1,126 @@
+"""Reference pages written from the code: each block with its ports, each signal with its fields, each graph.
+
+The pages hold a comment where the text goes; the hook puts it there when the site is built. So the
+reference cannot fall behind the blocks.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Collection, Iterator
+from types import ModuleType
+from typing import Any
+
+import flowgraph.blocks
+from flowgraph import Block, Signal, find_graph
+from flowgraph.block import REQUIRED
+from flowgraph.registry import graph_names
+from flowgraph.types import StructType, Type, leaves_of, struct_type
+
+
+def modules() -> list[ModuleType]:
+    """The modules of the block library."""
+    found = pkgutil.walk_packages(flowgraph.blocks.__path__, "flowgraph.blocks.")
+    return [importlib.import_module(info.name) for info in found]
+
+
+def public(kind: type) -> Iterator[tuple[ModuleType, str, Any]]:
+    """(module, name, object) of each instance or subclass of `kind` that a module defines for others."""
+    for module in modules():
+        for name, thing in vars(module).items():
+            chosen = issubclass(thing, kind) if isinstance(thing, type) else isinstance(thing, kind)
+            if chosen and not name.startswith("_") and thing.__module__ == module.__name__:
+                yield module, name, thing
+
+
+def blocks() -> str:
+    """A section a module, with each of its blocks."""
+    text: list[str] = []
+    last = None
+    for module, name, block in public(Block):
+        if module is not last:
+            text += [f"### {module.__name__}", *paragraphs(module)]
+            last = module
+        text += [f"#### {name}", *block_lines(block), fenced(block.step)]
+    return "\n\n".join(text)
+
+
+def block_lines(block: Block[Any]) -> Iterator[str]:
+    """Ports, settings and when it fires."""
+    rows = [("in", p.name + (" (optional)" if p.optional else ""), p.type) for p in block.ports]
+    outputs = block.outputs or ()
+    rows += [("out", p.name + (" (may be absent)" if p.optional else ""), p.type) for p in outputs]
+    lines = ["| | port | type |", "|---|---|---|"]
+    yield "\n".join([*lines, *(f"| {way} | {name} | {words(type_)} |" for way, name, type_ in rows)])
+    main = [f"`{p.name}`" for p in block.ports if not p.optional]
+    fires = f"Fires when {' and '.join(main)} {'is' if len(main) == 1 else 'are'} present, or at `at=`."
+    settings = [f"`{k}`" if v is REQUIRED else f"`{k}={v!r}`" for k, v in block.settings.items()]
+    state = " Has a state." if block.stateful else ""
+    host = " Stays in Python: cannot be lowered." if block.host else ""
+    yield (
+        (fires if main else "Fires when any of its inputs is present.")
+        + state
+        + host
+        + (f" Settings: {', '.join(settings)}." if settings else "")
+    )
+
+
+def signals() -> str:
+    """A table of the signal types."""
+    rows = ["| signal | field | type |", "|---|---|---|"]
+    for _, name, signal in public(Signal):
+        for k, (field, leaf) in enumerate(leaves_of(struct_type(signal))):
+            rows.append(f"| {f'`{name}`' if k == 0 else ''} | `{field}` | {leaf} |")
+    return "\n".join(rows)
+
+
+def graphs(page: str, drawn: Collection[str]) -> str:
+    """A section for each installed graph that the page has none for, with its diagram if it is drawn."""
+    text: list[str] = []
+    for name in graph_names():
+        if f"## {name}\n" in page:
+            continue
+        graph = find_graph(name)
+        sources, settings = graph.parameters
+        rows = ["| source | type | |", "|---|---|---|"]
+        rows += [f"| `{n}` | {words(t)} | {'optional' if o else ''} |" for n, (t, o) in sources.items()]
+        text += [f"## {name}", *paragraphs(inspect.getmodule(graph.function)), "\n".join(rows)]
+        text += [f"Settings: {', '.join(f'`{s}`' for s in settings)}."] if settings else []
+        text += [fenced(graph.function)]
+        if name in drawn:
+            text += [f"[![The diagram of {name}](generated/{name}.svg)](generated/{name}.svg)"]
+    return "\n\n".join(text)
+
+
+def words(type_: Type | None) -> str:
+    """A type in a table."""
+    if type_ is None:
+        return "any"
+    return f"`{type_}`" if isinstance(type_, StructType) else str(type_)
+
+
+def paragraphs(module: ModuleType | None) -> list[str]:
+    """What a module says about itself; indented text stays as it is."""
+    parts = (inspect.getdoc(module) or "").split("\n\n")
+    return [f"```text\n{p}\n```" if p.startswith(" ") else p for p in parts if p]
+
+
+def fenced(function: Any) -> str:
+    """A docstring as it stands, for its equations."""
+    doc = inspect.getdoc(function)
+    return f"```text\n{doc}\n```" if doc else ""
+
+
+MARKS = {"<!-- blocks -->": blocks, "<!-- signals -->": signals}
+
+
+def filled(markdown: str, drawn: Collection[str] = ()) -> str:
+    """A page with its marks replaced; `drawn` names the graphs of which there is a diagram."""
+    for mark, text in MARKS.items():
+        if mark in markdown:
+            markdown = markdown.replace(mark, text())
+    if "<!-- graphs -->" in markdown:
+        markdown = markdown.replace("<!-- graphs -->", graphs(markdown, drawn))
+    return markdown
