@@ -17,7 +17,7 @@ from flowgraph.errors import (
     UnknownNameError,
 )
 from flowgraph.graph import Graph
-from flowgraph.inputs import arrays, timing_of
+from flowgraph.inputs import arrays, ticks, timing_of
 from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
 from flowgraph.lowering import lower
 from flowgraph.many import Batch, simulate_many
@@ -29,7 +29,7 @@ from flowgraph.series import Flight, Series
 from flowgraph.simulate import simulate
 from flowgraph.state import load_state, save_state
 from flowgraph.stream import Held, Stream, apply
-from flowgraph.types import Array, Scalar, Signal, boolean, integer, real
+from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 
 __all__ = [
     "Array",
@@ -55,6 +55,7 @@ __all__ = [
     "Series",
     "Signal",
     "Stream",
+    "Tick",
     "TypeMismatchError",
     "UnknownNameError",
     "aperiodic",
@@ -80,6 +81,7 @@ __all__ = [
     "simulate",
     "simulate_many",
     "sink",
+    "ticks",
     "timing_of",
     "when",
     "zip",

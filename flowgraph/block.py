@@ -2,9 +2,9 @@
 
 A block is a plain function. Its positional parameters are ports, its keyword-only parameters settings;
 five names are handed in by the engine: `dt` (float seconds since this block last fired, 0 at first), `t`
-(the tick's time, int64 ns), `xp` (the array namespace), `draw` (random numbers) and `path`. A port annotated `X | None` is an
-optional input. The return annotation types the outputs; an output annotated `| None` has a clock of its
-own: the step returns None, or `when(condition, value)`, where it is absent.
+(the tick's time, int64 ns), `xp` (the array namespace), `draw` (random numbers) and `path`. A port
+annotated `X | None` is an optional input. The return annotation types the outputs; an output annotated
+`| None` has a clock of its own: the step returns None, or `when(condition, value)`, where it is absent.
 
 A block with memory declares its initial state with `@name.init`; its step then takes the state first and
 returns `(new state, outputs)`. Everything else about it is the same.
@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
+import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -68,7 +69,7 @@ class Port(NamedTuple):
 
 
 class StepOutput(NamedTuple):
-    """What one variant of a step gives at one output port; `presence` is "always", "never" or a value number."""
+    """What one variant of a step gives at an output; `presence` is "always", "never" or a value number."""
 
     presence: str | int
     type: Type | None
@@ -128,6 +129,7 @@ class Block(Generic[R]):
         clock: for joins, `(firing clock, argument clocks, settings) -> Clock | None` of the first output.
         output: for joins, `(argument types, settings) -> Type` of the first output.
         fault: for joins, `(state leaf, message)`: a time in ns at which a bound was exceeded.
+        local: names of the function in which it is defined, for its annotations.
     """
 
     def __init__(
@@ -140,16 +142,17 @@ class Block(Generic[R]):
         clock: Callable[..., Any] | None = None,
         output: Callable[..., Type] | None = None,
         fault: tuple[str, str] | None = None,
+        local: Mapping[str, Any] | None = None,
     ) -> None:
         functools.update_wrapper(self, step)
         self.step = step
         self.name = name or getattr(step, "__name__", type(step).__name__).strip("<>")
         self.host = host
-        self._init = init
+        self._init, self._local = init, local
         self.clock_rule, self.output_rule, self.fault = clock, output, fault
 
     def init(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Decorator: `function(*port_types, **settings)` gives the initial state; the step then takes it first."""
+        """Decorator: `function(*port_types, **settings)` is the initial state; the step takes it first."""
         self._init = function
         self.__dict__.pop("_signature_parts", None)
         return function
@@ -173,9 +176,17 @@ class Block(Generic[R]):
         except (TypeError, ValueError):  # a ufunc or another builtin: one port
             return (Port("x", None, False),), {}, frozenset(), None
         try:
-            hints = typing.get_type_hints(self.step, include_extras=True)
-        except (NameError, TypeError):
+            hints = typing.get_type_hints(self.step, localns=dict(self._local or {}), include_extras=True)
+        except TypeError:
             hints = {}
+        except NameError as error:
+            raise DeclarationError(
+                f"an annotation cannot be resolved: {error}",
+                path=self.name,
+                expected="names visible where the block is defined",
+                got=str(error),
+                fix="import the signal type at module level",
+            ) from None
         ports, settings, handed = [], {}, set()
         for p in parameters:
             if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD):
@@ -357,9 +368,11 @@ def block(
 ) -> Callable[[Callable[..., R]], Block[R]]: ...
 def block(step: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     """Make a block of a typed function: `@block`, or `@block(host=True)` for one that stays in Python."""
+    frame = sys._getframe(1)
+    local = None if frame.f_locals is frame.f_globals else frame.f_locals
     if step is None:
-        return lambda function: Block(function, **options)
-    return Block(step)
+        return lambda function: Block(function, local=local, **options)
+    return Block(step, local=local)
 
 
 def fits_state(new: Any, state: Type, path: str) -> None:

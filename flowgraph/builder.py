@@ -111,7 +111,7 @@ class Builder:
         return self._stamps[firing]
 
     def random_streams(self, prefix: str, path: str) -> str:
-        """Claim the names that begin with `prefix` for one node, so that no two nodes draw the same numbers."""
+        """Claim the names that begin with `prefix` for one node: no two nodes draw the same numbers."""
         if prefix in self._draws:
             raise DeclarationError(
                 f"the random streams {prefix!r} are taken by {self._draws[prefix]}",

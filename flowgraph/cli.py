@@ -240,9 +240,9 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
         case.graph.draw(str(file))
     with _writing(out / "metrics.json") as file:
         file.write_text(json.dumps(report, indent=1) + "\n")
-    if "belief" in result.series:
+    if case.estimate in result.series:
         with _writing(out / "navigation.png") as file:
-            plot_navigation(result["belief"], flight.truth, file)
+            plot_navigation(result[case.estimate], flight.truth, file)
 
 
 @contextmanager
@@ -262,7 +262,7 @@ def _print_json(value: Any) -> None:
     print()
 
 
-_WORDS = {
+_WORDS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "position_rmse_m": ("position RMSE [mm]", lambda v: f"{1e3 * v:.2f}"),
     "attitude_rmse_deg": ("attitude [deg]", lambda v: f"{v:.3f}"),
     "tilt_rmse_deg": ("tilt [deg]", lambda v: f"{v:.3f}"),

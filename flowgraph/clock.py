@@ -65,7 +65,7 @@ class Timing:
 def periodic(period: str | int, *, phase: str | int | None = None, jitter: str | int = 0) -> Timing:
     """A source with one event each `period` ("5ms"); data that do not keep to it are refused at run time.
 
-    With `phase` given and no `jitter`, coincidences with other such sources are known when the graph is built.
+    With `phase` given and no `jitter`, coincidences with other such sources are known at build.
     """
     length = nanoseconds(period, what="period")
     if length <= 0:
@@ -311,7 +311,9 @@ def _coincide(a: Timing, a_present: bool, b: Timing, b_present: bool) -> bool:
     exact = all(t.period is not None and t.phase is not None and not t.jitter for t in (a, b))
     if not exact or not (a_present or b_present):
         return True
-    assert a.period and b.period and a.phase is not None and b.phase is not None
+    assert a.period and b.period  # as `exact` says
+    assert a.phase is not None
+    assert b.phase is not None
     meet = (a.phase - b.phase) % math.gcd(a.period, b.period) == 0
     if a_present and b_present:
         return meet

@@ -67,7 +67,7 @@ class PipelineError(FlowgraphError):
 
 
 class DataError(FlowgraphError):
-    """Input data are missing, malformed, out of order or not finite; names file and row, or source and time."""
+    """Input data are missing, malformed, out of order or not finite; names file and row, or the source."""
 
 
 class FifoOverflowError(FlowgraphError):

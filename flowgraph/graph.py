@@ -7,13 +7,14 @@ changes after it is built; all state lives in runs.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flowgraph.block import Block, StepTrace
 from flowgraph.clock import Clock, Source, atoms
-from flowgraph.errors import CycleError, LoweringError, UnknownNameError
+from flowgraph.errors import CycleError, LoweringError, MissingDependencyError, UnknownNameError
 from flowgraph.types import Type
 
 if TYPE_CHECKING:
@@ -189,10 +190,8 @@ class Graph:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         bundle = {"text/plain": self.text()}
-        try:
+        with contextlib.suppress(MissingDependencyError):  # without a layout engine there is still the text
             bundle["image/svg+xml"] = self.draw()
-        except Exception:  # a notebook without a layout engine still shows the text
-            pass
         return bundle
 
     def __repr__(self) -> str:

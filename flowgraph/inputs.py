@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph.clock import Timing, aperiodic, periodic
+from flowgraph.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.errors import ClockError, DataError, TypeMismatchError, UnknownNameError
 from flowgraph.graph import NEVER, Graph
 from flowgraph.series import Flight, Series
@@ -53,6 +53,17 @@ def arrays(
     return series if keep.all() else series[keep]
 
 
+def ticks(period: str | int, *, until: str | int, start: int = 0, name: str = "ticks") -> Series:
+    """A source that only keeps time: true at `start` (int ns) and each `period` after it, before `until`.
+
+    Args:
+        period, until: a duration such as "5ms", or integer nanoseconds; `until` counts from `start`.
+    """
+    step = nanoseconds(period, what="period")
+    time = np.arange(0, nanoseconds(until, what="until"), step, dtype=np.int64) + start
+    return Series(time, np.ones(len(time), dtype=bool), name=name)
+
+
 def timing_of(series: Series) -> Timing:
     """The clock that a recording keeps: periodic where its steps are equal to 1 %, otherwise aperiodic."""
     steps = np.diff(series.time)
@@ -77,7 +88,7 @@ def _broken_rows(series: Series) -> np.ndarray:
     broken = np.zeros(len(series), dtype=bool)
     for leaf in series.leaves.values():
         if leaf.dtype.kind == "f":
-            broken |= ~np.isfinite(leaf.reshape(len(leaf), -1)).all(axis=1)
+            broken |= ~np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim)))
     return broken
 
 
@@ -258,26 +269,25 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
                 got=f"{int(steps[row])} ns (t = {int(stamps[row + 1])} ns)",
                 fix=f'declare what is true: {name}=periodic(..., jitter="...") or {name}=aperiodic(max_rate=...)',
             )
-        if timing.phase is not None and not timing.jitter:
-            # whole periods after the first stamp, the others are in phase if it is
-            if len(time) and (int(time[0]) - timing.phase) % timing.period != 0:
-                raise ClockError(
-                    "the data do not keep the declared phase",
-                    path=f"{name}, event 0",
-                    expected=f"a multiple of {timing.period} ns plus {timing.phase} ns",
-                    got=f"t = {int(time[0])} ns",
-                    fix="leave the phase out, or shift the stamps",
-                )
-    if timing.max_rate is not None:
-        if least < int(1e9 / timing.max_rate):
-            row = int(np.flatnonzero(steps < int(1e9 / timing.max_rate))[0])
+        # the others come whole periods after the first, and are in phase if it is
+        phase = None if timing.jitter or not len(time) else timing.phase
+        if phase is not None and (int(time[0]) - phase) % timing.period != 0:
             raise ClockError(
-                "events come closer than the declared highest rate",
-                path=f"{name}, event {row + 1}",
-                expected=f"at least {int(1e9 / timing.max_rate)} ns apart ({timing.max_rate:g} Hz)",
-                got=f"{int(steps[row])} ns (t = {int(stamps[row + 1])} ns)",
-                fix=f"declare {name}=aperiodic(max_rate={1e9 / max(int(steps[row]), 1):.0f}) or more",
+                "the data do not keep the declared phase",
+                path=f"{name}, event 0",
+                expected=f"a multiple of {timing.period} ns plus {timing.phase} ns",
+                got=f"t = {int(time[0])} ns",
+                fix="leave the phase out, or shift the stamps",
             )
+    if timing.max_rate is not None and least < int(1e9 / timing.max_rate):
+        row = int(np.flatnonzero(steps < int(1e9 / timing.max_rate))[0])
+        raise ClockError(
+            "events come closer than the declared highest rate",
+            path=f"{name}, event {row + 1}",
+            expected=f"at least {int(1e9 / timing.max_rate)} ns apart ({timing.max_rate:g} Hz)",
+            got=f"{int(steps[row])} ns (t = {int(stamps[row + 1])} ns)",
+            fix=f"declare {name}=aperiodic(max_rate={1e9 / max(int(steps[row]), 1):.0f}) or more",
+        )
 
 
 def check_event(

@@ -18,7 +18,7 @@ import numpy as np
 from flowgraph import clock as clocks
 from flowgraph.block import REQUIRED, Block, block, when
 from flowgraph.builder import builder
-from flowgraph.clock import Clock, Condition, Counted, Source, clock_of, nanoseconds, within
+from flowgraph.clock import Clock, Counted, Source, clock_of, nanoseconds, within
 from flowgraph.errors import ClockError, DeclarationError
 from flowgraph.graph import NEVER
 from flowgraph.stream import Stream
@@ -71,7 +71,7 @@ def latest(
         )
     if init is REQUIRED:
         if stream is not None and at is not None and within(clock_of(at), stream.clock):
-            return _sample(stream, at=at, name=name or "latest")
+            return _sample(stream, at=at, name=name)
         raise ClockError(
             "no initial value, and no proof that a value came first",
             path=stream.label if stream is not None else name or "latest",
@@ -265,14 +265,10 @@ def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
     for i, (x, y) in enumerate(builtins.zip(in_a, in_b, strict=True)):
         before = ahead
         ahead += int(x) - int(y)
-        depth = max(depth, abs(before) + 1, abs(ahead))
+        depth = max(depth, abs(ahead))
         if (y and before > 0) or (x and before < 0) or (x and y):
             pairs.append(i)
-    first = [i for i in pairs if i >= span]
-    offsets = [i - span for i in first]
-    steady = [i for i in pairs if i < span] == offsets  # no pair is missing from the first round
-    clock = clocks.counted(root, span, offsets) if steady else Condition(label, root)
-    return depth, clock
+    return depth, clocks.counted(root, span, [i for i in pairs if i < span])  # both rounds are alike
 
 
 def _pair_type(types: list[Type], _: Any) -> Type:
@@ -318,6 +314,9 @@ def _pair(a, b):  # type: ignore[no-untyped-def]
     return a, b
 
 
+_pair_latest: Block[Any] = Block(_pair.step, name="zip_latest")
+
+
 def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[Any]:
     """Pairs in order: the k-th of `a` with the k-th of `b`. Two queues, whose size follows from the clocks.
 
@@ -337,12 +336,12 @@ def zip_latest(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = 
     _need_streams(name or "zip_latest", a=a, b=b)
     first, second = init
     left, right = latest(a, init=first), latest(b, init=second)
-    return typing.cast("Stream[Any]", _pair(left, right, at=a | b, name=name or "zip_latest"))
+    return typing.cast("Stream[Any]", _pair_latest(left, right, at=a | b, name=name))
 
 
 def zip_latest_right(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
     """Pairs whenever `a` comes, with the last value of `b`; `init` is the value of `b` before its first."""
-    return typing.cast("Stream[Any]", _pair(a, latest(b, init=init), name=name or "zip_latest_right"))
+    return typing.cast("Stream[Any]", _pair_latest(a, latest(b, init=init), name=name))
 
 
 @block(name="match", output=_pair_type, fault=("overflow", "the queue is full"))

@@ -7,8 +7,30 @@ from typing import Any
 import numpy as np
 
 
+class _LinearAlgebra:
+    """`numpy.linalg`; `vecdot` is the ufunc itself, not its wrapper in Python."""
+
+    vecdot = staticmethod(np.vecdot)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(np.linalg, name)
+        setattr(self, name, found)
+        return found
+
+
 class NumpyNamespace:
-    """`numpy` with `float32_bits` and `materialise`."""
+    """`numpy` with `float32_bits` and `materialise`.
+
+    On small arrays a function's Python wrapper costs more than its work. Where blocks meet that often, the
+    wrapper is passed by.
+    """
+
+    linalg: Any = _LinearAlgebra()
+
+    @staticmethod
+    def reshape(x: Any, /, shape: Any, *, copy: bool | None = None) -> Any:
+        """`numpy.reshape`."""
+        return x.reshape(shape) if type(x) is np.ndarray and copy is None else np.reshape(x, shape, copy=copy)
 
     @staticmethod
     def float32_bits(x: Any) -> Any:

@@ -170,7 +170,7 @@ def _stack(*xs: Spec, axis: int) -> Spec:
     if len({x.shape for x in xs}) > 1:
         raise ShapeError(f"cannot stack {', '.join(str(x.shape) for x in xs)}")
     along = _axis(axis, len(xs[0].shape) + 1)
-    shape = xs[0].shape[:along] + (len(xs),) + xs[0].shape[along:]
+    shape = (*xs[0].shape[:along], len(xs), *xs[0].shape[along:])
     return Spec(shape, promote(*(x.dtype for x in xs)))
 
 
@@ -245,6 +245,10 @@ def _many(name: str) -> Callable[..., Any]:
     return lambda xp, *args, **attrs: getattr(xp, name)(args, **attrs)
 
 
+def _run_int64(name: str) -> Callable[..., Any]:
+    return lambda xp, *args, **attrs: getattr(xp, name)(*args, **attrs).astype(DTYPES["int64"])
+
+
 def _run_astype(xp: Any, x: Any, *, dtype: Any) -> Any:
     return xp.asarray(x).astype(dtype)
 
@@ -307,7 +311,7 @@ def _table() -> dict[str, Op]:
     add("cross", _cross, "same", _linalg)
     add("vecdot", _vecdot, "same", _linalg)
     add("outer", _outer, "same", _linalg)
-    add("searchsorted", _int_of, "same")
+    add("searchsorted", _int_of, "same", _run_int64)
     add("tril triu", _same, "as is")
     ops["where"] = Op("where", _where, _namespace("where"))
     ops["permute_dims"] = Op("permute_dims", _permute, _run_axes)

@@ -321,7 +321,7 @@ class Pipeline:
                 )
 
     def save(self, folder: str | Path) -> Path:
-        """Write `pipeline.json` and a listing `pipeline.txt` into a folder (made if missing); returns the folder.
+        """Write `pipeline.json` and a listing `pipeline.txt` into a folder, made if missing; returns it.
 
         Raises:
             PipelineError: where the folder holds another pipeline; nothing is overwritten in silence.
@@ -371,7 +371,8 @@ class Pipeline:
 
     def __repr__(self) -> str:
         t = self.totals()
-        return f"<Pipeline {self.name}: {t['stages']} stages, {t['instructions']} instructions, {t['register_bytes']} B>"
+        size = f"{t['stages']} stages, {t['instructions']} instructions, {t['register_bytes']} B of registers"
+        return f"<Pipeline {self.name}: {size}>"
 
 
 def work(i: Instruction, specs: Mapping[int, Spec]) -> int:
@@ -468,7 +469,7 @@ def _numbers(array: Any) -> Any:
 
 
 def _array(data: Any, shape: list[int], dtype: str) -> np.ndarray:
-    array = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
+    array: np.ndarray = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
     return array.astype(DTYPES[dtype]).reshape(shape)
 
 

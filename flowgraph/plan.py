@@ -11,14 +11,13 @@ from __future__ import annotations
 import linecache
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import CodeType, ModuleType
+from types import CodeType
 from typing import Any
-
-import numpy as np
 
 from flowgraph.block import StepTrace, When
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
 from flowgraph.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
+from flowgraph.namespaces import NUMPY
 
 Presence = bool | str
 """Whether something is present: known for a pattern, or an expression of the reaction's variables."""
@@ -195,18 +194,6 @@ class _Writer:
     @staticmethod
     def dt(stamp: int | None) -> str:
         return f"(t - r[{stamp}]) * 1e-9 if r[{stamp}] != NEVER else 0.0"
-
-
-def _reshape(x: Any, /, shape: Any, *, copy: bool | None = None) -> Any:
-    """`numpy.reshape` without its search for a method: small arrays are reshaped often."""
-    return x.reshape(shape) if type(x) is np.ndarray and copy is None else np.reshape(x, shape, copy=copy)
-
-
-NUMPY = ModuleType("numpy")
-"""What blocks are handed as `xp`: NumPy, with the functions replaced whose Python wrappers cost more than they do."""
-NUMPY.__dict__.update(vars(np), reshape=_reshape)
-NUMPY.__dict__["linalg"] = ModuleType("numpy.linalg")
-NUMPY.linalg.__dict__.update(vars(np.linalg), vecdot=np.vecdot)
 
 
 def bindings(graph: Graph) -> dict[str, Any]:

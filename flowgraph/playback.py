@@ -181,7 +181,11 @@ def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: 
     for register in pipeline.registers:
         parts = {c.name: np.asarray(next(values)).astype(DTYPES[c.dtype]) for c in register.cells}
         registers[register.path] = parts["value"] if list(parts) == ["value"] else parts
-    return {"registers": registers, "sources": {n: np.asarray(t, dtype=np.int64) for n, t in last.items()}}
+    return {
+        "registers": registers,
+        "sources": {n: np.asarray(t, dtype=np.int64) for n, t in last.items()},
+        "seed": np.asarray(seed, dtype=np.uint64),
+    }
 
 
 def check_faults(pipeline: Pipeline, cells: list[Any]) -> None:

@@ -68,13 +68,13 @@ def specialise(pipeline: Pipeline, key: int | None) -> Program:
             )
         )
     writes = tuple(same.get(c.write, c.write) for r in pipeline.registers for c in r.cells)
-    constants = dict(pipeline.constants) | {n: np.bool_(v) for n, v in known.items()}
+    constants = dict(pipeline.constants) | {n: np.asarray(v) for n, v in known.items()}
     live, needed = _live(
         kept, [*writes, *(n for p, leaves in outputs for n in (*leaves, *([] if p is None else [p])))]
     )
     return Program(
         {n: a for n, a in constants.items() if n in needed}, live, tuple(outputs), writes, pipeline.specs
-    )  # type: ignore[misc]
+    )
 
 
 def _fold(

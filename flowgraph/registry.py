@@ -32,11 +32,13 @@ class Case:
         graph: built, with the start and the noise for this flight.
         inputs: the flight's streams by source name.
         score: `result -> {metric: value}`, against the flight's truth.
+        estimate: name of the collected stream that the score and the pictures are of.
     """
 
     graph: Graph
     inputs: Inputs
     score: Callable[[Result], dict[str, float]]
+    estimate: str = "belief"
 
 
 def graph_names() -> list[str]:

@@ -17,9 +17,31 @@ ENGINES = ("python", "reference", "xla")
 
 
 @typing.overload
-def simulate(graph: Graph, inputs: Inputs, *, seeds: None = None, **options: Any) -> Result: ...
+def simulate(
+    graph: Graph,
+    inputs: Inputs,
+    *,
+    engine: str = ...,
+    dtype: str = ...,
+    init: Mapping[str, Any] | None = ...,
+    state: Mapping[str, Any] | None = ...,
+    seed: int = ...,
+    seeds: None = ...,
+    progress: Meter | None = ...,
+) -> Result: ...
 @typing.overload
-def simulate(graph: Graph, inputs: Inputs, *, seeds: Sequence[int], **options: Any) -> Batch: ...
+def simulate(
+    graph: Graph,
+    inputs: Inputs,
+    *,
+    engine: str = ...,
+    dtype: str = ...,
+    init: Mapping[str, Any] | None = ...,
+    state: Mapping[str, Any] | None = ...,
+    seed: int = ...,
+    seeds: Sequence[int],
+    progress: Meter | None = ...,
+) -> Batch: ...
 def simulate(
     graph: Graph,
     inputs: Inputs,

@@ -101,6 +101,18 @@ class Stream(Generic[T]):
     def __neg__(self) -> Stream[Any]:
         return apply(operator.neg, self)
 
+    def __lt__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.lt, self, other)
+
+    def __le__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.le, self, other)
+
+    def __gt__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.gt, self, other)
+
+    def __ge__(self, other: Any) -> Stream[Any]:
+        return _operate(operator.ge, self, other)
+
     def __bool__(self) -> bool:
         raise DeclarationError(
             "a stream has no truth value when the graph is declared",
@@ -131,7 +143,7 @@ class Held(Generic[T]):
 
     def at(self, clock: object, *, name: str | None = None) -> Stream[T]:
         """A stream that samples this value at a clock."""
-        return typing.cast("Stream[T]", _SAMPLE(self, at=clock, name=name or "sample"))
+        return typing.cast("Stream[T]", _SAMPLE(self, at=clock, name=name))
 
     def feed(self, stream: Stream[T]) -> None:
         """Write `stream` into this register at the end of each tick in which it is present."""
@@ -162,7 +174,7 @@ def apply(
     at: object = None,
     **settings: Any,
 ) -> Stream[Any]:
-    """A stream of `function(values...)`, present when all streams are: their clocks must be provably equal."""
+    """A stream of `function(values...)`, present when all streams are; their clocks must be equal."""
     named = getattr(function, "__name__", "map")
     rule = None if out is None else (lambda types, settings: annotation_type(out))
     block: Block[Any] = (

@@ -123,9 +123,13 @@ class Trace:
 def caller() -> str:
     """module:line of the nearest frame outside the recording machinery."""
     frame = sys._getframe(1)
-    while frame.f_back and frame.f_globals.get("__name__") in (__name__, "flowgraph.ops"):
+    while frame.f_back and _is_machinery(frame.f_globals.get("__name__", "?")):
         frame = frame.f_back
     return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
+
+
+def _is_machinery(module: str) -> bool:
+    return module in (__name__, "flowgraph.ops") or module.partition(".")[0] == "numpy"
 
 
 def refuse(what: str, expected: str, got: str, fix: str) -> NoReturn:

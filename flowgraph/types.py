@@ -12,6 +12,7 @@ bound when the graph is built.
 
 from __future__ import annotations
 
+import inspect
 import types as _pytypes
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -89,6 +90,10 @@ Scalar = Annotated[Any, ArrayType()]
 """A real scalar without a unit, for annotations: `Stream[Scalar]`."""
 
 
+Tick = Annotated[Any, ArrayType((), "bool")]
+"""What a source that only keeps time carries: `Stream[Tick]`."""
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(real, boolean, integer))
 class Signal:
     """Base class of signal types: a frozen struct of fixed-shape arrays.
@@ -108,7 +113,7 @@ class Signal:
     def __init_subclass__(cls) -> None:
         leaves = dict(cls._leaf_types)
         names = list(cls._fields)
-        for name in cls.__dict__.get("__annotations__", {}):
+        for name in inspect.get_annotations(cls):
             default = cls.__dict__.get(name)
             if isinstance(default, ArrayType):
                 leaves[name] = default
@@ -239,7 +244,7 @@ def map_leaves(type_: Type, change: typing.Callable[[ArrayType], ArrayType]) -> 
 
 
 def dtype_name(array: Any) -> str:
-    """The kind of number of an array or Python scalar: "real", "bool", "int32", "int64", "uint32", "uint64"."""
+    """The kind of number of an array or Python scalar, one of `DTYPES`."""
     kind = np.dtype(getattr(array, "dtype", None) or np.asarray(array).dtype)
     if kind.kind == "f":
         return "real"
@@ -313,7 +318,7 @@ def check_fits(given: Type, wanted: Type, *, given_at: str, wanted_at: str, size
         if given.cls is not wanted.cls or [n for n, _ in given.fields] != [n for n, _ in wanted.fields]:
             refuse(
                 "the signal type",
-                f"convert it in a block {given} -> {wanted}: they are different quantities, not different names",
+                f"convert it in a block {given} -> {wanted}: these are different quantities",
             )
         for (name, g), (_, w) in zip(given.fields, wanted.fields, strict=True):
             check_fits(g, w, given_at=f"{given_at}.{name}", wanted_at=f"{wanted_at}.{name}", sizes=sizes)

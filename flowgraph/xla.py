@@ -220,14 +220,14 @@ class Scan:
 def _places(keys: tuple[int, ...], key: np.ndarray) -> np.ndarray:
     """For each of `key` its place in `keys`, which are in order."""
     if max(keys, default=0) >= 2**16:
-        return np.searchsorted(keys, key)
+        return np.asarray(np.searchsorted(keys, key))
     table = np.zeros(max(keys, default=0) + 1, np.int32)
     table[list(keys)] = range(len(keys))
-    return table[key]
+    return np.asarray(table[key])
 
 
 def _picked(known: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return np.ones(len(places), bool) if known.all() else known[places]
+    return np.ones(len(places), bool) if known.all() else np.asarray(known[places])
 
 
 def _known_presence(programs: list[Program], k: int) -> np.ndarray | None:
