@@ -23,6 +23,7 @@ from flowgraph import Array
 
 __all__ = [
     "multiply",
+    "right_product",
     "conjugate",
     "normalize",
     "from_rotation_vector",
@@ -70,19 +71,26 @@ def _matrix_table() -> np.ndarray:
 
 
 _PRODUCT = _product_table()
+_RIGHT = _PRODUCT.reshape(4, 4, 4).transpose(1, 2, 0).reshape(4, 16)
 _MATRIX = _matrix_table()
 _SKEW = _table((3, 9), {(0, 5): -1, (0, 7): 1, (1, 2): 1, (1, 6): -1, (2, 1): -1, (2, 3): 1})
 _CONJUGATE = _table((4,), {(0,): 1, (1,): -1, (2,): -1, (3,): -1})
 
 
 def _outer(a: Array, b: Array, xp: Any) -> Array:
+    """The 16 products (..., 16) of the parts of two quaternions."""
     product = a[..., :, None] * b[..., None, :]
-    return xp.reshape(product, (*product.shape[:-2], product.shape[-2] * product.shape[-1]))
+    return xp.reshape(product, (*product.shape[:-2], 16))
 
 
 def multiply(a: Array, b: Array, *, xp: Any) -> Array:
     """The quaternion product (..., 4): first b, then a, as rotations (Solà eq. 12)."""
     return _outer(a, b, xp) @ xp.asarray(_PRODUCT, dtype=a.dtype)
+
+
+def right_product(b: Array, *, xp: Any) -> Array:
+    """The matrix (..., 4, 4) of a product with b on the right: right_product(b) @ a = a * b (Solà eq. 19)."""
+    return xp.reshape(b @ xp.asarray(_RIGHT, dtype=b.dtype), (*b.shape[:-1], 4, 4))
 
 
 def conjugate(q: Array, *, xp: Any) -> Array:
@@ -97,12 +105,10 @@ def normalize(q: Array, *, xp: Any) -> Array:
 
 def from_rotation_vector(v: Array, *, xp: Any) -> Array:
     """Exp: the quaternion (..., 4) of a rotation vector (..., 3) in rad (Solà eq. 101)."""
-    squared = xp.linalg.vecdot(v, v)[..., None]
-    small = squared < 1e-8
-    half = 0.5 * xp.sqrt(xp.where(small, 1.0, squared))
-    scalar = xp.where(small, 1.0 - squared / 8.0, xp.cos(half))
-    scale = xp.where(small, 0.5 - squared / 48.0, 0.5 * xp.sin(half) / half)
-    return xp.concat([scalar, scale * v], axis=-1)
+    u = 0.5 * v
+    # below 1e-15 rad the cosine and sin(half) / half are 1 to the last bit: no series, and never 0/0
+    half = xp.sqrt(xp.maximum(xp.linalg.vecdot(u, u)[..., None], 1e-30))
+    return xp.concat([xp.cos(half), xp.sin(half) / half * u], axis=-1)
 
 
 def to_rotation_vector(q: Array, *, xp: Any) -> Array:

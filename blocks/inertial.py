@@ -8,12 +8,15 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from flowgraph import block
-from flowgraph.blocks.geometry import from_rotation_vector, multiply, normalize, skew, to_matrix
+import numpy as np
+
+from flowgraph import Array, block
+from flowgraph.blocks.geometry import from_rotation_vector, normalize, right_product, skew, to_matrix
 from flowgraph.blocks.signals import Belief, Imu
 
 __all__ = ["GRAVITY", "ImuNoise", "predict"]
@@ -90,6 +93,22 @@ class ImuNoise:
         return tuple(density**2 for density in parts for _ in range(3))
 
 
+# What is constant in the Jacobian, in the order of `Belief`: all stay, the position drifts by the velocity.
+_STAYS, _DRIFTS, _BIASES_STAY = np.eye(15, 6), np.eye(15, 6, 3), np.eye(6, 9, 3)
+
+
+@functools.lru_cache
+def _density(noise: ImuNoise) -> np.ndarray:
+    """The spectral density (15, 15) of the driving noise."""
+    return np.diag(noise.power())
+
+
+def _like(table: Array, x: Array, xp: Any) -> Array:
+    """A constant matrix with the leading axes of x, in its precision."""
+    table = xp.asarray(table, dtype=x.dtype)
+    return xp.broadcast_to(table, (*x.shape[:-2], *table.shape)) if x.ndim > 2 else table
+
+
 @block
 def predict(
     belief: Belief,
@@ -119,30 +138,26 @@ def predict(
     rate = imu.gyro - belief.gyro_bias
     force = imu.specific_force - belief.accelerometer_bias
     half = from_rotation_vector(rate * (0.5 * dt), xp=xp)
-    half_matrix = to_matrix(half, xp=xp)
-    start_matrix = to_matrix(belief.attitude, xp=xp)
-    middle_matrix = start_matrix @ half_matrix
-    acceleration = (middle_matrix @ force[..., None])[..., 0] + xp.asarray(gravity, dtype=kind)
+    by_half = right_product(half, xp=xp)
+    middle = by_half @ belief.attitude[..., None]  # the attitude half-way, as a column
+    both = to_matrix(xp.concat([middle.mT, half[..., None, :]], axis=-2), xp=xp)
+    R, back = both[..., 0, :, :], both[..., 1, :, :].mT
+    acceleration = (R @ force[..., None])[..., 0] + xp.asarray(gravity, dtype=kind)
     step = acceleration * dt
 
     # d(velocity')/d(attitude, gyro bias, accelerometer bias); the position's are dt/2 times these
-    zero = 0.0 * half_matrix
-    one = zero + xp.eye(3, dtype=kind)
-    back = half_matrix.mT
-    turned = middle_matrix @ skew(force * -dt, xp=xp) @ back
-    pull = xp.concat([turned, turned * (-0.5 * dt), middle_matrix * -dt], axis=-1)
-    top = xp.concat([one, one * dt, pull * (0.5 * dt)], axis=-1)
-    middle = xp.concat([zero, one, pull], axis=-1)
-    attitude = xp.concat([zero, zero, back @ back, back * -dt, zero], axis=-1)
-    gyro_bias = xp.concat([zero, zero, zero, one, zero], axis=-1)
-    accelerometer_bias = xp.concat([zero, zero, zero, zero, one], axis=-1)
-    F = xp.concat([top, middle, attitude, gyro_bias, accelerometer_bias], axis=-2)
-    Q = xp.eye(15, dtype=kind) * xp.asarray(noise.power(), dtype=kind) * (0.5 * dt)
+    turned = R @ skew(force * -dt, xp=xp) @ back
+    pull = xp.concat([turned, turned * (-0.5 * dt), R * -dt], axis=-1)
+    turn = xp.concat([back @ back, back * -dt, 0.0 * back], axis=-1)
+    biases = _like(_BIASES_STAY, R, xp)
+    moved = _like(xp.asarray(_STAYS, dtype=kind) + xp.asarray(_DRIFTS, dtype=kind) * dt, R, xp)
+    F = xp.concat([moved, xp.concat([pull * (0.5 * dt), pull, turn, biases], axis=-2)], axis=-1)
+    Q = xp.asarray(_density(noise), dtype=kind) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
     return Belief(
         position=belief.position + (belief.velocity + 0.5 * step) * dt,
         velocity=belief.velocity + step,
-        attitude=normalize(multiply(belief.attitude, multiply(half, half, xp=xp), xp=xp), xp=xp),
+        attitude=normalize((by_half @ middle)[..., 0], xp=xp),
         gyro_bias=belief.gyro_bias,
         accelerometer_bias=belief.accelerometer_bias,
         covariance=0.5 * (P + P.mT),

@@ -364,7 +364,7 @@ def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series
         columns = [list(c) for c in zip(*(flatten(v, type_) for v in values), strict=True)] or [
             [] for _ in leaves
         ]
-    made = [
+    made: list[np.ndarray] = [
         np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
         for column, (_, leaf) in zip(columns, leaves, strict=True)
     ]

@@ -33,6 +33,11 @@ class NumpyNamespace:
         return x.reshape(shape) if type(x) is np.ndarray and copy is None else np.reshape(x, shape, copy=copy)
 
     @staticmethod
+    def argsort(x: Any, /, *, axis: int = -1) -> Any:
+        """`numpy.argsort`, with equal values in their order, as the array API has it."""
+        return np.argsort(x, axis=axis, stable=True)
+
+    @staticmethod
     def float32_bits(x: Any) -> Any:
         """The bits of the IEEE binary32 number nearest to each int32, as int32: octave and leading bits."""
         return np.asarray(x).astype(np.float32).view(np.int32)

@@ -79,12 +79,23 @@ def _elementwise(dtype: str | None) -> Callable[..., Spec]:
     return rule
 
 
+_COUNTS = {"bool": "int64", "int32": "int64", "uint32": "uint64"}
+"""What sums of small integers are kept in."""
+
+
+def _numeric(*args: Spec) -> Spec:
+    spec = Spec(broadcast(*(a.shape for a in args)), promote(*(a.dtype for a in args)))
+    if spec.dtype == "bool":
+        raise ShapeError("truth values are no numbers: convert with xp.astype, or use the logical operations")
+    return spec
+
+
 def _reduction(dtype: str | None, counted: bool = False) -> Callable[..., Spec]:
     def rule(x: Spec, *, axis: Any = None, keepdims: bool = False) -> Spec:
         axes = range(len(x.shape)) if axis is None else [axis] if isinstance(axis, int) else axis
         gone = {_axis(a, len(x.shape)) for a in axes}
         shape = tuple(1 if i in gone else n for i, n in enumerate(x.shape) if keepdims or i not in gone)
-        kind = dtype or ("int64" if counted and x.dtype in ("bool", "int32") else x.dtype)
+        kind = dtype or (_COUNTS.get(x.dtype, x.dtype) if counted else x.dtype)
         return Spec(shape, kind)
 
     return rule
@@ -202,6 +213,8 @@ def _cross(a: Spec, b: Spec) -> Spec:
 
 
 def _vecdot(a: Spec, b: Spec) -> Spec:
+    if a.shape[-1:] != b.shape[-1:] or not a.shape:
+        raise ShapeError(f"vecdot of {a.shape} and {b.shape}")
     return Spec(broadcast(a.shape, b.shape)[:-1], promote(a.dtype, b.dtype))
 
 
@@ -221,11 +234,19 @@ def _float32_bits(x: Spec) -> Spec:
     return x
 
 
+def _along(x: Spec, axis: Any) -> Spec:
+    for a in axis if isinstance(axis, list | tuple) else [] if axis is None else [axis]:
+        _axis(a, len(x.shape))
+    return x
+
+
 def _same(x: Spec, **_: Any) -> Spec:
     return x
 
 
-def _int_of(x: Spec, v: Spec, **_: Any) -> Spec:
+def _int_of(x: Spec, v: Spec, *, side: str = "left") -> Spec:
+    if len(x.shape) != 1:
+        raise ShapeError(f"searchsorted needs a vector to search in, not {x.shape}")
     return Spec(v.shape, "int64")
 
 
@@ -277,15 +298,15 @@ def _table() -> dict[str, Op]:
         for name in names.split():
             ops[name] = Op(name, rule, run(name), operands)
 
-    add("add subtract multiply maximum minimum remainder floor_divide pow", _elementwise(None), "same")
-    add("negative abs sign square positive", _elementwise(None), "same")
+    add("add multiply maximum minimum abs", _elementwise(None), "same")
+    add("subtract remainder floor_divide pow negative sign square positive", _numeric, "same")
     add("divide atan2 hypot copysign", _elementwise("real"), "real")
     add(
         "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh",
         _elementwise("real"),
         "real",
     )
-    add("floor ceil round trunc", _elementwise(None), "same")
+    add("floor ceil round trunc", _numeric, "same")
     add("equal not_equal less less_equal greater greater_equal", _elementwise("bool"), "same")
     add("logical_and logical_or logical_xor logical_not", _elementwise("bool"), "bool")
     add("isfinite isnan", _elementwise("bool"), "real")
@@ -299,9 +320,15 @@ def _table() -> dict[str, Op]:
     add("mean", _reduction("real"), "real", _run_reduce)
     add("any all", _reduction("bool"), "bool", _run_reduce)
     add("argmax argmin", _single("int64"), "as is")
-    add("sort flip roll", _same, "as is")
-    add("argsort", lambda x, **_: Spec(x.shape, "int64"), "as is")
-    add("cumulative_sum", _same, "as is")
+    add("sort", lambda x, *, axis=-1: _along(x, axis), "as is")
+    add("flip", lambda x, *, axis=None: _along(x, axis), "as is")
+    add("roll", lambda x, *, shift, axis=None: _along(x, axis), "as is")
+    add("argsort", lambda x, *, axis=-1: Spec(_along(x, axis).shape, "int64"), "as is")
+    add(
+        "cumulative_sum",
+        lambda x, *, axis: Spec(_along(x, axis).shape, _COUNTS.get(x.dtype, x.dtype)),
+        "as is",
+    )
     add("concat stack", _concat, "same", _many)
     ops["stack"] = Op("stack", _stack, _many("stack"), "same")
     add("matmul", _matmul, "same")
@@ -312,7 +339,7 @@ def _table() -> dict[str, Op]:
     add("vecdot", _vecdot, "same", _linalg)
     add("outer", _outer, "same", _linalg)
     add("searchsorted", _int_of, "same", _run_int64)
-    add("tril triu", _same, "as is")
+    add("tril triu", lambda x, *, k=0: x, "as is")
     ops["where"] = Op("where", _where, _namespace("where"))
     ops["permute_dims"] = Op("permute_dims", _permute, _run_axes)
     ops["reshape"] = Op("reshape", _reshape, _run_shape("reshape"))

@@ -279,7 +279,16 @@ class Pipeline:
 
     def _check_values(self, path: str) -> None:
         """Every value is assigned once, before it is used, with the shape that its instruction gives."""
-        specs = {n: s for n, s in self.specs.items() if n not in {i.out for i in self.instructions}}
+        given = self._given()
+        specs = dict(given)
+        if len(specs) < len(given):
+            raise PipelineError(
+                "a value is assigned twice",
+                path=path,
+                expected="one number a value",
+                got=str(sorted(n for n, k in Counter(n for n, _ in given).items() if k > 1)),
+                fix="lower the graph again",
+            )
         for stage in self.stages:
             for i in stage.instructions:
                 where = f"{path}: stage {stage.path}, value {i.out}"
@@ -294,7 +303,7 @@ class Pipeline:
                     )
                 try:
                     derived = OPS[i.op].rule(*(specs[a] for a in i.args), **i.attrs)
-                except (ValueError, TypeError, IndexError) as error:
+                except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
                     derived = Spec((-1,), str(error))
                 if derived != i.spec:
                     raise PipelineError(
@@ -305,18 +314,28 @@ class Pipeline:
                         fix="lower the graph again",
                     )
                 specs[i.out] = i.spec
-        ends = [leaf.value for o in self.outputs for leaf in o.leaves] + [o.present for o in self.outputs]
-        for n in [
-            *ends,
-            *(c.write for r in self.registers for c in r.cells),
-            *(s.enable for s in self.stages),
-        ]:
-            if n not in specs:
+        flag = Spec((), "bool")
+        ends = [(f"output {o.name}", leaf.value, _spec(leaf)) for o in self.outputs for leaf in o.leaves]
+        ends += [(f"output {o.name}", o.present, flag) for o in self.outputs]
+        ends += [(f"register {r.path}", c.write, _spec(c)) for r in self.registers for c in r.cells]
+        ends += [(f"stage {s.path}", s.enable, flag) for s in self.stages]
+        for where, n, wanted in ends:
+            if specs.get(n) != wanted:
                 raise PipelineError(
-                    f"value {n} is never assigned",
-                    path=path,
-                    expected="outputs and writes that exist",
-                    got=str(n),
+                    f"value {n} is never assigned" if n not in specs else f"value {n} is of another kind",
+                    path=f"{path}: {where}",
+                    expected=str(wanted),
+                    got=str(specs.get(n, "nothing")),
+                    fix="lower the graph again",
+                )
+        cells = {(r.path, c.name) for r in self.registers for c in r.cells}
+        for fault in self.faults:
+            if (fault.register, fault.cell) not in cells:
+                raise PipelineError(
+                    "a fault is kept nowhere",
+                    path=f"{path}: fault of {fault.path}",
+                    expected="a register cell that exists",
+                    got=f"{fault.register}, {fault.cell}",
                     fix="lower the graph again",
                 )
 
@@ -353,7 +372,7 @@ class Pipeline:
         file = file / _FILE if file.is_dir() else file
         try:
             data = json.loads(file.read_text())
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise PipelineError(
                 "no pipeline can be read here",
                 path=str(file),

@@ -99,7 +99,7 @@ def _input(pipeline: Pipeline, port: Any, inputs: Mapping[str, Any]) -> Series:
     value = inputs[port.name]
     type_ = type_of_leaves(port.type, port.leaves)
     if isinstance(value, Series):
-        arrays = value.leaves
+        arrays: Mapping[str, Any] = value.leaves
         time = value.time
     else:
         time, values = value
@@ -179,7 +179,9 @@ def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: 
     values = iter(cells)
     registers: dict[str, Any] = {}
     for register in pipeline.registers:
-        parts = {c.name: np.asarray(next(values)).astype(DTYPES[c.dtype]) for c in register.cells}
+        parts: dict[str, np.ndarray] = {
+            c.name: np.asarray(next(values)).astype(DTYPES[c.dtype]) for c in register.cells
+        }
         registers[register.path] = parts["value"] if list(parts) == ["value"] else parts
     return {
         "registers": registers,
@@ -229,7 +231,7 @@ def _reference(
     stacked = []
     for port, (times, kept) in zip(pipeline.outputs, outputs, strict=True):
         columns: Iterable[Any] = zip(*kept, strict=True) if kept else [[] for _ in port.leaves]
-        arrays = [
+        arrays: list[np.ndarray] = [
             np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
             for column, leaf in zip(columns, port.leaves, strict=True)
         ]

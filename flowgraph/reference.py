@@ -30,7 +30,7 @@ class _LinearAlgebra:
             except np.linalg.LinAlgError:
                 return np.full_like(args[-1], np.nan)
 
-        return total if name in ("cholesky", "solve") else function  # type: ignore[no-any-return]
+        return total if name in ("cholesky", "solve") else function
 
 
 class _TotalNumpy(NumpyNamespace):

@@ -11,7 +11,6 @@ import inspect
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any
 
 from flowgraph.errors import DeclarationError, UnknownNameError
@@ -21,6 +20,8 @@ from flowgraph.result import Result
 from flowgraph.series import Flight
 
 if typing.TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from flowgraph.declare import GraphFunction
 
 
@@ -41,14 +42,20 @@ class Case:
     estimate: str = "belief"
 
 
+def _entries(group: str) -> list[EntryPoint]:
+    from importlib.metadata import entry_points  # slow to import, and only needed to look names up
+
+    return list(entry_points(group=group))
+
+
 def graph_names() -> list[str]:
     """The names of all installed graphs."""
-    return sorted(e.name for e in entry_points(group="flowgraph.graphs"))
+    return sorted(e.name for e in _entries("flowgraph.graphs"))
 
 
 def flight_names() -> list[str]:
     """The kinds of flight that can be loaded."""
-    return sorted(e.name for e in entry_points(group="flowgraph.flights"))
+    return sorted(e.name for e in _entries("flowgraph.flights"))
 
 
 def find_graph(name: str) -> GraphFunction:
@@ -62,7 +69,7 @@ def find_graph(name: str) -> GraphFunction:
 
 
 def _find(group: str, kind: str, name: str, valid: list[str]) -> Any:
-    for entry in entry_points(group=group):
+    for entry in _entries(group):
         if entry.name == name:
             return entry.load()
     raise UnknownNameError(kind, name, valid)

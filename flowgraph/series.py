@@ -62,7 +62,7 @@ class Series:
         for leaf, (leaf_name, leaf_type) in zip(
             flatten(values, self.type), leaves_of(self.type), strict=True
         ):
-            array = np.asarray(leaf, dtype=DTYPES[leaf_type.dtype])
+            array: np.ndarray = np.asarray(leaf, dtype=DTYPES[leaf_type.dtype])
             if array.shape != (len(self.time), *leaf_type.shape):
                 raise DataError(
                     f"field {leaf_name!r} does not have one value a time stamp",

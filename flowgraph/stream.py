@@ -176,7 +176,8 @@ def apply(
 ) -> Stream[Any]:
     """A stream of `function(values...)`, present when all streams are; their clocks must be equal."""
     named = getattr(function, "__name__", "map")
-    rule = None if out is None else (lambda types, settings: annotation_type(out))
+    declared = annotation_type(out)
+    rule = None if declared is None else (lambda types, settings: declared)
     block: Block[Any] = (
         function
         if isinstance(function, Block)

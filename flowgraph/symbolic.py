@@ -259,7 +259,7 @@ class Symbolic:
     __hash__ = None  # type: ignore[assignment]
 
 
-def _getitem(x: Any, entries: list[Any]) -> Any:
+def _getitem(x: Symbolic, entries: list[Any]) -> Symbolic:
     """Basic indexing by whole numbers, slices, None and Ellipsis."""
     used = sum(e is not None and e is not Ellipsis for e in entries)
     if used > x.ndim:
@@ -488,7 +488,21 @@ def _take(x: Any, indices: Any, /, *, axis: int = 0) -> Any:
 def _cumulative_sum(x: Any, /, *, axis: int | None = None) -> Any:
     if not isinstance(x, Symbolic):
         return np.cumulative_sum(x, axis=axis)
+    if axis is None and x.ndim != 1:
+        refuse("cumulative_sum without an axis", "axis=", f"shape {x.shape}", "say along which axis")
     return x.trace.apply("cumulative_sum", x, axis=0 if axis is None else axis)
+
+
+def _roll(x: Any, /, shift: int, *, axis: int | None = None) -> Any:
+    if not isinstance(x, Symbolic):
+        return np.roll(x, shift, axis=axis)
+    return x.trace.apply("roll", x, shift=shift, axis=axis)
+
+
+def _argsort(x: Any, /, *, axis: int = -1) -> Any:
+    if not isinstance(x, Symbolic):
+        return NUMPY.argsort(x, axis=axis)
+    return x.trace.apply("argsort", x, axis=axis)
 
 
 def _trace_sum(x: Any, /) -> Any:
@@ -524,6 +538,8 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "clip": _clip,
     "take": _take,
     "cumulative_sum": _cumulative_sum,
+    "roll": _roll,
+    "argsort": _argsort,
     "zeros_like": lambda x: np.zeros(x.shape, x.dtype),
     "ones_like": lambda x: np.ones(x.shape, x.dtype),
     **{name: _reducer(name) for name in ("sum", "prod", "max", "min", "mean", "any", "all")},

@@ -196,7 +196,8 @@ class Scan:
 
         With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs.
         """
-        pattern = _places(self.keys, key)
+        varies = any(known is not None and not known.all() for known in self.follows)
+        pattern = _places(self.keys, key) if varies or self.branches is not None else key
         choice = key if self.branches is None else pattern
         self.compile(cells, seed, inputs)
         now: Any = tuple(_as(c, self.dtype) for c in cells)

@@ -5,9 +5,23 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from flowgraph import Case, DataError, Flight, Result, Series, Stream, collect, delay, graph, latest, timing_of
+from flowgraph import (
+    Case,
+    DataError,
+    Flight,
+    Result,
+    Series,
+    Stream,
+    collect,
+    delay,
+    graph,
+    latest,
+    timing_of,
+)
 from flowgraph.blocks.aiding import aid_attitude, aid_position
 from flowgraph.blocks.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial import ImuNoise, predict
@@ -59,8 +73,8 @@ def for_flight(
 ) -> Case:
     """Start and tune the filter for a flight with an IMU and a position: EuRoC, or the simulated one.
 
-    The start is the truth's position, the attitude that takes the measured specific force to +z and is nearest
-    to the truth's, and zero velocity and biases.
+    The start is the truth's position, the attitude that takes the measured specific force to +z and is
+    nearest to the truth's, and zero velocity and biases.
 
     Args:
         flight: with the streams `imu` and one of `leica` (Position) or `vicon` (Pose).
@@ -83,8 +97,9 @@ def for_flight(
     else:
         places, turns = interpolate_pose(truth, imu.time[:1])
         place, turn = places[0], turns[0]
+    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
     built = ins_eskf.build(
-        **{name: timing_of(series) for name, series in inputs.items()},
+        **clocks,
         start=start_belief(place, turn, specific_force=imu.specific_force[0], spread=StartSpread()),
         noise=noise,
         position_noise=_given(position_noise, flight.info.get("position_noise", 0.004)),

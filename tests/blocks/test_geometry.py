@@ -167,3 +167,18 @@ def test_batches_are_rows():
     ):
         whole = function(*args, xp=np)
         np.testing.assert_allclose(whole[1, 3], function(*(a[1, 3] for a in args), xp=np), atol=1e-14)
+
+
+def test_right_product_multiplies_on_the_right():
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(2, 7, 4))
+    found = (g.right_product(b, xp=np) @ a[..., None])[..., 0]
+    np.testing.assert_allclose(found, g.multiply(a, b, xp=np), atol=1e-14)
+
+
+def test_exp_of_a_tiny_rotation_is_exact():
+    v = np.array([[0.0, 0.0, 0.0], [1e-200, 0.0, 0.0], [0.0, 3e-16, 0.0], [0.0, 0.0, 2e-9]])
+    q = g.from_rotation_vector(v, xp=np)
+    np.testing.assert_array_equal(q[:, 0], 1.0)
+    np.testing.assert_allclose(q[:, 1:], v / 2, rtol=1e-15)
+    assert np.isfinite(g.from_rotation_vector(v.astype(np.float32), xp=np)).all()

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from flowgraph.blocks import geometry as g
-from flowgraph.blocks.aiding import aid_attitude, aid_pose, aid_position
+from flowgraph.blocks.aiding import aid_attitude, aid_position
 from flowgraph.blocks.alignment import StartSpread, level_attitude, start_belief
 from flowgraph.blocks.flights import euroc
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.metrics import interpolate_pose
-from flowgraph.blocks.signals import Attitude, Belief, Imu, Pose, Position, SpecificForce
+from flowgraph.blocks.signals import Attitude, Belief, Imu, Position, SpecificForce
 from tests.bench import direct_eskf
 
 NONE = ImuNoise(0.0, 0.0, 0.0, 0.0)
@@ -159,16 +159,6 @@ def test_attitude_update_goes_towards_the_measurement(seed):
     assert g.geodesic_angle(post.attitude, measured) < 1e-4
     S = prior.covariance[6:9, 6:9] + np.eye(3) * 1e-10
     np.testing.assert_allclose(innovation.covariance, S, atol=1e-12)
-
-
-def test_pose_update_is_both_updates_at_once():
-    prior = a_belief(3)
-    pose = Pose(position=prior.position + 0.01, attitude=prior.attitude)
-    post, innovation = aid_pose.step(prior, pose, position_noise=0.1, attitude_noise=0.2, lever=LEVER, xp=np)
-    assert innovation.residual.shape == (6,)
-    first, _ = aid_position.step(prior, Position(position=pose.position), noise=0.1, lever=LEVER, xp=np)
-    both, _ = aid_attitude.step(first, Attitude(attitude=pose.attitude), noise=0.2, xp=np)
-    np.testing.assert_allclose(difference(both, post), 0.0, atol=5e-4)  # the first one moves q
 
 
 @pytest.mark.parametrize("aid", [aid_position, aid_attitude])

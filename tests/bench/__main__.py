@@ -1,0 +1,68 @@
+"""`python -m tests.bench`: what flowgraph costs, each figure beside its peer in one run.
+
+A missed bound is printed and marked, and does not fail: times on a shared machine are no test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from tests.bench import imports, inertial, toy
+from tests.bench.rows import Row
+
+Bench = Callable[..., list[Row]]
+
+BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
+    "toy-python": (toy.python_engine, {"ticks": 100, "repeats": 1}),
+    "toy-xla": (toy.xla_engine, {"ticks": 200, "repeats": 1}),
+    "eskf-python": (inertial.against_numpy, {"duration": 0.5, "repeats": 1}),
+    "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
+    "import": (imports.import_time, {"repeats": 1}),
+}
+"""The benches by name, each with the sizes of `--quick`."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one object with rows, and nothing else")
+    parser.add_argument("--only", action="append", choices=list(BENCHES), help="one bench; may be repeated")
+    parser.add_argument(
+        "--quick", action="store_true", help="tiny sizes: checks the peers' numbers, no timing"
+    )
+    chosen = parser.parse_args(arguments)
+    rows = []
+    for name in chosen.only or BENCHES:
+        bench, tiny = BENCHES[name]
+        rows += bench(**(tiny if chosen.quick else {}))
+    if chosen.json:
+        print(json.dumps({"rows": [asdict(row) for row in rows]}, indent=1))
+    else:
+        show(rows)
+
+
+def show(rows: list[Row]) -> None:
+    """Print the table."""
+    table = Table(title="Medians of interleaved pairs", title_justify="left")
+    for heading in ("bench", "ours", "peer", "ratio"):
+        table.add_column(heading, justify="left" if heading == "bench" else "right")
+    for heading in ("unit", "peer is", "bound", ""):
+        table.add_column(heading)
+    marks = {True: "[green]met[/]", False: "[bold red]MISSED[/]", None: ""}
+    for r in rows:
+        numbers = (f"{r.ours:.3g}", f"{r.peer:.3g}", f"{r.ratio:.2f}")
+        table.add_row(r.name, *numbers, r.unit, r.against, r.bound or "", marks[r.met])
+    console = Console()
+    console.print(table)
+    missed = [r.name for r in rows if r.met is False]
+    console.print(f"{len(missed)} missed: {', '.join(missed)}" if missed else "All bounds are met.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""A row of the benchmark's table, and the timing behind it: medians of interleaved pairs.
+
+On a machine that is shared, speeds drift by a factor over seconds. So ours and the peer take turns, A B A B,
+and what is compared is the median of the ratios of neighbours, not the ratio of two medians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
+
+    Args:
+        name: what is measured.
+        ours, peer: the two figures, in `unit`.
+        unit: of both.
+        against: what the peer is.
+        ratio: ours / peer, the median over pairs.
+        bound: what must hold, in words; None where the row is for information only.
+        met: whether it holds; None without a bound.
+        details: anything else worth keeping; only in the JSON.
+    """
+
+    name: str
+    ours: float
+    peer: float
+    unit: str
+    against: str
+    ratio: float
+    bound: str | None = None
+    met: bool | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """How long one call takes."""
+    start = perf_counter()
+    work()
+    return perf_counter() - start
+
+
+def interleaved(
+    ours: Callable[[], float], peer: Callable[[], float], repeats: int
+) -> tuple[float, float, float]:
+    """Medians of what `ours` and `peer` return when called in turn, and the median of their ratios.
+
+    Each is called once before, unmeasured, so that neither pays for what is done only once in a process.
+    """
+    ours(), peer()
+    pairs = [(ours(), peer()) for _ in range(repeats)]
+    return median(a for a, _ in pairs), median(b for _, b in pairs), median(a / b for a, b in pairs)
