@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from flowgraph import Array, Signal, real
+from flowgraph import Array, Signal, boolean, integer, real
 
 __all__ = [
     "Imu",
@@ -24,6 +24,17 @@ __all__ = [
     "NavigationState",
     "Belief",
     "Innovation",
+    "Cloud",
+    "Weights",
+    "LogLikelihood",
+    "Ancestors",
+    "PoseEstimate",
+    "GeodeticPosition",
+    "MagneticField",
+    "Range",
+    "OpticalFlow",
+    "Thrust",
+    "BodyRate",
 ]
 
 
@@ -52,9 +63,12 @@ class SpecificForce(Signal):
 
 
 class CoordinateAcceleration(Signal):
-    """The second derivative of position, m/s^2, world: zero at rest. Not what an accelerometer reads."""
+    """The second derivative of position, m/s^2, in body coordinates: zero at rest.
 
-    acceleration: Array = real(3, unit="m/s^2", frame="world")
+    Not what an accelerometer reads (that is `SpecificForce`); the thesis's accelerometer is of this type.
+    """
+
+    acceleration: Array = real(3, unit="m/s^2", frame="body")
 
 
 class Position(Signal):
@@ -118,3 +132,95 @@ class Innovation(Signal):
     residual: Array = real(3)
     covariance: Array = real(3, 3)
     nis: Array = real()
+
+
+class Cloud(Signal):
+    """A Rao-Blackwellized particle cloud: attitude by particles, velocity and position Gaussian given each.
+
+    Struct of arrays: the particle is the last axis of every field, so that one operation runs over all of
+    them.
+
+    log_weight: natural logarithm of the weights, which add up to 1. velocity, position: means, m/s and m,
+    world. velocity_covariance (m^2/s^2), cross_covariance (m^2/s; rows position, columns velocity) and
+    position_covariance (m^2): the blocks of the covariance of (velocity, position), each 3 x 3.
+    """
+
+    log_weight: Array = real("particles")
+    attitude: Array = real(4, "particles", unit="1", frame="world<-body")
+    velocity: Array = real(3, "particles", unit="m/s", frame="world")
+    position: Array = real(3, "particles", unit="m", frame="world")
+    velocity_covariance: Array = real(3, 3, "particles")
+    cross_covariance: Array = real(3, 3, "particles")
+    position_covariance: Array = real(3, 3, "particles")
+
+
+class Weights(Signal):
+    """The weights of a cloud, one a particle; they add up to 1."""
+
+    weight: Array = real("particles")
+
+
+class LogLikelihood(Signal):
+    """The logarithm of a measurement's density given each particle."""
+
+    value: Array = real("particles")
+
+
+class Ancestors(Signal):
+    """Which particle each new one is a copy of, and whether the cloud was resampled at all."""
+
+    index: Array = integer("particles")
+    resampled: Array = boolean()
+
+
+class PoseEstimate(Signal):
+    """The expected pose of a belief: position (m, world), velocity (m/s, world) and attitude."""
+
+    position: Array = real(3, unit="m", frame="world")
+    velocity: Array = real(3, unit="m/s", frame="world")
+    attitude: Array = real(4, unit="1", frame="world<-body")
+
+
+class GeodeticPosition(Signal):
+    """A position on the Earth (WGS84): latitude and longitude in rad, height above the ellipsoid in m."""
+
+    latitude: Array = real(unit="rad", frame="WGS84")
+    longitude: Array = real(unit="rad", frame="WGS84")
+    height: Array = real(unit="m", frame="WGS84")
+
+
+class MagneticField(Signal):
+    """The magnetic field in body coordinates, T; the Earth's is 25e-6 to 65e-6."""
+
+    field: Array = real(3, unit="T", frame="body")
+
+
+class Range(Signal):
+    """The distance to the ground (world z = 0) along the body's z axis, downwards, m."""
+
+    distance: Array = real(unit="m", frame="body")
+
+
+class OpticalFlow(Signal):
+    """How the body moved over the interval that ends now; before and after are its two ends.
+
+    displacement: m, R(q_before)^T (p_after - p_before): in body coordinates of before.
+    turn: unit quaternion, q_before^-1 q_after.
+    interval: s.
+    """
+
+    displacement: Array = real(3, unit="m", frame="body")
+    turn: Array = real(4, unit="1", frame="body<-body")
+    interval: Array = real(unit="s")
+
+
+class Thrust(Signal):
+    """The commanded thrust per mass, along body z, m/s^2; 9.81 at hover."""
+
+    thrust: Array = real(unit="m/s^2", frame="body")
+
+
+class BodyRate(Signal):
+    """The commanded angular rate of the body, in body coordinates, rad/s. What is measured is `Gyro`."""
+
+    rate: Array = real(3, unit="rad/s", frame="body")

@@ -7,6 +7,7 @@ error. Exit status 2 means that the command was used wrongly, 1 that it failed.
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -52,7 +53,7 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of a simulated flight.")]
+Seed = Annotated[int, typer.Option(help="Of a simulated flight, and of the graph's draws.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -124,7 +125,7 @@ def run(
     case, flight = _case(graph, data, settings, seed)
     for note in flight.notes:
         _err.print(f"note: {note}", markup=False)
-    result, row = _measure(case, graph, engine, dtype, quiet=as_json)
+    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
     report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     if out is not None:
         _write_report(out, case, flight, result, report)
@@ -168,7 +169,7 @@ def demo(
         case, flight = _case(name, "sim", None, seed)
         for engine in ("python", "xla"):
             try:
-                result, row = _measure(case, name, engine, "float64", quiet=as_json)
+                result, row = _measure(case, name, engine, "float64", seed, quiet=as_json)
             except FlowgraphError as error:
                 if engine == "python":
                     raise
@@ -189,6 +190,8 @@ def _case(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[
         return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
     mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
     flight = load_flight(spec, seed=seed, settings=rest)
+    if "seed" in inspect.signature(graph.prepare).parameters:
+        mine.setdefault("seed", seed)
     return graph.case(flight, **mine), flight
 
 
@@ -205,10 +208,12 @@ def _pair(text: str) -> tuple[str, str]:
     return key.strip(), value.strip()
 
 
-def _measure(case: Case, name: str, engine: str, dtype: str, *, quiet: bool) -> tuple[Result, dict[str, Any]]:
+def _measure(
+    case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool
+) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     with _meter(event_count(case.inputs), name, engine, quiet) as meter:
-        result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, progress=meter)
+        result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter)
     total = perf_counter() - start
     row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
     return result, {**row, "setup_s": total - result.wall_s, **case.score(result), **result.stats}

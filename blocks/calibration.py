@@ -1,0 +1,65 @@
+"""Calibration at rest: what a standing inertial unit reads, beyond gravity, is its bias.
+
+A filter without bias states (a particle filter, for one) can still be honest about constant biases if the
+body stands still before it moves, as a quadrotor does before it takes off.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import block
+from flowgraph.blocks.signals import Imu
+
+__all__ = ["subtract_rest_bias"]
+
+_NEVER = np.int64(-(2**62))
+
+
+@block
+def subtract_rest_bias(
+    state,  # type: ignore[no-untyped-def]
+    imu: Imu,
+    *,
+    seconds: float,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    gravity: float = 9.81,
+    t: int,
+    xp: Any,
+) -> tuple[Any, Imu]:
+    """Subtract from each reading what the readings at rest had too much, on average and so far.
+
+        bias_gyro = mean(gyro)      bias_force = mean(specific_force) - gravity * up
+
+    The means are over the first `seconds`, running while they last: only readings that have come are used.
+    Fires with each reading.
+
+    Args:
+        imu: rad/s and m/s^2, body.
+        seconds: how long after its first reading the body stands still.
+        up: world +z in body coordinates while it does, a unit vector. A wrong tilt becomes a wrong bias; when
+            `up` is taken from the specific force itself, only the bias along it is removed.
+        gravity: m/s^2.
+
+    State: time of the first reading (int64 ns), number of readings at rest, and the bias (gyro, force).
+    """
+    kind = imu.gyro.dtype
+    first = xp.where(state["first"] == _NEVER, t, state["first"])
+    resting = t - first <= round(seconds * 1e9)
+    count = state["count"] + resting
+    expected = np.concatenate([np.zeros(3), np.asarray(up) * gravity])
+    reading = xp.concat([imu.gyro, imu.specific_force])
+    excess = reading - xp.asarray(expected, dtype=kind) - state["bias"]
+    bias = state["bias"] + excess * xp.where(resting, 1.0 / count, 0.0)
+    corrected = reading - bias
+    return (
+        {"first": first, "count": count, "bias": bias},
+        Imu(gyro=corrected[:3], specific_force=corrected[3:]),
+    )
+
+
+@subtract_rest_bias.init
+def _(imu: Any, **_: Any) -> dict[str, Any]:
+    return {"first": _NEVER, "count": np.float64(0.0), "bias": np.zeros(6)}

@@ -1,0 +1,209 @@
+"""rbpf_indoor: a Rao-Blackwellized particle filter on an IMU and a motion capture.
+
+The attitude is sampled: each particle turns by the gyroscope's reading and a drawn error. Given its attitude,
+a particle's velocity and position are Gaussian and have a Kalman filter of their own. A pose measurement
+corrects these, and weighs each particle by how likely it was. So the hard, nonlinear part of the state, three
+numbers, is all that particles must cover, and a start with an unknown heading is no difficulty.
+
+Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017; A. Doucet, N. de Freitas, K. Murphy and
+S. Russell, "Rao-Blackwellised particle filtering for dynamic Bayesian networks", UAI 2000.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, latest, merge, timing_of
+from flowgraph.blocks.alignment import StartSpread
+from flowgraph.blocks.calibration import subtract_rest_bias
+from flowgraph.blocks.geometry import level, to_matrix
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.particles import (
+    attitude_likelihood,
+    average_attitude,
+    average_pose,
+    dominant_eigenvector,
+    effective_sample_size,
+    propagate_attitude,
+    reweight,
+    start_cloud,
+    weights,
+)
+from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
+from flowgraph.blocks.resampling import draw_ancestors, take_ancestors
+from flowgraph.blocks.signals import Cloud, Imu, Pose
+
+
+@graph
+def predict(cloud: Stream[Cloud], imu: Stream[Imu], *, noise: ImuNoise, draws: str, at: Any):
+    """Carry the cloud to now: attitudes drawn through the gyroscope, motion by a Kalman prediction each."""
+    turned = propagate_attitude(cloud, imu, gyro_noise=noise.gyro, draws=draws, at=at, name="attitude")
+    return predict_motion(turned, imu, accelerometer_noise=noise.accelerometer, name="kalman")
+
+
+@graph
+def update(
+    prior: Stream[Cloud],
+    measured: Stream[Pose],
+    *,
+    position_noise: float,
+    attitude_noise: float,
+    lever: tuple[float, float, float],
+):
+    """Correct the cloud with a pose: likelihood of position times likelihood of attitude."""
+    corrected, position = correct_motion(
+        prior, measured, noise=position_noise, lever=lever, at=measured, name="kalman"
+    )
+    attitude = attitude_likelihood(prior, measured, noise=attitude_noise, at=measured, name="attitude")
+    return reweight(corrected, position, attitude, name="weights")
+
+
+@graph
+def resample(cloud: Stream[Cloud], *, below: float, scheme: str, draws: str):
+    """Draw the cloud anew where its effective sample size has fallen below a fraction of its size."""
+    size = effective_sample_size(cloud, name="size")
+    ancestors = draw_ancestors(cloud, size, below=below, scheme=scheme, draws=draws, name="ancestors")
+    return take_ancestors(cloud, ancestors, name="cloud"), size, ancestors
+
+
+@graph
+def average(cloud: Stream[Cloud]):
+    """The weighted expectation of the pose."""
+    weight = weights(cloud)
+    attitude = average_attitude(cloud, weight, name="attitude")
+    return average_pose(cloud, weight, attitude, name="pose")
+
+
+@graph
+def rbpf_indoor(
+    imu: Stream[Imu],
+    vicon: Stream[Pose],
+    *,
+    start: Cloud,
+    noise: ImuNoise,
+    position_noise: float,
+    attitude_noise: float,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    still: float = 0.0,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    resample_below: float = 0.1,
+    scheme: str = "systematic",
+    draws: str = "rbpf_indoor",
+):
+    """Rao-Blackwellized particle filter: attitude by particles, motion by a Kalman filter each.
+
+    Every tick predicts to now; a tick with a pose also updates and resamples. There are no bias states: when
+    the body stands `still` for some seconds at first, what the IMU reads then is its bias and is subtracted.
+    The pose is averaged before resampling, which only adds noise to it. Collected: `pose` at every tick;
+    `effective_sample_size` and `ancestors` (whether it resampled, and the index of each new particle) at
+    every measured pose.
+    """
+    if still > 0.0:
+        imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
+    cloud = delay(start, name="cloud")
+    control = latest(imu, init=Imu.at_rest(), name="control")
+    prior = predict(cloud, control, noise=noise, draws=f"{draws}.attitude", at=imu | vicon)
+    posterior = update(
+        prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
+    )
+    fresh, size, ancestors = resample(
+        posterior, below=resample_below, scheme=scheme, draws=f"{draws}.resample"
+    )
+    cloud.feed(merge(fresh, prior, tie="left", name="next"))
+    pose = average(merge(posterior, prior, tie="left", name="now"))
+    return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
+
+
+@rbpf_indoor.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    particles: int = 1000,
+    seed: int = 0,
+    resample_below: float = 0.1,
+    scheme: str = "systematic",
+    unknown_yaw: bool = True,
+    gyro_factor: float | None = None,
+    accelerometer_factor: float | None = None,
+    position_noise: float | None = None,
+    attitude_noise: float | None = None,
+    still: float | None = None,
+    settle: float = 1.0,
+) -> Case:
+    """Start and tune the filter for a flight with an IMU and a motion capture.
+
+    The start is the first measured position, and zero velocity. With an unknown yaw, roll and pitch are zero
+    and the yaw is uniform over the circle (a body that starts tilted needs unknown_yaw=False); else the
+    attitude is the mean that was measured at rest, or the first one, levelled with the specific force.
+
+    Args:
+        flight: with the streams `imu` and `vicon` (Pose).
+        particles: how many.
+        seed: of the start's draws; that of the run is given to `simulate`.
+        resample_below: resample when the effective sample size is below this fraction of the particles.
+        scheme: systematic, stratified, residual or multinomial.
+        unknown_yaw: whether nothing is known of the heading at first.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU. For real units as in
+            `ins_eskf`: a data sheet knows nothing of vibration. The simulated one gets 3 and 2: what
+            calibration leaves of a bias is no white noise, and particles need room to move after the first
+            pose has left a few of them.
+        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
+        still: seconds at the start in which the body does not move; 1 for the simulated flight, else 0.
+        settle: seconds at the start that the errors leave out.
+    """
+    for stream in ("imu", "vicon"):
+        if stream not in flight.streams:
+            raise DataError(
+                "this flight lacks what rbpf_indoor needs",
+                path=flight.name,
+                expected="streams imu and vicon",
+                got=", ".join(flight.streams),
+                fix="choose another recording, or build rbpf_indoor with your own sources",
+            )
+    imu, vicon = flight.streams["imu"], flight.streams["vicon"]
+    simulated = "position_noise" in flight.info
+    still = _given(still, 1.0 if simulated else 0.0)
+    attitude = None
+    up = np.array([0.0, 0.0, 1.0])
+    if not unknown_yaw:
+        attitude = _first_attitude(imu, vicon, still)
+        up = to_matrix(attitude, xp=np)[2]
+    built = rbpf_indoor.build(
+        imu=timing_of(imu),
+        vicon=timing_of(vicon),
+        start=start_cloud(
+            particles, seed=seed, position=vicon.position[0], attitude=attitude, spread=StartSpread()
+        ),
+        noise=flight.info["imu_noise"].scaled(
+            gyro=_given(gyro_factor, 3.0 if simulated else 15.0),
+            accelerometer=_given(accelerometer_factor, 2.0 if simulated else 20.0),
+        ),
+        position_noise=_given(position_noise, flight.info.get("position_noise", 0.004)),
+        attitude_noise=_given(attitude_noise, flight.info.get("attitude_noise", 0.01)),
+        lever=flight.info.get("vicon_lever", (0.0, 0.0, 0.0)),
+        still=still,
+        up=tuple(up.tolist()),
+        resample_below=resample_below,
+        scheme=scheme,
+    )
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else pose_errors(result["pose"], truth, settle=settle)
+
+    return Case(built, {"imu": imu, "vicon": vicon}, score, estimate="pose")
+
+
+def _first_attitude(imu: Series, vicon: Series, still: float) -> np.ndarray:
+    """The mean attitude (4) measured at rest; without a rest the first one, levelled with the force."""
+    if still <= 0.0:
+        return np.asarray(level(vicon.attitude[0], imu.specific_force[0], xp=np))
+    seen = vicon.attitude[vicon.time - vicon.time[0] <= round(still * 1e9)]
+    return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), seen[0], xp=np))
+
+
+def _given(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

@@ -1,0 +1,60 @@
+"""Closed forms along the last axis, against the functions for one quaternion or matrix at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowgraph.blocks import geometry as g
+from flowgraph.blocks import lanes
+
+N = 7
+
+
+def quaternions(seed: int) -> np.ndarray:
+    q = np.random.default_rng(seed).normal(size=(4, N))
+    return q / np.linalg.norm(q, axis=0)
+
+
+def test_quaternions_agree_with_geometry():
+    a, b = quaternions(0), quaternions(1)
+    v = np.random.default_rng(2).normal(size=(3, N))
+    np.testing.assert_allclose(lanes.multiply(a, b, xp=np).T, g.multiply(a.T, b.T, xp=np), atol=1e-15)
+    np.testing.assert_allclose(lanes.exponential(v, xp=np).T, g.from_rotation_vector(v.T, xp=np), atol=1e-15)
+    R = np.moveaxis(lanes.rotation_matrices(a, xp=np), -1, 0)
+    np.testing.assert_allclose(R, g.to_matrix(a.T, xp=np), atol=1e-15)
+    np.testing.assert_allclose(lanes.normalize(3.0 * a, xp=np), a, atol=1e-15)
+
+
+def test_one_vector_is_rotated_by_every_attitude():
+    q, v = quaternions(0), np.array([0.3, -9.0, 2.0])
+    np.testing.assert_allclose(lanes.rotate(q, v, xp=np), (g.to_matrix(q.T, xp=np) @ v).T, atol=1e-14)
+
+
+def test_rotation_vectors_to_one_attitude():
+    q, z = quaternions(0), quaternions(1)[:, 0]
+    q[:, 0] = z  # no turn at all
+    q[:, 1] = -z
+    q[:, 2] = g.multiply(z, g.from_rotation_vector(np.array([1e-7, 0.0, 0.0]), xp=np), xp=np)
+    found = lanes.rotation_vectors_to(q, z, xp=np)
+    relative = g.multiply(g.conjugate(q.T, xp=np), np.broadcast_to(z, (N, 4)), xp=np)
+    np.testing.assert_allclose(found.T, g.to_rotation_vector(relative, xp=np), atol=1e-14)
+    np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-15)
+    np.testing.assert_allclose(found[:, 2], [-1e-7, 0.0, 0.0], atol=1e-15)
+
+
+def test_the_exponential_of_nothing_is_the_identity():
+    np.testing.assert_array_equal(
+        lanes.exponential(np.zeros((3, 2)), xp=np), [[1, 1], [0, 0], [0, 0], [0, 0]]
+    )
+
+
+def test_matrices_agree_with_linear_algebra():
+    rng = np.random.default_rng(3)
+    A, B = rng.normal(size=(2, N, 3, 3))
+    last = lambda M: np.moveaxis(M, 0, -1)
+    np.testing.assert_allclose(lanes.matrix_product(last(A), last(B)), last(A @ B), atol=1e-14)
+    np.testing.assert_array_equal(lanes.transpose(last(A), xp=np), last(A.mT))
+    S = A @ A.mT + 0.1 * np.eye(3)
+    inverse, determinant = lanes.inverse_and_determinant(last(S), xp=np)
+    np.testing.assert_allclose(inverse, last(np.linalg.inv(S)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(determinant, np.linalg.det(S), rtol=1e-10)
