@@ -151,7 +151,7 @@ def for_flight(
             calibration leaves of a bias is no white noise, and particles need room to move after the first
             pose has left a few of them.
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
-        still: seconds at the start in which the body does not move; 1 for the simulated flight, else 0.
+        still: seconds at the start in which the body does not move; the flight's own, or 1 for `sim`, else 0.
         settle: seconds at the start that the errors leave out.
     """
     for stream in ("imu", "vicon"):
@@ -165,7 +165,7 @@ def for_flight(
             )
     imu, vicon = flight.streams["imu"], flight.streams["vicon"]
     simulated = "position_noise" in flight.info
-    still = _given(still, 1.0 if simulated else 0.0)
+    still = _given(still, flight.info.get("still", 1.0 if simulated else 0.0))
     attitude = None
     up = np.array([0.0, 0.0, 1.0])
     if not unknown_yaw:

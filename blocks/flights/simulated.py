@@ -1,4 +1,7 @@
-"""A simulated quadrotor flight: 1 s at rest, then a smooth figure in space, with an IMU and a motion capture.
+"""Simulated flights. `sim`: 1 s at rest, then a smooth figure in space, with an IMU and a motion capture.
+
+`sim:thesis`, `sim:roundtrip` and `sim:hover` go through the simulated world with sensors of choice: see
+`worlds`. What follows is the figure of `sim`.
 
 Position and yaw are sums of sinusoids of a phase that starts slowly, so every derivative is exact. Thrust
 must carry gravity and the acceleration, which fixes the body's z axis; with the yaw that fixes the attitude,
@@ -9,19 +12,20 @@ for quadrotors", ICRA 2011, eqs. 5-9 and sec. III).
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.flights import worlds
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
+from flowgraph.blocks.world import generator
 from flowgraph.errors import DataError, UnknownNameError
 
-__all__ = ["DEFAULTS", "load", "trajectory"]
+__all__ = ["DEFAULTS", "SETTINGS", "load", "trajectory"]
 
 DEFAULTS: Mapping[str, float] = {
     "duration": 20.0,
@@ -39,33 +43,39 @@ DEFAULTS: Mapping[str, float] = {
 """Settings: seconds, Hz, continuous densities, standard deviations of the constant biases, and of the motion
 capture in m and rad."""
 
+SETTINGS: Mapping[str, str | float] = {**worlds.SETTINGS, **DEFAULTS}
+"""All settings that `load` understands: `DEFAULTS` for the figure, `worlds.SETTINGS` for the worlds, whose
+values when left out are their own."""
+
 _AT_REST, _RAMP = 1.0, 2.0  # seconds
 
 
 def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
-    """Make a flight with the streams `imu` (`Imu`) and `vicon` (`Pose`).
+    """Make a flight with the streams `imu` (`Imu`) and `vicon` (`Pose`), or one through a world.
 
     Args:
-        argument: "" or "quadrotor", the one shape there is.
+        argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`).
         seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
             change of one setting does not change the draws of another.
-        settings: any of `DEFAULTS`.
+        settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
 
     Returns:
-        A `Flight`: truth is a `NavigationState` at the IMU's times; info has `imu_noise` (`ImuNoise`),
-        `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and `vicon_period_ns`.
+        Of the figure, a `Flight`: truth is a `NavigationState` at the IMU's times; info has `imu_noise`
+        (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and `vicon_period_ns`.
 
     Raises:
         UnknownNameError: for another shape or an unknown setting.
         DataError: for a setting that is not a number in its range.
     """
+    if argument in worlds.WORLDS:
+        return worlds.load_world(argument, seed=seed, settings=settings)
     if argument not in ("", "quadrotor"):
-        raise UnknownNameError("simulated flight", argument, ["quadrotor"], path="sim")
+        raise UnknownNameError("simulated flight", argument, ["quadrotor", *worlds.WORLDS], path="sim")
     s = _settings(settings or {})
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
     end = round(s["duration"] * 1e9)
     time = np.arange(0, end + 1, imu_period, dtype=np.int64)
-    draw = lambda name, *shape: _generator(seed, name).standard_normal(shape)
+    draw = lambda name, *shape: generator(seed, name).standard_normal(shape)
 
     motion = trajectory(time * 1e-9, seed=seed)
     n, rate = len(time), 1e9 / imu_period
@@ -118,7 +128,7 @@ def trajectory(seconds: np.ndarray, *, seed: int = 0) -> dict[str, np.ndarray]:
         position, velocity (m, m/s, world); attitude (body to world); rate (rad/s) and force (specific force,
         m/s^2), both in the body.
     """
-    random = _generator(seed, "figure")
+    random = generator(seed, "figure")
     frequencies = np.array([0.75, 1.5, 2.2]) * random.uniform(0.85, 1.15, (3, 3))
     sizes = np.array([[1.6], [1.6], [0.6]]) * np.array([1.0, 0.5, 0.25]) * random.uniform(0.7, 1.3, (3, 3))
     phases = random.uniform(0.0, 2.0 * np.pi, (3, 3))
@@ -198,10 +208,6 @@ def _quaternion(R: np.ndarray) -> np.ndarray:
     flips = np.sign(np.einsum("ni,ni->n", q[1:], q[:-1]))
     signs = np.cumprod(np.concatenate([[math.copysign(1.0, q[0, 0])], flips]))
     return np.asarray(q * signs[:, None])
-
-
-def _generator(seed: int, name: str) -> np.random.Generator:
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())])))
 
 
 def _settings(given: Mapping[str, str | float]) -> dict[str, float]:

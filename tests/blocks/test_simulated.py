@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flowgraph import load_flight
 from flowgraph.blocks import geometry as g
-from flowgraph.blocks.flights.simulated import DEFAULTS, load, trajectory
+from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
+from flowgraph.blocks.flights.worlds import SENSORS
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.errors import DataError, UnknownNameError
 
@@ -83,3 +85,109 @@ def test_bad_settings_are_refused(value):
         load(settings={"imu.rate": value})
     assert "positive number" in str(caught.value)
     assert "imu.rate=200" in str(caught.value)
+
+
+# Through the simulated world.
+
+KINDS = ["thesis", "roundtrip", "hover"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_worlds_give_a_flight_with_the_usual_streams(kind):
+    flight = load_flight(f"sim:{kind}", seed=2, settings={"duration": "8"})
+    assert set(flight.streams) == {"imu", "vicon"}
+    assert len(flight.streams["imu"]) == 1601
+    assert len(flight.streams["vicon"]) == 33
+    assert flight.truth is not None
+    assert (flight.truth.time == flight.streams["imu"].time).all()
+    np.testing.assert_allclose(flight.info["imu_noise"].gyro, np.sqrt(0.1 / 200.0))
+    assert flight.info["position_noise"] == flight.info["attitude_noise"] == 0.1
+    assert "RMS acceleration" in flight.notes[0]
+    errors = pose_errors(flight.streams["vicon"], flight.truth, settle=0.0)
+    np.testing.assert_allclose(errors["position_rmse_m"], np.sqrt(3) * 0.1, rtol=0.4)
+
+
+def test_every_sensor_has_a_stream_and_settings():
+    flight = load("thesis", settings={"sensors": "all", "duration": 4.0})
+    assert list(flight.streams) == list(SENSORS)
+    assert {f"{n}.{k}" for n, parts in SENSORS.items() for k in parts} <= set(SETTINGS)
+    assert set(DEFAULTS) <= set(SETTINGS)
+    for name, parts in SENSORS.items():
+        assert flight.info["noise"][name] == dict(parts)
+        assert flight.info[f"{name}_period_ns"] == round(1e9 / parts["rate"])
+
+
+def test_streams_do_not_disturb_each_other():
+    alone = load("thesis", seed=3, settings={"sensors": "vicon"})
+    among = load("thesis", seed=3, settings={"sensors": "gps,vicon,imu", "gps.noise": 5, "imu.rate": 100})
+    assert (alone.streams["vicon"].attitude == among.streams["vicon"].attitude).all()
+    apart = load("thesis", seed=3, settings={"sensors": "gyro,accelerometer"})
+    together = load("thesis", seed=3)
+    assert (apart.streams["gyro"].rate == together.streams["imu"].gyro).all()
+    assert (apart.streams["accelerometer"].force == together.streams["imu"].specific_force).all()
+
+
+def test_truth_has_the_biases_of_the_readings():
+    quiet = {"gyro.noise": 0.0, "accelerometer.noise": 0.0}
+    wrong = {"gyro.bias": 0.1, "gyro.walk": 0.01, "accelerometer.bias": 0.2, "imu.phase": 0.01}
+    given: dict[str, str | float] = {"imu.rate": "50", "sensors": "imu,thrust", **quiet, **wrong}
+    flight = load("thesis", seed=4, settings=given)
+    imu, truth = flight.streams["imu"], flight.truth
+    assert truth is not None
+    assert (np.diff(truth.time) == 5_000_000).all()  # those of the fastest sensor
+    rows = np.searchsorted(truth.time, imu.time)
+    motion = flight.info["world"].at(imu.time / 1e9)
+    np.testing.assert_allclose(imu.gyro - motion.rate, truth.gyro_bias[rows], atol=1e-12)
+    push = imu.specific_force - motion.specific_force
+    np.testing.assert_allclose(push, truth.accelerometer_bias[rows], atol=1e-12)
+    assert np.ptp(truth.gyro_bias[:, 0]) > 0.0
+    assert np.ptp(truth.accelerometer_bias[:, 0]) == 0.0
+
+
+def test_late_sensors_tell_their_stamps():
+    late: dict[str, str | float] = {"sensors": "imu,gps", "gps.latency": "0.3", "gps.jitter": 0.05}
+    late["gps.lever_x"] = "-0.2"
+    flight = load("thesis", seed=1, settings=late)
+    gps, stamp = flight.streams["gps"], flight.info["stamps"]["gps"]
+    assert set(flight.info["stamps"]) == {"gps"}
+    assert len(stamp) == len(gps)
+    assert abs(np.mean(gps.time - stamp) * 1e-9 - 0.3) < 0.03
+    assert flight.info["gps_lever"] == (-0.2, 0.0, 0.0)
+
+
+def test_worlds_take_their_settings():
+    assert load("hover", settings={"drift": "0.2", "duration": 60}).info["still"] == 0.0
+    assert load("hover", settings={"duration": 60}).info["still"] == 60.0
+    trip = load("roundtrip", settings={"angle": -0.5, "rest": 2})
+    assert trip.info["still"] == 2.0
+    assert trip.info["world"].angle == -0.5
+    tame = load("thesis", settings={"most_thrust": 25}).info["world"]
+    assert tame.at(np.arange(0.0, 20.0, 0.01)).thrust.max() <= 25.0
+
+
+def test_worlds_refuse_what_they_do_not_know():
+    with pytest.raises(UnknownNameError, match=r"no setting is called 'gps\.lag'") as caught:
+        load("thesis", settings={"sensors": "imu,gps", "gps.lag": 1})
+    assert "gps.latency" in str(caught.value)
+    with pytest.raises(UnknownNameError, match="no sensor is called 'lidar'"):
+        load("thesis", settings={"sensors": "imu,lidar"})
+    with pytest.raises(UnknownNameError, match="no setting is called 'drift'"):
+        load("thesis", settings={"drift": 1})
+    with pytest.raises(
+        DataError, match=r"setting 'gps\.rate' is of a sensor that this flight does not"
+    ) as bad:
+        load("thesis", settings={"gps.rate": 1})
+    assert "sensors=imu,vicon,gps" in str(bad.value)
+    with pytest.raises(DataError, match="a flight needs a sensor"):
+        load("thesis", settings={"sensors": " , "})
+    with pytest.raises(DataError, match="the thesis's flights are shorter"):
+        load("thesis", settings={"duration": 30})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("vicon.rate", "0"), ("vicon.noise", "-1"), ("imu.latency", "x")]
+)
+def test_worlds_refuse_bad_numbers(name, value):
+    with pytest.raises(DataError, match=f"setting '{name}' is not usable") as caught:
+        load("hover", settings={name: value})
+    assert f"{name}=" in str(caught.value)

@@ -1,0 +1,276 @@
+"""Flights through the simulated world: `sim:thesis`, `sim:roundtrip` and `sim:hover`, with any of its
+sensors.
+
+`sensors` names the streams, comma-separated (or all); each sensor has settings of its own, `NAME.rate` and so
+on, that are refused where the flight has no such sensor. Left out, they are those of the thesis: variances
+per sample of 0.1 for gyroscope and accelerometer at 200 Hz, as continuous densities here, and of 0.01 for the
+motion capture at 4 Hz; no biases, no latency.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Flight, Series
+from flowgraph.blocks import sensors as s
+from flowgraph.blocks.signals import NavigationState
+from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
+from flowgraph.errors import DataError, UnknownNameError
+
+__all__ = ["SENSORS", "SETTINGS", "WORLDS", "load_world"]
+
+_CLOCK = {"phase": 0.0, "latency": 0.0, "jitter": 0.0}
+_DRIFT = {"bias": 0.0, "walk": 0.0}
+_THESIS = math.sqrt(0.1 / 200.0)  # the density of a variance of 0.1 per sample at 200 Hz
+_DEVIATION = math.sqrt(0.1)
+_LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
+
+SENSORS: Mapping[str, Mapping[str, float]] = {
+    "imu": {"rate": 200.0, **_CLOCK},
+    "gyro": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
+    "accelerometer": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
+    "coordinate_acceleration": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
+    "position": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, **_LEVER},
+    "attitude": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT},
+    "vicon": {"rate": 4.0, **_CLOCK, "noise": 0.1, "attitude_noise": 0.1},
+    "gps": {"rate": 2.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER},
+    "gps2": {"rate": 1.25, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER},
+    "magnetometer": {
+        **{"rate": 50.0, **_CLOCK, "noise": 5e-7, **_DRIFT},
+        **{"declination": 0.0, "dip": math.radians(60.0), "strength": 50e-6},
+    },
+    "magnetic_attitude": {"rate": 50.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
+    "altimeter": {"rate": 80.0, **_CLOCK, "noise": 0.1, **_DRIFT, "most_tilt": math.radians(75.0)},
+    "optical_flow": {"rate": 20.0, **_CLOCK, "noise": 0.01, "attitude_noise": 0.01},
+    "thrust": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
+    "body_rate": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
+}
+"""What each sensor can be set to, and what it is when left out, in SI units and radians. `noise` is a
+continuous density for gyro, accelerometer and coordinate_acceleration (the imu has theirs), and for all
+others a standard deviation per sample; `bias` is the standard deviation of a constant, `walk` the density of
+its random walk."""
+
+WORLDS: Mapping[str, Mapping[str, float]] = {
+    "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 30.0, "most_rate": 35.0},
+    "roundtrip": {"duration": 20.0, "angle": 1.0, "trip": 5.0, "rest": 1.0},
+    "hover": {"duration": 20.0, "drift": 0.0},
+}
+"""The settings of each world: s, m/s^2, rad/s, rad, m."""
+
+SETTINGS: Mapping[str, str | float] = {
+    "sensors": "imu,vicon",
+    **{name: value for world in WORLDS.values() for name, value in world.items()},
+    **{f"{sensor}.{part}": value for sensor, parts in SENSORS.items() for part, value in parts.items()},
+}
+"""All settings of `load_world`, and their values when left out."""
+
+_POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "rate", "strength", "most_tilt")
+_SIGNED = ("angle", "declination", "dip", *_LEVER)
+_PARTS_OF_IMU = ("gyro", "accelerometer")
+
+Numbers = Mapping[str, float]
+
+
+def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
+    """Make a flight through a world.
+
+    Args:
+        kind: thesis, roundtrip or hover.
+        seed: of the world and of all noise; each noise has a random stream of its own name.
+        settings: any of `SETTINGS` that concern this world and its sensors.
+
+    Returns:
+        A `Flight`: a stream for each sensor, by time of arrival. truth: `NavigationState` at the times of the
+        fastest sensor, with the biases of the gyroscope and accelerometer. info:
+        `world` (the `World`); `still` (s at rest at the start); `noise` (the settings of each sensor);
+        `NAME_period_ns`; `stamps` (when each reading of a late sensor was true, int64 ns, row by row);
+        `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `vicon_lever`, `gps_lever`,
+        `gps2_lever`, `position_lever` (m, body) and `magnetic_field` (T, world) where there are such sensors.
+
+    Raises:
+        UnknownNameError: for a setting, sensor or world that is not there.
+        DataError: for a setting out of its range, or of a sensor that the flight does not have.
+    """
+    if kind not in WORLDS:
+        raise UnknownNameError("simulated world", kind, WORLDS, path="sim")
+    path = f"sim:{kind}"
+    given = dict(settings or {})
+    chosen = _chosen(str(given.pop("sensors", SETTINGS["sensors"])), path)
+    numbers = _numbers(kind, chosen, given, path)
+    world, still = _world(kind, numbers, seed, path)
+    end = round(numbers["duration"] * 1e9)
+
+    streams: dict[str, Series] = {}
+    stamps: dict[str, np.ndarray] = {}
+    made: dict[str, s.Sensor] = {}
+    info: dict[str, Any] = {"world": world, "still": still, "noise": {}, "stamps": stamps}
+    for name in chosen:
+        made[name] = sensor = _sensor(name, numbers)
+        recording = sensor.record(world, seed=seed, until=end)
+        streams[name] = recording.series
+        info["noise"][name] = _of(name, numbers)
+        info[f"{name}_period_ns"] = sensor.period
+        if sensor.latency or sensor.jitter:
+            stamps[name] = recording.stamp
+        info.update(_calibration(sensor))
+    for part in _PARTS_OF_IMU if "imu" in chosen else ():
+        info["noise"][part] = _of(part, numbers)
+
+    time = np.arange(0, end + 1, min(sensor.period for sensor in made.values()), dtype=np.int64)
+    motion = world.at(time / 1e9)
+    truth = NavigationState(
+        position=motion.position,
+        velocity=motion.velocity,
+        attitude=motion.attitude,
+        gyro_bias=_bias("gyro", made, time, numbers, seed),
+        accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
+    )
+    note = f"simulated with seed {seed}: {figures(world)}"
+    return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, (note,))
+
+
+def _world(kind: str, n: Numbers, seed: int, path: str) -> tuple[World, float]:
+    """The world, and for how many seconds the body is at rest at first."""
+    if kind == "roundtrip":
+        shape = RoundTrip(n["duration"], angle=n["angle"], trip=n["trip"], rest=n["rest"])
+        return shape, min(n["rest"], n["duration"])
+    if kind == "hover":
+        at_rest = n["drift"] == 0.0
+        return Hover(n["duration"], drift=n["drift"], seed=seed), n["duration"] if at_rest else 0.0
+    flight = thesis_flight(seed, limits=Limits(n["least_thrust"], n["most_thrust"], n["most_rate"]))
+    if n["duration"] > flight.duration:
+        raise DataError(
+            "the thesis's flights are shorter",
+            path=path,
+            expected=f"duration at most {flight.duration:g} s",
+            got=f"{n['duration']:g}",
+            fix="leave duration out, or use sim:roundtrip or sim:hover",
+        )
+    return flight, 0.0
+
+
+def _noise(n: Numbers, *, density: bool = False, white: str = "noise") -> s.Noise:
+    kind = {"density" if density else "deviation": n[white]}
+    return s.Noise(**kind, bias=n.get("bias", 0.0), walk=n.get("walk", 0.0))
+
+
+def _sensor(name: str, numbers: Numbers) -> s.Sensor:
+    n = _of(name, numbers)
+    common: dict[str, Any] = {"name": name, "rate": n["rate"], **{k: n[k] for k in _CLOCK}}
+    if name == "imu":
+        gyro, push = (_noise(_of(part, numbers), density=True) for part in _PARTS_OF_IMU)
+        return s.InertialUnit(**common, gyro=gyro, accelerometer=push)
+    common["noise"] = _noise(n, density=name in ("gyro", "accelerometer", "coordinate_acceleration"))
+    if name in ("vicon", "optical_flow"):
+        common["attitude_noise"] = _noise(n, white="attitude_noise")
+    if "lever_x" in n:
+        common["lever"] = tuple(n[k] for k in _LEVER)
+    common.update({k: n[k] for k in ("declination", "dip", "strength", "most_tilt") if k in n})
+    return _MAKERS[name](**common)
+
+
+_MAKERS: Mapping[str, Callable[..., s.Sensor]] = {
+    "gyro": s.Gyroscope,
+    "accelerometer": s.Accelerometer,
+    "coordinate_acceleration": s.CoordinateAccelerometer,
+    "position": s.PositionSensor,
+    "attitude": s.AttitudeSensor,
+    "vicon": s.Vicon,
+    "gps": s.Gps,
+    "gps2": s.Gps,
+    "magnetometer": s.Magnetometer,
+    "magnetic_attitude": s.MagneticAttitude,
+    "altimeter": s.Altimeter,
+    "optical_flow": s.OpticalFlowSensor,
+    "thrust": s.ThrustInput,
+    "body_rate": s.BodyRateInput,
+}
+
+
+def _calibration(sensor: s.Sensor) -> dict[str, Any]:
+    """What a filter may know of a sensor, under the names that recorded flights use too."""
+    if isinstance(sensor, s.InertialUnit):
+        return {"imu_noise": sensor.densities}
+    if isinstance(sensor, s.Vicon):
+        noise = {"position_noise": sensor.noise.deviation, "attitude_noise": sensor.attitude_noise.deviation}
+        return {**noise, "vicon_lever": (0.0, 0.0, 0.0)}
+    if isinstance(sensor, s.Magnetometer):
+        return {"magnetic_field": s.earth_field(sensor.declination, sensor.dip, sensor.strength)}
+    if isinstance(sensor, s.PositionSensor):
+        return {f"{sensor.name}_lever": sensor.lever}
+    return {}
+
+
+def _bias(
+    part: str, made: Mapping[str, s.Sensor], time: np.ndarray, numbers: Numbers, seed: int
+) -> np.ndarray:
+    """The bias (n, 3) that a reading at or before each time had; zero without such a sensor."""
+    reader = made.get("imu") or made.get(part)
+    if reader is None:
+        return np.zeros((len(time), 3))
+    stamp = np.arange(round(reader.phase * 1e9), int(time[-1]) + reader.period, reader.period)
+    drift = _noise(_of(part, numbers), density=True).drift(part, seed, stamp / 1e9, 3)
+    return drift[np.maximum(np.searchsorted(stamp, time, side="right") - 1, 0)]
+
+
+def _of(name: str, numbers: Numbers) -> dict[str, float]:
+    return {part: numbers[f"{name}.{part}"] for part in SENSORS[name]}
+
+
+def _chosen(text: str, path: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    names = list(SENSORS) if names == ["all"] else list(dict.fromkeys(names))
+    for name in names:
+        if name not in SENSORS:
+            raise UnknownNameError("sensor", name, [*SENSORS, "all"], path=path)
+    if not names:
+        raise DataError(
+            "a flight needs a sensor",
+            path=path,
+            expected="sensors: names with commas between, of " + ", ".join(SENSORS),
+            got=repr(text),
+            fix="for example sensors=imu,vicon",
+        )
+    return names
+
+
+def _numbers(kind: str, chosen: list[str], given: Mapping[str, str | float], path: str) -> dict[str, float]:
+    used = [*chosen, *(_PARTS_OF_IMU if "imu" in chosen else ())]
+    known = {f"{name}.{part}": value for name, parts in SENSORS.items() for part, value in parts.items()}
+    known.update(WORLDS[kind])
+    for name, text in given.items():
+        if name not in known:
+            raise UnknownNameError("setting", name, ["sensors", *known], path=path)
+        sensor, dot, part = name.rpartition(".")
+        if dot and sensor not in used:
+            raise DataError(
+                f"setting {name!r} is of a sensor that this flight does not have",
+                path=path,
+                expected="settings of " + ", ".join(used),
+                got=f"{name}={text}",
+                fix=f"name the sensor too: sensors={','.join([*chosen, sensor])}",
+            )
+        known[name] = _number(name, part, text, known[name], path)
+    return known
+
+
+def _number(name: str, part: str, text: str | float, otherwise: float, path: str) -> float:
+    try:
+        number = float(text)
+    except (TypeError, ValueError):
+        number = math.nan
+    least = -math.inf if part in _SIGNED else 0.0
+    if not math.isfinite(number) or number < least or (part in _POSITIVE and number == 0.0):
+        kind = "a positive number" if part in _POSITIVE else "a number that is not negative"
+        raise DataError(
+            f"setting {name!r} is not usable",
+            path=path,
+            expected="a number" if part in _SIGNED else kind,
+            got=repr(text),
+            fix=f"for example {name}={otherwise:g}",
+        )
+    return number

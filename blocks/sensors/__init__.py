@@ -1,0 +1,44 @@
+"""Simulated sensors: each reads a `World` by its own clock, with its own noise, and perhaps late.
+
+A sensor is immutable; `sensor.sample(world, seed=0)` gives a `Series` of its signal type. Random numbers
+depend on the seed and the sensor's name only.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.sensors.altimeter import Altimeter
+from flowgraph.blocks.sensors.control import BodyRateInput, ThrustInput
+from flowgraph.blocks.sensors.flow import OpticalFlowSensor
+from flowgraph.blocks.sensors.geodetic import as_geodetic, as_position, from_enu, to_enu
+from flowgraph.blocks.sensors.gps import Gps
+from flowgraph.blocks.sensors.inertial import Accelerometer, CoordinateAccelerometer, Gyroscope, InertialUnit
+from flowgraph.blocks.sensors.magnetic import MagneticAttitude, Magnetometer, earth_field
+from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
+from flowgraph.blocks.sensors.pose import AttitudeSensor, PositionSensor, Vicon
+from flowgraph.blocks.sensors.sensor import Recording, Sensor
+
+__all__ = [
+    "Sensor",
+    "Recording",
+    "Noise",
+    "NO_NOISE",
+    "Gyroscope",
+    "Accelerometer",
+    "CoordinateAccelerometer",
+    "InertialUnit",
+    "PositionSensor",
+    "AttitudeSensor",
+    "Vicon",
+    "Gps",
+    "Magnetometer",
+    "MagneticAttitude",
+    "earth_field",
+    "Altimeter",
+    "OpticalFlowSensor",
+    "ThrustInput",
+    "BodyRateInput",
+    "to_enu",
+    "from_enu",
+    "as_geodetic",
+    "as_position",
+]

@@ -1,0 +1,36 @@
+"""The simulated world: bodies that move in known ways, for sensors to read.
+
+A `World` answers for any times with a `Motion`: position and its derivatives, attitude and body rate, all
+exact. `thesis_flight` draws a random quadrotor flight, `Quadrotor` follows given key points, `RoundTrip`
+turns out and back in its place, `Hover` stays.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.world.draws import generator
+from flowgraph.blocks.world.feasibility import LIMITS, Limits
+from flowgraph.blocks.world.figures import Figures, figures
+from flowgraph.blocks.world.hover import Hover
+from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join
+from flowgraph.blocks.world.motion import Motion, World
+from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
+from flowgraph.blocks.world.roundtrip import RoundTrip
+from flowgraph.blocks.world.thesis import thesis_flight
+
+__all__ = [
+    "World",
+    "Motion",
+    "KeyPoint",
+    "Primitives",
+    "join",
+    "Quadrotor",
+    "carried_by_thrust",
+    "Limits",
+    "LIMITS",
+    "thesis_flight",
+    "RoundTrip",
+    "Hover",
+    "Figures",
+    "figures",
+    "generator",
+]
