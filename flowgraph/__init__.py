@@ -21,6 +21,7 @@ from flowgraph.inputs import arrays, ticks, timing_of
 from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
 from flowgraph.lowering import lower
 from flowgraph.many import Batch, simulate_many
+from flowgraph.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.pipeline import Pipeline
 from flowgraph.registry import Case, find_graph, load_flight
 from flowgraph.result import Result
@@ -29,7 +30,9 @@ from flowgraph.series import Flight, Series
 from flowgraph.simulate import simulate
 from flowgraph.state import load_state, save_state
 from flowgraph.stream import Held, Stream, apply
+from flowgraph.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
+from flowgraph.windows import batch, flat_map, padded, reduce, stacked, window
 
 __all__ = [
     "Array",
@@ -61,29 +64,46 @@ __all__ = [
     "aperiodic",
     "apply",
     "arrays",
+    "batch",
     "block",
     "boolean",
     "collect",
     "delay",
+    "delta_time",
+    "drop",
     "every",
     "find_graph",
+    "flat_map",
     "graph",
+    "group_by",
+    "high_pass",
     "integer",
+    "integrate",
     "latest",
     "load_flight",
     "load_state",
+    "low_pass",
     "lower",
     "match",
     "merge",
+    "padded",
     "periodic",
     "real",
+    "reduce",
     "save_state",
+    "scan",
     "simulate",
     "simulate_many",
     "sink",
+    "stacked",
+    "take_while",
+    "tap",
     "ticks",
     "timing_of",
+    "until",
+    "unzip",
     "when",
+    "window",
     "zip",
     "zip_latest",
     "zip_latest_right",

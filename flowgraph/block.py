@@ -18,25 +18,13 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
-from flowgraph.ops import Spec
-from flowgraph.random import Site, site
-from flowgraph.symbolic import Symbolic, Trace, namespace
+from flowgraph.errors import DeclarationError
 from flowgraph.types import (
-    ArrayType,
     StructType,
     Type,
     annotation_type,
-    bind,
-    check_fits,
-    flatten,
-    leaves_of,
-    tuple_type,
-    type_of,
-    unflatten,
     without_none,
 )
 
@@ -44,6 +32,9 @@ R = TypeVar("R")
 
 HANDED_IN = ("dt", "t", "xp", "path", "draw")
 """Keyword-only parameters that the engine supplies; all others are settings."""
+
+WIRING = ("at", "name", "draws")
+"""Keywords of every wiring: the clock at which to fire, the node's name, the names of its random streams."""
 
 REQUIRED: Any = inspect.Parameter.empty
 
@@ -66,55 +57,6 @@ class Port(NamedTuple):
     name: str
     type: Type | None
     optional: bool
-
-
-class StepOutput(NamedTuple):
-    """What one variant of a step gives at an output; `presence` is "always", "never" or a value number."""
-
-    presence: str | int
-    type: Type | None
-    leaves: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class StepTrace:
-    """The instructions of one variant of a step, with the numbers of its ends."""
-
-    trace: Trace
-    arguments: tuple[tuple[int, ...] | None, ...]
-    state: tuple[int, ...]
-    time: int
-    dt: int
-    outputs: tuple[StepOutput, ...]
-    next_state: tuple[int, ...]
-    sites: tuple[tuple[Site, int], ...] = ()
-
-
-class SymbolicDraw:
-    """`draw` while a step is recorded: each site becomes a value that comes from outside."""
-
-    def __init__(self, trace: Trace, prefix: str) -> None:
-        self._trace, self._prefix = trace, prefix
-        self.sites: dict[Site, Symbolic] = {}
-
-    def normal(self, name: str, shape: tuple[int, ...]) -> Symbolic:
-        return self._at(site(self._prefix, "normal", name, shape))
-
-    def uniform(self, name: str, shape: tuple[int, ...]) -> Symbolic:
-        return self._at(site(self._prefix, "uniform", name, shape))
-
-    def _at(self, found: Site) -> Symbolic:
-        if any(known.name == found.name and known != found for known in self.sites):
-            raise DeclarationError(
-                "a random stream is drawn in two shapes",
-                path=found.name,
-                expected="one draw a name",
-                got=f"{found.kind}{found.shape} and another",
-                fix="give each draw a name of its own",
-            )
-        if found not in self.sites:
-            self.sites[found] = self._trace.input(Spec(found.shape, "real"))
-        return self.sites[found]
 
 
 class Block(Generic[R]):
@@ -194,6 +136,14 @@ class Block(Generic[R]):
                 ports.append(Port(p.name, annotation_type(annotation), optional or p.default is None))
             elif p.kind is p.KEYWORD_ONLY and p.name in HANDED_IN:
                 handed.add(p.name)
+            elif p.kind is p.KEYWORD_ONLY and p.name in WIRING:
+                raise DeclarationError(
+                    f"a setting cannot be called {p.name!r}",
+                    path=self.name,
+                    expected="a name other than " + ", ".join(WIRING),
+                    got=p.name,
+                    fix="these say how a block is wired; choose another name",
+                )
             elif p.kind is p.KEYWORD_ONLY:
                 settings[p.name] = p.default
             else:
@@ -263,99 +213,6 @@ class Block(Generic[R]):
         assert self._init is not None
         return self._init(*types, **settings)
 
-    def record(
-        self,
-        types: Sequence[Type | None],
-        settings: Mapping[str, Any],
-        state: Type | None,
-        path: str,
-        draws: str = "",
-    ) -> StepTrace:
-        """Run the step on symbolic arguments (None: absent) and return what it did.
-
-        Raises:
-            LoweringError: where it does something a pipeline cannot hold; names the line.
-        """
-        trace = Trace()
-
-        def symbolic(type_: Type) -> tuple[Any, tuple[int, ...]]:
-            leaves = [trace.input(Spec(_sizes(t, path), t.dtype)) for _, t in leaves_of(type_)]
-            return unflatten(type_, iter(leaves)), tuple(leaf.number for leaf in leaves)
-
-        time, dt = trace.input(Spec((), "int64")), trace.input(Spec((), "real"))
-        args = [None if t is None else symbolic(t) for t in types]
-        known = {
-            number: leaf
-            for t, a in zip(types, args, strict=True)
-            if t is not None and a is not None
-            for number, (_, leaf) in zip(a[1], leaves_of(t), strict=True)
-        }
-        values = [None if a is None else a[0] for a in args]
-        memory = symbolic(state) if state is not None else None
-        draw = SymbolicDraw(trace, draws or self.name)
-        handed = {"dt": dt, "t": time, "xp": namespace, "path": path, "draw": draw}
-        try:
-            result = self.step(
-                *([memory[0]] if memory else []), *values, **settings, **{h: handed[h] for h in self.handed}
-            )
-        except FlowgraphError as error:
-            error.path = f"{path} ({error.path})" if error.path else path
-            raise
-        except Exception as error:
-            raise LoweringError(
-                f"the step cannot be traced: {type(error).__name__}: {error}",
-                path=f"{path} ({_line_of(error)})",
-                expected="array-API operations through xp on fixed shapes",
-                got=f"{type(error).__name__}",
-                fix="use functions of xp, or declare @block(host=True) with annotated outputs",
-            ) from error
-        next_state: tuple[int, ...] = ()
-        if memory is not None and state is not None:
-            new_state, result = self._split(result, path)
-            fits_state(new_state, state, path)
-            next_state = _numbers(trace, new_state, state)
-        outputs = tuple(
-            _output(trace, value, port, known, path)
-            for value, port in zip(
-                self.split_outputs(result, path), self.outputs or [Port("out", None, False)], strict=True
-            )
-        )
-        return StepTrace(
-            trace,
-            tuple(None if a is None else a[1] for a in args),
-            memory[1] if memory else (),
-            time.number,
-            dt.number,
-            outputs,
-            next_state,
-            tuple((known, value.number) for known, value in draw.sites.items()),
-        )
-
-    def _split(self, result: Any, path: str) -> tuple[Any, Any]:
-        if not isinstance(result, tuple) or len(result) != 2 or isinstance(result, When):
-            raise DeclarationError(
-                "a block with a state must return (state, outputs)",
-                path=path,
-                expected="a pair",
-                got=type(result).__name__,
-                fix="return new_state, output",
-            )
-        return result
-
-    def split_outputs(self, result: Any, path: str) -> tuple[Any, ...]:
-        """The outputs one by one."""
-        if self.outputs is None or len(self.outputs) == 1:
-            return (result,)
-        if not isinstance(result, tuple) or len(result) != len(self.outputs):
-            raise DeclarationError(
-                "the step returns another number of outputs than it declares",
-                path=path,
-                expected=f"{len(self.outputs)} outputs ({', '.join(p.name for p in self.outputs)})",
-                got=f"{len(result)}" if isinstance(result, tuple) else type(result).__name__,
-                fix="return one value an output, as annotated",
-            )
-        return result
-
     def __repr__(self) -> str:
         return f"<block {self.name}({', '.join(p.name for p in self.ports)})>"
 
@@ -373,97 +230,6 @@ def block(step: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     if step is None:
         return lambda function: Block(function, local=local, **options)
     return Block(step, local=local)
-
-
-def fits_state(new: Any, state: Type, path: str) -> None:
-    """Check that a step's new state has the type of its initial state."""
-    check_fits(
-        type_of(new), state, given_at=f"the state returned by {path}", wanted_at=f"{path} state", sizes={}
-    )
-
-
-def _numbers(trace: Trace, value: Any, type_: Type) -> tuple[int, ...]:
-    lifted = [leaf if isinstance(leaf, Symbolic) else trace.constant(leaf) for leaf in flatten(value, type_)]
-    kinds = [t.dtype for _, t in leaves_of(type_)]
-    return tuple(leaf.cast(kind).number for leaf, kind in zip(lifted, kinds, strict=True))
-
-
-def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str) -> StepOutput:
-    if value is None:
-        return StepOutput("never", None, ())
-    presence: str | int = "always"
-    if isinstance(value, When):
-        flag = value.present
-        presence = (flag if isinstance(flag, Symbolic) else trace.constant(bool(flag))).cast("bool").number
-        value = value.value
-    given = _typed(value, known)
-    if port.type is not None:
-        sizes: dict[str, int] = {}
-        wanted = _reals(port.type, given)
-        try:
-            check_fits(
-                wanted, port.type, given_at=f"{path}'s result", wanted_at=f"{path}.{port.name}", sizes=sizes
-            )
-        except TypeMismatchError as error:
-            error.fix = "return what the annotation promises, or mend the annotation"
-            raise
-        given = _with_units(wanted, bind(port.type, sizes))
-    return StepOutput(presence, given, _numbers(trace, value, given))
-
-
-def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
-    """The type of a result; a leaf passed through unchanged keeps its unit and frame."""
-    if isinstance(value, Symbolic) and value.number in known:
-        return known[value.number]
-    if isinstance(value, tuple):
-        return tuple_type([_typed(v, known) for v in value])
-    return type_of(value)
-
-
-def _reals(wanted: Type, given: Type) -> Type:
-    """`given`, with Python integers where `wanted` has a real taken as reals."""
-    if isinstance(wanted, ArrayType) and isinstance(given, ArrayType) and wanted.dtype == "real":
-        return ArrayType(given.shape, "real" if given.dtype != "bool" else "bool", given.unit, given.frame)
-    return given
-
-
-def _with_units(given: Type, named: Type) -> Type:
-    if isinstance(given, ArrayType) and isinstance(named, ArrayType):
-        return replace(
-            given,
-            unit=named.unit or given.unit,
-            frame=named.frame or given.frame,
-            axes=named.axes or given.axes,
-        )
-    if isinstance(given, StructType) and isinstance(named, StructType):
-        pairs = zip(given.fields, named.fields, strict=True)
-        return StructType(given.name, tuple((n, _with_units(g, w)) for (n, g), (_, w) in pairs), given.cls)
-    return given
-
-
-def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
-    unbound = [d for d in leaf.shape if isinstance(d, str)]
-    if unbound:
-        raise DeclarationError(
-            f"size {unbound[0]!r} is not bound",
-            path=path,
-            expected="every size known when the graph is built",
-            got=str(leaf),
-            fix=f"give it to build: build(sizes={{{unbound[0]!r}: ...}})",
-        )
-    return typing.cast(tuple[int, ...], leaf.shape)
-
-
-def _line_of(error: BaseException) -> str:
-    """module:line of the last frame of the user's code in a traceback."""
-    place = "?"
-    step = error.__traceback__
-    while step is not None:
-        module = step.tb_frame.f_globals.get("__name__", "?")
-        if module not in (__name__, "flowgraph.symbolic", "flowgraph.ops"):
-            place = f"{module}:{step.tb_lineno}"
-        step = step.tb_next
-    return place
 
 
 def _snake(name: str) -> str:

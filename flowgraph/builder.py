@@ -30,6 +30,9 @@ from flowgraph.graph import (
 from flowgraph.stream import Held, Stream
 from flowgraph.types import ArrayType, Type, as_value, bind, check_fits, type_of
 
+_MOST_SOURCES = 62
+"""Source patterns are bits of an int64."""
+
 
 class Builder:
     """The graph under construction."""
@@ -175,6 +178,15 @@ class Builder:
                     got="none",
                     fix="call .feed(...) on it before the graph function returns",
                 )
+        sources = [n.path for n in self.nodes if isinstance(n, SourceNode)]
+        if len(sources) > _MOST_SOURCES:
+            raise DeclarationError(
+                "too many sources",
+                path=self.name,
+                expected=f"at most {_MOST_SOURCES}",
+                got=str(len(sources)),
+                fix="pack several sensors of one clock into one signal",
+            )
         order = firing_order(self.nodes)
         used = {w.node for w in self._wires()} | self._clocked()
         for index, source in enumerate(self.nodes):

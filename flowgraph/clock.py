@@ -47,7 +47,7 @@ class Timing:
     Args:
         period: nanoseconds between events; None for an aperiodic source.
         phase: time of the events modulo the period, in ns; None: whatever the first event shows.
-        jitter: how far a stamp may be from its place, in ns; 0 for exact.
+        jitter: how far the step between two stamps may be from the period, in ns; 0 for exact.
         max_rate: highest rate of an aperiodic source in Hz (for its closest two events), or None.
     """
 
@@ -311,7 +311,8 @@ def _coincide(a: Timing, a_present: bool, b: Timing, b_present: bool) -> bool:
     exact = all(t.period is not None and t.phase is not None and not t.jitter for t in (a, b))
     if not exact or not (a_present or b_present):
         return True
-    assert a.period and b.period  # as `exact` says
+    assert a.period  # as `exact` says
+    assert b.period
     assert a.phase is not None
     assert b.phase is not None
     meet = (a.phase - b.phase) % math.gcd(a.period, b.period) == 0

@@ -12,9 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flowgraph.block import Block, StepTrace
+from flowgraph.block import Block
 from flowgraph.clock import Clock, Source, atoms
 from flowgraph.errors import CycleError, LoweringError, MissingDependencyError, UnknownNameError
+from flowgraph.recording import StepTrace
 from flowgraph.types import Type
 
 if TYPE_CHECKING:

@@ -41,16 +41,17 @@ def arrays(
         time: (n,) integer nanoseconds, in order.
         values: a signal or array with a leading axis of length n.
         duplicates: of two events at one time "raise", or keep the "first" or "last".
-        not_finite: where a value is NaN or infinite "raise", or treat the event as "absent".
+        not_finite: where a value is NaN or infinite "raise", or treat the event as "absent"; "keep" lets NaN
+            pass as data, for blocks that take it as an entry that was not measured.
     """
-    series = Series(time, values, name=name)
-    keep = np.ones(len(series), dtype=bool)
-    if _rule("duplicates", duplicates, ("raise", "first", "last")) != "raise":
+    rule = _rule("not_finite", not_finite, ("raise", "absent", "keep"))
+    series = Series(time, values, name=name, gaps=rule == "keep")
+    if rule == "absent":
+        series = series[~_broken_rows(series)]
+    if _rule("duplicates", duplicates, ("raise", "first", "last")) != "raise" and len(series):
         same = np.diff(series.time) == 0
-        keep &= np.r_[True, ~same] if duplicates == "first" else np.r_[~same, True]
-    if _rule("not_finite", not_finite, ("raise", "absent")) == "absent":
-        keep &= ~_broken_rows(series)
-    return series if keep.all() else series[keep]
+        series = series[np.r_[True, ~same] if duplicates == "first" else np.r_[~same, True]]
+    return series
 
 
 def ticks(period: str | int, *, until: str | int, start: int = 0, name: str = "ticks") -> Series:
@@ -85,10 +86,12 @@ def _rule(what: str, given: str, valid: tuple[str, ...]) -> str:
 
 
 def _broken_rows(series: Series) -> np.ndarray:
+    """(n,) rows with a value that is not finite; where gaps are data, with one that is infinite."""
     broken = np.zeros(len(series), dtype=bool)
     for leaf in series.leaves.values():
         if leaf.dtype.kind == "f":
-            broken |= ~np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim)))
+            wrong = np.isinf(leaf) if series.gaps else ~np.isfinite(leaf)
+            broken |= wrong.any(axis=tuple(range(1, leaf.ndim)))
     return broken
 
 
@@ -193,9 +196,10 @@ def _typed(name: str, series: Series, wanted: Type) -> Series:
             got=str(series.type),
             fix=f"pack the arrays: Series(time, {wanted}(...))",
         )
-    as_real = Series(series.time, series.values, type=_as_wanted(series.type, wanted), name=name)
+    more: dict[str, Any] = {"name": name, "gaps": series.gaps}
+    as_real = Series(series.time, series.values, type=_as_wanted(series.type, wanted), **more)
     check_fits(as_real.type, wanted, given_at=f"the data of {name}", wanted_at=f"source {name}", sizes={})
-    return Series(series.time, series.values, type=wanted, name=name)
+    return Series(series.time, series.values, type=wanted, **more)
 
 
 def _as_wanted(given: Type, wanted: Type) -> Type:
@@ -218,12 +222,17 @@ def _check_after(name: str, time: int, resumed: int) -> None:
 
 
 def _checked(name: str, series: Series, timing: Timing, before: int = NEVER) -> Series:
-    if not all(np.isfinite(leaf).all() for leaf in series.leaves.values() if leaf.dtype.kind == "f"):
-        broken = _broken_rows(series)
-        row = int(np.flatnonzero(broken)[0])
-        _not_finite(name, int(series.time[row]), f"row {row} ({int(broken.sum())} in all)")
+    check_finite(name, series)
     check_times(name, series.time, timing, before)
     return series
+
+
+def check_finite(name: str, series: Series) -> None:
+    """Refuse a recording with values that are NaN or infinite."""
+    sound = all(np.isfinite(leaf).all() for leaf in series.leaves.values() if leaf.dtype.kind == "f")
+    if not sound and (broken := _broken_rows(series)).any():
+        row = int(np.flatnonzero(broken)[0])
+        _not_finite(name, int(series.time[row]), f"row {row} ({int(broken.sum())} in all)")
 
 
 def _not_finite(name: str, time: int, where: str) -> None:
@@ -267,7 +276,7 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
                 + (f" +- {timing.jitter} ns" if timing.jitter else "")
                 + " after the one before",
                 got=f"{int(steps[row])} ns (t = {int(stamps[row + 1])} ns)",
-                fix=f'declare what is true: {name}=periodic(..., jitter="...") or {name}=aperiodic(max_rate=...)',
+                fix=f'declare {name}=periodic(..., jitter="...") or {name}=aperiodic(max_rate=...)',
             )
         # the others come whole periods after the first, and are in phase if it is
         phase = None if timing.jitter or not len(time) else timing.phase

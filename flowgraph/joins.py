@@ -21,8 +21,9 @@ from flowgraph.builder import builder
 from flowgraph.clock import Clock, Counted, Source, clock_of, nanoseconds, within
 from flowgraph.errors import ClockError, DeclarationError
 from flowgraph.graph import NEVER
+from flowgraph.queues import drop_first, empty_queue, push
 from flowgraph.stream import Stream
-from flowgraph.types import ArrayType, Type, annotation_type, flatten, tuple_type, unflatten, zeros
+from flowgraph.types import ArrayType, Type, annotation_type, flatten, tuple_type, unflatten
 
 T = TypeVar("T")
 
@@ -35,7 +36,7 @@ def _need_streams(join: str, **given: Any) -> None:
                 path=join,
                 expected="a Stream",
                 got=repr(value),
-                fix="a held value is always there and has no times: read it with map or apply, or sample it with .at(clock)",
+                fix="a held value has no times: read it with map or apply, or sample it with .at(clock)",
             )
 
 
@@ -178,36 +179,6 @@ def merge(a: Stream[T], b: Stream[T], *, tie: Any = None, name: str | None = Non
     return typing.cast("Stream[T]", _merge(a, b, tie=rule, name=name))
 
 
-# Queues: {"items": leaves with a leading axis of the queue's size, "count": how many are in it}.
-
-
-def _queue(type_: Type, size: int) -> dict[str, Any]:
-    blank = zeros(type_)
-    items = tuple(np.repeat(np.asarray(leaf)[None], size, axis=0) for leaf in flatten(blank, type_))
-    return {"items": items, "count": np.int32(0)}
-
-
-def _push(queue: dict[str, Any], leaves: list[Any], present: Any, xp: Any) -> dict[str, Any]:
-    size = queue["items"][0].shape[0]
-    slot = (xp.arange(size, dtype=xp.int32) == queue["count"]) & present
-    items = tuple(
-        xp.where(
-            xp.reshape(slot, (size,) + (1,) * (old.ndim - 1)), xp.expand_dims(xp.asarray(new), axis=0), old
-        )
-        for old, new in builtins.zip(queue["items"], leaves, strict=True)
-    )
-    return {"items": items, "count": queue["count"] + xp.astype(xp.asarray(present), xp.int32)}
-
-
-def _drop(queue: dict[str, Any], n: Any, xp: Any) -> dict[str, Any]:
-    size = queue["items"][0].shape[0]
-    index = xp.clip(xp.arange(size, dtype=xp.int32) + n, max=xp.asarray(np.int32(size - 1)))
-    return {
-        "items": tuple(xp.take(leaf, index, axis=0) for leaf in queue["items"]),
-        "count": queue["count"] - n,
-    }
-
-
 def _ranks(clock: Clock, root: Clock, ticks: int) -> list[bool]:
     """Which of the first `ticks` ticks of `root` belong to `clock`."""
     if clock == root:
@@ -292,8 +263,8 @@ def _zip(state, a=None, b=None, *, size, types, clock, t, xp):  # type: ignore[n
     gone = xp.astype(xp.asarray(ready), xp.int32)
     over = (left["count"] - gone > size) | (right["count"] - gone > size)
     new = {
-        "a": _drop(left, gone, xp),
-        "b": _drop(right, gone, xp),
+        "a": drop_first(left, gone, xp),
+        "b": drop_first(right, gone, xp),
         "overflow": xp.where(over & (state["overflow"] == NEVER), t, state["overflow"]),
     }
     return new, when(ready, out)
@@ -301,11 +272,15 @@ def _zip(state, a=None, b=None, *, size, types, clock, t, xp):  # type: ignore[n
 
 @_zip.init
 def _(a: Type, b: Type, *, size: int, types: Any, clock: Any) -> Any:
-    return {"a": _queue(types[0], size + 1), "b": _queue(types[1], size + 1), "overflow": np.int64(NEVER)}
+    return {
+        "a": empty_queue(types[0], size + 1),
+        "b": empty_queue(types[1], size + 1),
+        "overflow": np.int64(NEVER),
+    }
 
 
 def _arrive(queue: dict[str, Any], value: Any, type_: Type, xp: Any) -> dict[str, Any]:
-    return queue if value is None else _push(queue, flatten(value, type_), True, xp)
+    return queue if value is None else push(queue, flatten(value, type_), True, xp)
 
 
 @block(name="zip")
@@ -352,8 +327,8 @@ def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ig
     """
     stamped = [tuple_type([ArrayType((), "int64"), kind]) for kind in types]
     state_a, state_b = state["a"], state["b"]
-    left = state_a if a is None else _push(state_a, [t, *flatten(a, types[0])], True, xp)
-    right = state_b if b is None else _push(state_b, [t, *flatten(b, types[1])], True, xp)
+    left = state_a if a is None else push(state_a, [t, *flatten(a, types[0])], True, xp)
+    right = state_b if b is None else push(state_b, [t, *flatten(b, types[1])], True, xp)
     # only one queue can hold older values, except in the tick in which both arrive
     pick_a, near_a = _nearest(left, t, tolerance, xp)
     pick_b, near_b = _nearest(right, t, tolerance, xp)
@@ -375,8 +350,8 @@ def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ig
     taken = xp.astype(ready, xp.int32)
     over = (left["count"] - gone_a > size) | (right["count"] - gone_b > size)
     new = {
-        "a": _drop(left, gone_a, xp),
-        "b": _drop(right, gone_b, xp),
+        "a": drop_first(left, gone_a, xp),
+        "b": drop_first(right, gone_b, xp),
         "expired_a": state["expired_a"] + gone_a - taken,
         "expired_b": state["expired_b"] + gone_b - taken,
         "overflow": xp.where(over & (state["overflow"] == NEVER), t, state["overflow"]),
@@ -387,7 +362,7 @@ def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ig
 @_match.init
 def _(a: Type, b: Type, *, tolerance: int, size: int, types: Any) -> Any:
     stamp = ArrayType((), "int64")
-    left, right = (_queue(tuple_type([stamp, kind]), size + 1) for kind in types)
+    left, right = (empty_queue(tuple_type([stamp, kind]), size + 1) for kind in types)
     none = np.int32(0)
     return {"a": left, "b": right, "expired_a": none, "expired_b": none, "overflow": np.int64(NEVER)}
 

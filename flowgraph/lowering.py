@@ -13,14 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.block import StepTrace
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
 from flowgraph.errors import LoweringError
 from flowgraph.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.ops import OPS, Spec
 from flowgraph.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
 from flowgraph.random import Site
-from flowgraph.symbolic import Instruction, Trace, namespace
+from flowgraph.recording import StepTrace
+from flowgraph.symbolic import Instruction, Trace
+from flowgraph.symbolic_namespace import namespace
 from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 
 
@@ -269,9 +270,8 @@ class _Lowering:
             leaves = {c: outs[k][1] for c, (outs, _) in played.items() if outs[k][1]}
             self.leaves[Wire(index, k)] = self.choose(options, leaves)
             if call.dynamic[k]:
-                self.flags[Wire(index, k)] = self.choose(
-                    options, {c: [outs[k][0]] for c, (outs, _) in played.items()}
-                )[0]
+                flag = self.choose(options, {c: [outs[k][0]] for c, (outs, _) in played.items()})[0]
+                self.flags[Wire(index, k)] = self.emit("logical_and", firing, flag)
         if call.state is not None:
             new = self.choose(options, {c: state for c, (_, state) in played.items()})
             self.writes[call.state] = [self.select(firing, n, o) for n, o in zip(new, memory, strict=True)]

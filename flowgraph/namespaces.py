@@ -38,6 +38,11 @@ class NumpyNamespace:
         return np.argsort(x, axis=axis, stable=True)
 
     @staticmethod
+    def take(x: Any, indices: Any, /, *, axis: int = 0, mode: Any = "clip") -> Any:
+        """`numpy.take`; an index outside is brought to the nearest end, as in a pipeline."""
+        return np.take(x, indices, axis=axis, mode=mode)
+
+    @staticmethod
     def float32_bits(x: Any) -> Any:
         """The bits of the IEEE binary32 number nearest to each int32, as int32: octave and leading bits."""
         return np.asarray(x).astype(np.float32).view(np.int32)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
@@ -193,15 +194,15 @@ class Pipeline:
     @cached_property
     def specs(self) -> dict[int, Spec]:
         """Shape and dtype of every value."""
-        specs = {self.time: Spec((), "int64"), self.seed: Spec((2,), "uint32")}
+        return dict(self._given()) | {i.out: i.spec for i in self.instructions}
+
+    def _given(self) -> list[tuple[int, Spec]]:
+        """The values that no instruction makes."""
+        found = [(self.time, Spec((), "int64")), (self.seed, Spec((2,), "uint32"))]
         for port in self.inputs:
-            specs[port.present] = Spec((), "bool")
-            specs.update({leaf.value: Spec(leaf.shape, leaf.dtype) for leaf in port.leaves})
-        for register in self.registers:
-            specs.update({c.read: Spec(c.shape, c.dtype) for c in register.cells})
-        specs.update({n: Spec(a.shape, _kind(a)) for n, a in self.constants.items()})
-        specs.update({i.out: i.spec for i in self.instructions})
-        return specs
+            found += [(port.present, Spec((), "bool")), *((leaf.value, _spec(leaf)) for leaf in port.leaves)]
+        found += [(c.read, _spec(c)) for r in self.registers for c in r.cells]
+        return found + [(n, Spec(a.shape, _kind(a))) for n, a in self.constants.items()]
 
     # -- JSON ----------------------------------------------------------------------------------------
 
@@ -474,6 +475,10 @@ def _check_schema(data: Any, path: str) -> None:
         )
 
 
+def _spec(part: Leaf | Cell) -> Spec:
+    return Spec(part.shape, part.dtype)
+
+
 def _kind(array: np.ndarray) -> str:
     return "real" if array.dtype.kind == "f" else "bool" if array.dtype.kind == "b" else array.dtype.name
 
@@ -488,8 +493,17 @@ def _numbers(array: Any) -> Any:
 
 
 def _array(data: Any, shape: list[int], dtype: str) -> np.ndarray:
-    array: np.ndarray = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
-    return array.astype(DTYPES[dtype]).reshape(shape)
+    try:
+        array: np.ndarray = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
+        return array.astype(DTYPES[dtype]).reshape(shape)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise PipelineError(
+            "numbers are malformed",
+            path="pipeline",
+            expected=f"{dtype} of shape {tuple(shape)}",
+            got=str(error),
+            fix="lower the graph again",
+        ) from None
 
 
 def _plain(record: Any) -> Any:

@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from types import CodeType
 from typing import Any
 
-from flowgraph.block import StepTrace, When
+import numpy as np
+
+from flowgraph.block import When
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
 from flowgraph.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.namespaces import NUMPY
+from flowgraph.recording import StepTrace
 
 Presence = bool | str
 """Whether something is present: known for a pattern, or an expression of the reaction's variables."""
@@ -193,14 +196,14 @@ class _Writer:
 
     @staticmethod
     def dt(stamp: int | None) -> str:
-        return f"(t - r[{stamp}]) * 1e-9 if r[{stamp}] != NEVER else 0.0"
+        return f"real((t - r[{stamp}]) * 1e-9) if r[{stamp}] != NEVER else real(0.0)"
 
 
 def bindings(graph: Graph) -> dict[str, Any]:
     """The names that every reaction of a graph uses and no run changes: steps, settings, namespace."""
     from flowgraph.graph import NEVER
 
-    names: dict[str, Any] = {"xp": NUMPY, "NEVER": NEVER, "presence": presence}
+    names: dict[str, Any] = {"xp": NUMPY, "NEVER": NEVER, "presence": presence, "real": np.float64}
     for index, call in graph.calls:
         names[f"f{index}"] = call.block.step
         for key, value in call.settings.items():

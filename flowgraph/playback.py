@@ -15,7 +15,7 @@ import numpy as np
 from flowgraph.clock import Timing
 from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, Graph
-from flowgraph.inputs import Inputs, Tape, check_times, prepare, tape
+from flowgraph.inputs import Inputs, Tape, check_finite, check_times, prepare, tape
 from flowgraph.lowering import lower
 from flowgraph.pipeline import Pipeline, type_of_leaves
 from flowgraph.random import seed_words
@@ -115,6 +115,7 @@ def _input(pipeline: Pipeline, port: Any, inputs: Mapping[str, Any]) -> Series:
     series = Series(
         time, unflatten(type_, iter([np.asarray(a) for a in arrays.values()])), type=type_, name=port.name
     )
+    check_finite(port.name, series)
     check_times(port.name, series.time, Timing())
     return series
 
@@ -127,6 +128,15 @@ def _initial_cells(
     for path in given:
         if path not in paths:
             raise UnknownNameError("register", path, paths, path=pipeline.name)
+    absent = sorted(set(paths) - set(given)) if state is not None else []
+    if absent:
+        raise DataError(
+            "this state is of another pipeline",
+            path=pipeline.name,
+            expected=f"registers {sorted(paths)}",
+            got=f"none called {absent[0]!r}",
+            fix="resume a run with the pipeline that it was saved from",
+        )
     cells: list[Any] = []
     for register in pipeline.registers:
         type_ = type_of_leaves(register.path, register.cells)

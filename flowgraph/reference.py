@@ -16,6 +16,7 @@ from flowgraph.namespaces import NumpyNamespace
 from flowgraph.ops import OPS, bound_attrs
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import Program, specialise
+from flowgraph.types import DTYPES
 
 
 class _LinearAlgebra:
@@ -54,15 +55,16 @@ class Player:
         self.pipeline, self.cells, self.dtype, self.seed = pipeline, cells, dtype, seed
         self._reads = [c.read for r in pipeline.registers for c in r.cells]
         self._leaves = [[leaf.value for leaf in port.leaves] for port in pipeline.inputs]
-        self._programs: dict[int, tuple[Program, list[Any]]] = {}
+        self._programs: dict[int, tuple[Program, list[Any], dict[int, Any]]] = {}
 
     def tick(self, time: int, key: int, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...] | None]:
-        """One tick: `values` are the leaves of the present inputs; returns the leaves of each output, or None."""
+        """One tick: `values` are the leaves of the present inputs; returns those of each output, or None."""
         if key not in self._programs:
             program = specialise(self.pipeline, key)
-            self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions]
-        program, steps = self._programs[key]
-        env: dict[int, Any] = {n: _as(a, self.dtype) for n, a in program.constants.items()}
+            known = {n: _as(a, self.dtype) for n, a in program.constants.items()} | self._blanks(key)
+            self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions], known
+        program, steps, known = self._programs[key]
+        env = dict(known)
         env[self.pipeline.time] = np.int64(time)
         env[self.pipeline.seed] = self.seed
         env.update(zip(self._reads, self.cells, strict=True))
@@ -77,6 +79,15 @@ class Player:
             None if flag is None or not env.get(flag, True) else tuple(env[n] for n in leaves)
             for flag, leaves in program.outputs
         ]
+
+    def _blanks(self, key: int) -> dict[int, Any]:
+        """Zeros for the leaves of absent inputs, which a selection may name without taking."""
+        absent = [p for k, p in enumerate(self.pipeline.inputs) if not key >> k & 1]
+        return {
+            leaf.value: _as(np.zeros(leaf.shape, DTYPES[leaf.dtype]), self.dtype)
+            for port in absent
+            for leaf in port.leaves
+        }
 
 
 def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:

@@ -58,7 +58,7 @@ class Run:
         self.wall_s = 0.0
         self._registers = initial_registers(graph, init)
         self._last = dict.fromkeys(graph.sources, NEVER)
-        self.seed = seed
+        self._key = seed_words(seed)
         if state is not None:
             self.state = state
         self._values: list[list[Any]] = [[] for _ in graph.collected]
@@ -76,7 +76,7 @@ class Run:
             "r": self._registers,
             "overflow": self._overflow,
             **{
-                f"d{index}": partial(NumpyDraw, call.draws, seed_words(self.seed))
+                f"d{index}": partial(NumpyDraw, call.draws, self._key)
                 for index, call in graph.calls
                 if "draw" in call.block.handed
             },
@@ -189,7 +189,14 @@ class Run:
 
     @state.setter
     def state(self, tree: Mapping[str, Any]) -> None:
-        self._registers[:], self._last, self.seed = load_registers(self.graph, tree)
+        self._registers[:], self._last, seed = load_registers(self.graph, tree)
+        self._key[:] = seed_words(seed)
+        self.time = max(self._last.values(), default=NEVER)
+
+    @property
+    def seed(self) -> int:
+        """The seed of the random numbers."""
+        return int(self._key[0]) | int(self._key[1]) << 32
 
     @property
     def stats(self) -> dict[str, int]:

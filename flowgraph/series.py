@@ -36,6 +36,7 @@ class Series:
         values: a `Signal`, tuple or array whose leaves have a leading axis of length n.
         type: the type of one value; found from `values` where it is left out.
         name: what to call it in messages.
+        gaps: whether a NaN is data, an entry that was not measured; otherwise a run refuses it.
 
     A leaf is an attribute (`series.position`) or an item (`series["pose.position"]`).
 
@@ -44,7 +45,13 @@ class Series:
     """
 
     def __init__(
-        self, time: npt.ArrayLike, values: Any, *, type: Type | None = None, name: str = "series"
+        self,
+        time: npt.ArrayLike,
+        values: Any,
+        *,
+        type: Type | None = None,
+        name: str = "series",
+        gaps: bool = False,
     ) -> None:
         stamps = np.asarray(time)
         if stamps.dtype.kind not in "iu":
@@ -56,7 +63,7 @@ class Series:
                 fix="round float seconds once, at the source: Series.from_seconds(seconds, values)",
             )
         self.time = stamps.astype(np.int64)
-        self.name = name
+        self.name, self.gaps = name, gaps
         self.type = type if type is not None else _one_of(values)
         self._leaves: list[np.ndarray] = []
         for leaf, (leaf_name, leaf_type) in zip(
@@ -129,7 +136,8 @@ class Series:
         picked = [leaf[key] for leaf in self._leaves]
         if np.ndim(self.time[key]) == 0:
             return unflatten(self.type, iter(picked))
-        return Series(self.time[key], unflatten(self.type, iter(picked)), type=self.type, name=self.name)
+        part = unflatten(self.type, iter(picked))
+        return Series(self.time[key], part, type=self.type, name=self.name, gaps=self.gaps)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):

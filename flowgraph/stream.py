@@ -54,6 +54,24 @@ class Stream(Generic[T]):
 
         return typing.cast("Stream[T]", every(n, self, phase=phase))
 
+    def drop(self, n: int, *, name: str | None = None) -> Stream[T]:
+        """All values but the first `n`."""
+        from flowgraph.operations import drop
+
+        return drop(n, self, name=name)
+
+    def take_while(self, predicate: Callable[..., Any], *, name: str | None = None) -> Stream[T]:
+        """The values before the first for which the predicate is false."""
+        from flowgraph.operations import take_while
+
+        return take_while(self, predicate, name=name)
+
+    def tap(self, function: Callable[[Any], object], *, name: str | None = None) -> Stream[T]:
+        """This stream, with `function(value)` called on the host for each value."""
+        from flowgraph.operations import tap
+
+        return tap(self, function, name=name)
+
     def delay(self, init: Any, *, name: str | None = None) -> Held[T]:
         """The value of an earlier tick, held: what was last written before this tick."""
         from flowgraph.declare import delay

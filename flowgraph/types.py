@@ -385,7 +385,21 @@ def as_value(value: Any, type_: Type, *, path: str, real_dtype: Any = np.float64
 
 
 def zeros(type_: Type) -> Any:
-    """A value of `type_` whose leaves are all zero (False)."""
+    """A value of `type_` whose leaves are all zero (False).
+
+    Raises:
+        DeclarationError: where a size is not bound.
+    """
+    for name, leaf in leaves_of(type_):
+        for size in leaf.shape:
+            if isinstance(size, str):
+                raise DeclarationError(
+                    f"size {size!r} is not bound",
+                    path=name,
+                    expected="every size known when the graph is built",
+                    got=str(leaf),
+                    fix=f"give it to build: build(sizes={{{size!r}: ...}})",
+                )
     return unflatten(
         type_,
         iter(

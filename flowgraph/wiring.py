@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from flowgraph import clock as clocks
-from flowgraph.block import REQUIRED, Block, StepTrace
+from flowgraph.block import REQUIRED, WIRING, Block
 from flowgraph.builder import Builder, builder
 from flowgraph.clock import Clock, Condition, both, clock_of, either, within
 from flowgraph.errors import ClockError, DeclarationError, LoweringError, TypeMismatchError, UnknownNameError
 from flowgraph.graph import Argument, CallNode, OutputPort, RegisterNode, Wire
+from flowgraph.recording import StepTrace, record
 from flowgraph.stream import Held, Stream
 from flowgraph.types import Type, check_fits
 
@@ -23,7 +24,7 @@ from flowgraph.types import Type, check_fits
 def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
     """Add a call of `block` to the graph under construction; returns its output stream or streams."""
     build = builder(block.name)
-    at, name, draws = (keywords.pop(k, None) for k in ("at", "name", "draws"))
+    at, name, draws = (keywords.pop(k, None) for k in WIRING)
     path = build.path(name or block.name, given=name is not None)
     given = _match_ports(block, path, streams, keywords)
     settings = _match_settings(block, path, keywords)
@@ -95,7 +96,7 @@ def _match_ports(
 def _match_settings(block: Block[Any], path: str, keywords: dict[str, Any]) -> dict[str, Any]:
     for key in keywords:
         if key not in block.settings:
-            raise UnknownNameError("setting", key, [*block.settings, "at", "name", "draws"], path=path)
+            raise UnknownNameError("setting", key, [*block.settings, *WIRING], path=path)
     settings = {k: keywords.get(k, default) for k, default in block.settings.items()}
     missing = [k for k, v in settings.items() if v is REQUIRED]
     if missing:
@@ -223,7 +224,7 @@ def _variants(
             )
             continue
         try:
-            found[choice] = block.record(types, settings, state, path, draws)
+            found[choice] = record(block, types, settings, state, path, draws)
         except LoweringError as error:
             found[choice] = error
     return found

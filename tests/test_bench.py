@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from flowgraph import simulate
-from tests.bench import toy
-from tests.bench.__main__ import BENCHES, main
+from tests.bench import particles, toy
+from tests.bench.__main__ import BENCHES, main, show
 
-NEEDS = {"toy-python": ["reactivex"], "toy-xla": ["jax"], "eskf-engines": ["jax"]}
+NEEDS = {
+    "toy-python": ["reactivex"],
+    **{name: ["jax"] for name in ("toy-xla", "eskf-engines", "rbpf-engines", "normals-xla", "many-runs")},
+}
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -26,7 +29,12 @@ def test_each_bench_gives_rows_beside_a_peer(name, capsys):
     assert rows
     for row in rows:
         assert {"name", "ours", "peer", "unit", "against", "ratio", "bound", "met", "details"} == set(row)
-        assert min(row["ours"], row["peer"], row["ratio"]) > 0.0
+        assert row["ours"] > 0.0
+        if row["peer"] is None:
+            assert row["ratio"] is None
+            assert "is not to be had" in row["against"]
+        else:
+            assert min(row["peer"], row["ratio"]) > 0.0
         assert (row["met"] is None) == (row["bound"] is None)
 
 
@@ -35,6 +43,27 @@ def test_the_table_says_what_is_missed(capsys):
     out = capsys.readouterr().out
     assert "direct" in out
     assert "missed: ins_eskf, python" in out or "All bounds are met." in out
+
+
+def test_a_missing_library_gives_a_row_without_a_peer(monkeypatch):
+    """The other libraries' rows stay, and the table can be shown."""
+    absent = "a_library_that_is_not_there"
+    make = particles.LIBRARIES["particles"][1]
+    monkeypatch.setattr(particles, "LIBRARIES", {"particles": (absent, make)})
+    (row,) = particles.libraries(sizes=(20,), steps=3, repeats=1)
+    assert row.ours > 0.0
+    assert (row.peer, row.ratio, row.met) == (None, None, None)
+    assert row.against == f"none: particles is not to be had (No module named {absent!r})"
+    show([row])
+
+
+def test_the_plain_model_of_the_libraries_moves_as_its_states_say():
+    """Each state is F times the last and a jerk's noise, of the size that Q says; positions are seen."""
+    F, Q, H, states, seen = particles.plain_model(2000)
+    errors = states[1:] - states[:-1] @ F.T
+    whitened = np.linalg.solve(np.linalg.cholesky(Q), errors.T)
+    assert abs(whitened.var() - 1.0) < 0.05
+    assert abs((seen - states @ H.T).std() - particles.SEEN) < 0.05 * particles.SEEN
 
 
 def test_the_import_bench_names_the_heaviest_modules(capsys):

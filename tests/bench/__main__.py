@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import imports, inertial, toy
+from tests.bench import imports, inertial, many, particles, random, toy
 from tests.bench.rows import Row
 
 Bench = Callable[..., list[Row]]
@@ -24,6 +24,12 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "toy-xla": (toy.xla_engine, {"ticks": 200, "repeats": 1}),
     "eskf-python": (inertial.against_numpy, {"duration": 0.5, "repeats": 1}),
     "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
+    "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),
+    "rbpf-libraries": (particles.libraries, {"sizes": (1000,), "steps": 10, "repeats": 1}),
+    "resampling": (particles.resampling, {"sizes": (100,), "repeats": 1}),
+    "normals-xla": (random.in_xla, {"ticks": 20, "repeats": 1}),
+    "normals-python": (random.in_numpy, {"ticks": 5, "repeats": 1}),
+    "many-runs": (many.rows, {"runs": 16, "duration": 2.0}),
     "import": (imports.import_time, {"repeats": 1}),
 }
 """The benches by name, each with the sizes of `--quick`."""
@@ -56,12 +62,16 @@ def show(rows: list[Row]) -> None:
         table.add_column(heading)
     marks = {True: "[green]met[/]", False: "[bold red]MISSED[/]", None: ""}
     for r in rows:
-        numbers = (f"{r.ours:.3g}", f"{r.peer:.3g}", f"{r.ratio:.2f}")
+        numbers = (f"{r.ours:.3g}", _figure(r.peer, ".3g"), _figure(r.ratio, ".2f"))
         table.add_row(r.name, *numbers, r.unit, r.against, r.bound or "", marks[r.met])
     console = Console()
     console.print(table)
     missed = [r.name for r in rows if r.met is False]
     console.print(f"{len(missed)} missed: {', '.join(missed)}" if missed else "All bounds are met.")
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
 
 
 if __name__ == "__main__":

@@ -19,10 +19,10 @@ class Row:
 
     Args:
         name: what is measured.
-        ours, peer: the two figures, in `unit`.
+        ours, peer: the two figures, in `unit`; no peer where its library is missing.
         unit: of both.
-        against: what the peer is.
-        ratio: ours / peer, the median over pairs.
+        against: what the peer is, or why there is none.
+        ratio: ours / peer, the median over pairs; None without a peer.
         bound: what must hold, in words; None where the row is for information only.
         met: whether it holds; None without a bound.
         details: anything else worth keeping; only in the JSON.
@@ -30,13 +30,18 @@ class Row:
 
     name: str
     ours: float
-    peer: float
+    peer: float | None
     unit: str
     against: str
-    ratio: float
+    ratio: float | None
     bound: str | None = None
     met: bool | None = None
     details: dict[str, Any] = field(default_factory=dict)
+
+
+def missing(name: str, ours: float, unit: str, library: str, error: ImportError) -> Row:
+    """A row without a peer: its library is not installed, or does not work with what is."""
+    return Row(name, ours, None, unit, f"none: {library} is not to be had ({error})", None)
 
 
 def seconds(work: Callable[[], object]) -> float:

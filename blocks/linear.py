@@ -1,0 +1,92 @@
+"""Linear motion in continuous time, and its exact discretisation over any step.
+
+Filters that are fired by events step over whatever time has passed; so a model is kept in continuous time and
+made discrete for each step, as a polynomial in dt whose coefficients are constants of the graph.
+
+Source: C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23(3), 1978; Y.
+Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, secs. 4.2
+and 6.2.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Array
+from flowgraph.errors import DeclarationError
+
+__all__ = ["LinearModel"]
+
+
+class LinearModel:
+    """dx = (A x + B u) dt + dw with E[dw dw^T] = D dt, and u held over a step. Immutable.
+
+    Over dt, with the sums cut off at `order` powers of A (exact where A^(order + 1) = 0, as for positions,
+    velocities and accelerations):
+
+        F = sum A^k dt^k / k!        G = sum A^k B dt^(k+1) / (k+1)!
+        Q = sum A^j D (A^k)^T dt^(j+k+1) / (j! k! (j+k+1))
+
+    Args:
+        A: (n, n), 1/s.
+        B: (n, m): what a control does.
+        density: (n, n) D, the spectral density of the driving noise.
+        order: of the sums.
+
+    Raises:
+        DeclarationError: where the shapes do not fit together.
+    """
+
+    def __init__(self, A: npt.ArrayLike, B: npt.ArrayLike, density: npt.ArrayLike, *, order: int = 6) -> None:
+        A, B, D = (np.array(x, dtype=float) for x in (A, B, density))
+        n = len(A)
+        if A.shape != (n, n) or D.shape != (n, n) or B.ndim != 2 or len(B) != n:
+            raise DeclarationError(
+                "the matrices of a linear model do not fit together",
+                path="LinearModel",
+                expected="A (n, n), B (n, m) and density (n, n)",
+                got=f"A {A.shape}, B {B.shape}, density {D.shape}",
+                fix="give each one row for each state",
+            )
+        self.size = n
+        power = [np.eye(n)]
+        while len(power) <= order and power[-1].any():
+            power.append(power[-1] @ A)
+        power = [p / math.factorial(k) for k, p in enumerate(power) if p.any()]
+        self._F = dict(enumerate(power))
+        self._G = {k + 1: p @ B / (k + 1) for k, p in enumerate(power)}
+        self._Q = {k: np.zeros((n, n)) for k in range(1, 2 * len(power))}
+        for j, left in enumerate(power):
+            for k, right in enumerate(power):
+                self._Q[j + k + 1] += left @ D @ right.T / (j + k + 1)
+        for matrix in (*self._F.values(), *self._G.values(), *self._Q.values()):
+            matrix.flags.writeable = False
+
+    def discrete(self, dt: Any, xp: Any, kind: Any) -> tuple[Array, Array, Array]:
+        """(F, G, Q) over dt seconds, in the precision `kind`; for dt (k, 1, 1) a stack of each."""
+        F, G, Q = (_polynomial(p, dt, xp, kind) for p in (self._F, self._G, self._Q))
+        return F, G, Q
+
+    def transitions(self, time: np.ndarray) -> np.ndarray:
+        """F (k - 1, n, n) from each of the times (k,) int64 ns to the next, as the smoothers ask for it."""
+        dt = np.diff(time)[:, None, None] * 1e-9
+        return np.asarray(_polynomial(self._F, dt, np, np.float64) + np.zeros_like(dt))
+
+
+def _polynomial(terms: dict[int, np.ndarray], dt: Any, xp: Any, kind: Any) -> Array:
+    """The sum of matrices times powers of dt; matrices of zeros left out."""
+    total, power = None, None
+    for k in range(max(terms) + 1):
+        if k > 0:
+            power = dt if power is None else power * dt
+        matrix = terms.get(k)
+        if matrix is None or (not matrix.any() and total is not None):
+            continue
+        term = xp.asarray(matrix, dtype=kind)
+        term = term if power is None else term * power
+        total = term if total is None else total + term
+    return total

@@ -1,0 +1,139 @@
+"""The Kalman filter in its textbook form: one record a tick, with the control and what was measured with it.
+
+State: position and velocity, in the world. Control: the coordinate acceleration in the world, so the attitude
+must be known. A record holds a position too; a coordinate that was not measured with this control is NaN, and
+then the filter corrects with the others, or only predicts.
+
+    predict   x-_k = F x_(k-1) + G u_k                  P-_k = F P_(k-1) F^T + Q
+    correct   x_k = x-_k + K (z_k - H x-_k)             P_k = (I - K H) P-_k (I - K H)^T + K R K^T
+
+Source: R. Fiszel, thesis (2017), section on the Kalman filter, after R. Kalman, "A new approach to linear
+filtering and prediction problems", 1960. Three slips of the thesis are mended: the covariance is corrected
+with a minus sign (its P- + K S K^T would grow), the prediction starts from the last posterior (it prints S-
+for S), and the control matrix holds dt. Where the positions have a clock of their own, see `async_kalman`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import (
+    Case,
+    DataError,
+    Flight,
+    Result,
+    Series,
+    Stream,
+    arrays,
+    collect,
+    delay,
+    graph,
+    timing_of,
+)  # fmt: skip
+from flowgraph.blocks.consistency import point_errors
+from flowgraph.blocks.kalman import Gaussian, predict_linear, update_linear
+from flowgraph.blocks.point import (
+    PointReading,
+    WorldAcceleration,
+    between,
+    point_belief,
+    point_model,
+    start_point,
+    told_acceleration,
+)  # fmt: skip
+
+_AT_REST = WorldAcceleration(acceleration=np.zeros(3))
+
+
+@graph
+def kalman(
+    reading: Stream[PointReading],
+    *,
+    start: Gaussian,
+    noise: float,
+    position_noise: float,
+    gate: float | None = None,
+):
+    """Kalman filter of position and velocity: a record holds an acceleration and what was measured with it.
+
+    Collected: `belief`, `prior` and `posterior` at every tick, and the `innovation` where a coordinate was
+    measured.
+    """
+    belief = delay(start, name="belief")
+    last = delay(_AT_REST, name="last_control")
+    control = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
+    mean = between(last, control).map(lambda u: u.acceleration)
+    prior = predict_linear(belief, mean, model=point_model(noise))
+    posterior, innovation = update_linear(
+        prior, reading.map(lambda r: r.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
+    )
+    belief.feed(posterior)
+    last.feed(control)
+    collect(innovation, "innovation")
+    return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
+
+
+@kalman.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    position_noise: float | None = None,
+    accelerometer_noise: float | None = None,
+    gate: float | None = None,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
+
+    The positions must come at times of the IMU. Told the exact attitude and bias, the filter is the bound
+    that no filter on these data can beat.
+
+    Args:
+        flight: with the streams `imu` and `vicon` (Pose).
+        position_noise: standard deviation, m; the flight's own if left out.
+        accelerometer_noise: density, m/s^2/sqrt(Hz); the flight's own if left out.
+        gate: a measurement with a larger normalised innovation squared changes nothing.
+        settle: seconds at the start that the errors leave out.
+    """
+    reading = readings(flight)
+    own = flight.info["imu_noise"].accelerometer
+    truth = flight.truth
+    assert truth is not None  # as `readings` has checked
+    clocks: dict[str, Any] = {"reading": timing_of(reading)}
+    built = kalman.build(
+        **clocks,
+        start=start_point(flight.streams["vicon"]["position"][0]),
+        noise=own if accelerometer_noise is None else accelerometer_noise,
+        position_noise=flight.info["position_noise"] if position_noise is None else position_noise,
+        gate=gate,
+    )
+
+    def score(result: Result) -> dict[str, float]:
+        return point_errors(result["belief"], truth, settle=settle)
+
+    return Case(built, {"reading": reading}, score)
+
+
+def readings(flight: Flight) -> Series:
+    """The flight's accelerations, each with the position of its time, NaN where there was none.
+
+    Raises:
+        DataError: without an IMU, motion capture or truth, or where a position comes between two IMU
+            readings.
+    """
+    control = told_acceleration(flight)
+    vicon = flight.streams.get("vicon")
+    rows = np.searchsorted(control.time, vicon.time) if vicon is not None else np.zeros(0, int)
+    if vicon is None or not np.isin(vicon.time, control.time).all():
+        raise DataError(
+            "the positions do not come with the controls",
+            path=flight.name,
+            expected="a stream vicon, at times of the stream imu",
+            got="no vicon" if vicon is None else "positions between two readings of the imu",
+            fix="use async_kalman, which takes each when it comes",
+        )
+    position = np.full((len(control), 3), np.nan)
+    position[rows] = vicon["position"]
+    values = PointReading(acceleration=control["acceleration"], position=position)
+    return arrays(control.time, values, not_finite="keep", name="reading")

@@ -1,0 +1,222 @@
+"""`ekf`: Jacobians against automatic differentiation, consistency over many runs, engines that agree."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import Case, DataError, Flight, load_flight, simulate, simulate_many
+from flowgraph.blocks import extended as x
+from flowgraph.blocks.consistency import chi_square_band, inside, nis_summary
+from flowgraph.blocks.geometry import from_rotation_vector, multiply, rotate, to_rotation_vector
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.graphs import ekf
+from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
+
+RUNS = 50
+DT, LEVER = 0.01, np.array([0.1, -0.2, 0.3])
+
+
+def a_state(seed: int) -> tuple[np.ndarray, Imu]:
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=4)
+    state = np.concatenate([rng.normal(size=6), q / np.linalg.norm(q)])
+    return state, Imu(gyro=rng.normal(size=3) * 3.0, specific_force=rng.normal(size=3) * 10.0)
+
+
+def a_belief(seed: int = 0) -> x.QuaternionBelief:
+    state, _ = a_state(seed)
+    return x.start_pose(state[3:6], state[6:], velocity=state[:3])
+
+
+# Jacobians
+
+
+@pytest.fixture
+def jax() -> Any:
+    found = pytest.importorskip("jax")
+    with found.enable_x64(True):
+        yield found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_jacobian_of_the_prediction_is_that_of_automatic_differentiation(jax, seed):
+    state, imu = a_state(seed)
+    jnp = jax.numpy
+
+    def moved(s: Any) -> Any:
+        return jnp.concatenate(x.move(s[:3], s[3:6], s[6:], imu, DT, jnp))
+
+    automatic = jax.jacfwd(moved)(jnp.asarray(state))
+    np.testing.assert_allclose(x.move_jacobian(state[6:], imu, DT, np), automatic, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_jacobian_of_the_measurement_is_that_of_automatic_differentiation(jax, seed):
+    state, _ = a_state(seed)
+    jnp = jax.numpy
+
+    def seen(s: Any) -> Any:
+        return jnp.concatenate([s[3:6] + rotate(s[6:], jnp.asarray(LEVER), xp=jnp), s[6:]])
+
+    expected = seen(jnp.asarray(state))
+    automatic = jax.jacfwd(lambda s: x.POSE.minus(seen(s), expected, jnp))(jnp.asarray(state))
+    found = x.observe_jacobian(state[6:], LEVER, np)
+    np.testing.assert_allclose(found, automatic, atol=1e-9, rtol=0)
+
+
+# Noise and norm
+
+
+def test_the_unscented_noise_of_the_quaternion():
+    """To first order it is (s^2 dt / 4)(I - q q^T); it adds no noise along q, and none over no time."""
+    q, density = a_state(1)[0][6:], 0.3
+    Q = x.quaternion_noise(q, density, DT, np)
+    np.testing.assert_allclose(Q, 0.25 * density**2 * DT * (np.eye(4) - np.outer(q, q)), rtol=2e-3, atol=1e-9)
+    np.testing.assert_allclose(Q @ q, 0.0, atol=1e-15)
+    np.testing.assert_array_equal(x.quaternion_noise(q, density, 0.0, np), np.zeros((4, 4)))
+    turns = np.random.default_rng(0).normal(size=(200_000, 3)) * density * DT**0.5
+    drawn = multiply(q, from_rotation_vector(turns, xp=np), xp=np)
+    np.testing.assert_allclose(Q, np.cov(drawn.T), atol=0.02 * Q.max())
+
+
+def test_the_quaternion_stays_of_unit_norm_and_the_covariance_normal_to_it():
+    belief, noise = a_belief(), ImuNoise(0.02, 0.02, 0.0, 0.0)
+    z = Pose(position=belief.position + 0.3, attitude=a_state(3)[0][6:])
+    for step in range(5):
+        belief = x.predict_pose.step(belief, a_state(step)[1], noise=noise, dt=DT, xp=np)
+        belief, _ = x.update_pose.step(belief, z, position_noise=0.1, attitude_noise=0.1, xp=np)
+        q, P = belief.attitude, belief.covariance
+        np.testing.assert_allclose(np.linalg.norm(q), 1.0, atol=1e-15)
+        np.testing.assert_allclose(P[6:, 6:] @ q, 0.0, atol=1e-14)
+        np.testing.assert_array_equal(P, P.T)
+        assert np.linalg.eigvalsh(P)[0] > -1e-14
+
+
+def test_no_time_changes_nothing():
+    belief = a_belief()
+    found = x.predict_pose.step(belief, a_state(0)[1], noise=ImuNoise(1.0, 1.0, 0.0, 0.0), dt=0.0, xp=np)
+    for name in belief._fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(belief, name), atol=1e-15)
+
+
+def test_a_quaternion_and_its_negative_are_one_measurement():
+    belief, z = a_belief(), a_state(3)[0][6:]
+    settings: dict[str, Any] = {"position_noise": 0.1, "attitude_noise": 0.1, "xp": np}
+    a, b = (
+        x.update_pose.step(belief, Pose(position=belief.position, attitude=s * z), **settings)[0]
+        for s in (1.0, -1.0)
+    )
+    np.testing.assert_allclose(a.attitude, b.attitude, atol=1e-14)
+    assert x.update_pose.step(belief, None, **settings) == (belief, None)
+
+
+def test_the_covariance_in_the_tangent_space():
+    belief = a_belief()
+    found = x.pose_belief.step(belief, xp=np)
+    diagonal = np.diag([0.7**2] * 6 + [0.3**2] * 3)
+    np.testing.assert_allclose(found.covariance, diagonal, atol=1e-15)
+    small = np.array([1e-7, -2e-7, 3e-7])
+    apart = multiply(belief.attitude, from_rotation_vector(small, xp=np), xp=np) - belief.attitude
+    np.testing.assert_allclose(x._to_angle(belief.attitude, np) @ apart, small, atol=1e-13)
+
+
+# The graph
+
+
+@cache
+def a_case(seconds: float = 3.0) -> Case:
+    return ekf.case(thesis(1, seconds, vicon_phase=0.0123))
+
+
+def test_the_engines_agree():
+    pytest.importorskip("jax")
+    case = a_case()
+    result = engines_agree(case.graph, case.inputs)
+    assert len(result["innovation"]) == 12
+
+
+def test_it_is_lowered_and_drawn():
+    is_lowered_and_drawn(a_case(), "predict_pose", "update_pose", "pose_belief")
+
+
+def test_it_follows_the_flights_of_the_thesis():
+    for seed in range(3):
+        case = ekf.case(thesis(seed, 20.0))
+        result = simulate(case.graph, case.inputs)
+        score = case.score(result)
+        assert score["position_rmse_m"] < 0.2
+        assert score["attitude_rmse_deg"] < 4.0
+        assert score["position_3sigma"] > 0.97
+        assert 0.8 < nis_summary(result["innovation"])["nis_mean"] < 1.25
+
+
+def test_a_unit_with_biases_is_trusted_less():
+    case = ekf.case(load_flight("sim", seed=1))
+    score = case.score(simulate(case.graph, case.inputs))
+    assert score["position_rmse_m"] < 0.03
+    assert score["attitude_rmse_deg"] < 1.2
+
+
+def test_a_flight_without_motion_capture_is_refused():
+    whole = thesis(1, 3.0)
+    with pytest.raises(DataError, match=r"lacks what ekf needs[\s\S]*imu and vicon[\s\S]*got: +imu"):
+        ekf.case(Flight(whole.name, {"imu": whole.streams["imu"]}, whole.truth, whole.info))
+
+
+# Consistency
+
+
+def start(seed: int) -> dict[str, x.QuaternionBelief]:
+    """A start whose error is drawn from its spread."""
+    truth = smooth(seed).truth
+    assert truth is not None
+    error = np.random.default_rng(seed).normal(size=9) * np.repeat([0.5, 0.5, 0.1], 3)
+    q = multiply(truth["attitude"][0], from_rotation_vector(-error[6:], xp=np), xp=np)
+    assert np.linalg.norm(to_rotation_vector(q, xp=np)) < 4.0
+    belief = x.start_pose(
+        truth["position"][0] + error[:3],
+        q,
+        velocity=truth["velocity"][0] + error[3:6],
+        position_deviation=0.5,
+        velocity_deviation=0.5,
+        attitude_deviation=0.1,
+    )
+    return {"belief": belief}
+
+
+@cache
+def consistent_ticks(base: int, factor: float) -> float:
+    """The fraction of ticks at which the mean NEES of 50 runs lies in its band, with R times `factor`."""
+    noise = 0.1 * factor**0.5
+    case = ekf.case(smooth(base), position_noise=noise, attitude_noise=noise)
+    seeds = range(base, base + RUNS)
+    batch = simulate_many(
+        case.graph, lambda seed: dict(smooth(seed).streams), seeds, init=start, keep=["belief"]
+    )
+    found = mean_nees(batch["belief"], [smooth(seed) for seed in seeds])
+    return inside(found, chi_square_band(9, runs=RUNS))
+
+
+def is_consistent(base: int, factor: float = 1.0) -> bool:
+    return consistent_ticks(base, factor) >= 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("base", [0, 100, 200])
+def test_the_nees_of_50_runs_lies_in_its_band(base):
+    """On smooth flights. In those of the thesis the body rate jumps, which readings at 200 Hz cannot tell."""
+    pytest.importorskip("jax")
+    assert is_consistent(base)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+@pytest.mark.parametrize("base", [0, 100, 200])
+def test_the_same_test_fails_with_a_wrong_noise(base, factor):
+    pytest.importorskip("jax")
+    assert not is_consistent(base, factor)
