@@ -49,10 +49,21 @@ class Builder:
 
     def path(self, name: str, *, given: bool = False) -> str:
         """A unique path in the current scope; a name that the user gave must be free."""
-        base = path = "/".join((*self._scope, name))
+        if given and (not isinstance(name, str) or not name or "/" in name):
+            raise DeclarationError(
+                "a node cannot be called this",
+                path="/".join(self._scope) or self.name,
+                expected="a text without /, which joins names to paths",
+                got=repr(name),
+                fix='give another name, such as name="gate_2"',
+            )
+        return self._claim("/".join((*self._scope, name)), given=given)
+
+    def _claim(self, base: str, *, given: bool = False) -> str:
+        path = base
         if path in self._taken and given:
             raise DeclarationError(
-                f"the name {name!r} is taken",
+                f"the name {base.rsplit('/', 1)[-1]!r} is taken",
                 path=path,
                 expected="one node a name",
                 got="a second one",
@@ -109,7 +120,9 @@ class Builder:
     def stamp(self, firing: Clock) -> int:
         """The register that keeps when a clock last ticked; nodes of one clock share it."""
         if firing not in self._stamps:
-            node = RegisterNode(f"last({firing})", "stamp", ArrayType((), "int64", "ns"), np.int64(NEVER))
+            node = RegisterNode(
+                self._claim(f"last({firing})"), "stamp", ArrayType((), "int64", "ns"), np.int64(NEVER)
+            )
             self._stamps[firing] = self.add(node)
         return self._stamps[firing]
 
@@ -156,6 +169,14 @@ class Builder:
                 expected="a stream",
                 got=repr(stream),
                 fix="sample a held value with .at(clock)",
+            )
+        if not isinstance(name, str) or not name:
+            raise DeclarationError(
+                "an output cannot be called this",
+                path=self.name,
+                expected="a text",
+                got=repr(name),
+                fix='give it a name: {"belief": stream}, or collect(stream, "belief")',
             )
         full = "/".join((*self._scope, name))
         if full in self.collected:

@@ -238,16 +238,21 @@ def _meter(total: int | None, name: str, engine: str, quiet: bool) -> Iterator[_
 
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
-    from flowgraph.plot import plot_navigation
+    from flowgraph.plot import plot_navigation, plot_result
 
     out.mkdir(parents=True, exist_ok=True)
     with _writing(out / "diagram.svg") as file:
         case.graph.draw(str(file))
     with _writing(out / "metrics.json") as file:
         file.write_text(json.dumps(report, indent=1) + "\n")
-    if case.estimate in result.series:
+    if case.estimate not in result.series:
+        return
+    if "position" in result[case.estimate].leaves:
         with _writing(out / "navigation.png") as file:
             plot_navigation(result[case.estimate], flight.truth, file)
+    else:  # such as an attitude alone
+        with _writing(out / "outputs.png") as file:
+            plot_result(result, file)
 
 
 @contextmanager

@@ -25,10 +25,10 @@ def nanoseconds(duration: str | int, *, what: str = "duration") -> int:
     """Nanoseconds from "5ms", "1.25us", "2s" or an integer count of nanoseconds.
 
     Raises:
-        DeclarationError: where the text is not a number and one of ns, us, ms, s.
+        DeclarationError: where the text is not a number and one of ns, us, ms, s, or is beyond 64 bits.
     """
     if isinstance(duration, int) and not isinstance(duration, bool):
-        return duration
+        return _in_64_bits(duration, duration, what)
     match = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*(ns|us|ms|s)\s*", str(duration))
     if match is None or isinstance(duration, float):
         raise DeclarationError(
@@ -37,7 +37,20 @@ def nanoseconds(duration: str | int, *, what: str = "duration") -> int:
             got=repr(duration),
             fix=f'write {what}="5ms"',
         )
-    return round(float(match[1]) * _UNITS[match[2]])
+    number = float(match[1]) * _UNITS[match[2]]
+    return _in_64_bits(round(number) if number < 2.0**64 else 2**64, duration, what)
+
+
+def _in_64_bits(number: int, given: object, what: str) -> int:
+    if not -(2**63) <= number < 2**63:
+        raise DeclarationError(
+            f"{what} is too long",
+            path=what,
+            expected="what int64 nanoseconds hold: below 9.2e9 s",
+            got=repr(given),
+            fix=f'write {what}="5ms"',
+        )
+    return number
 
 
 @dataclass(frozen=True)
@@ -86,9 +99,10 @@ def periodic(period: str | int, *, phase: str | int | None = None, jitter: str |
 
 def aperiodic(*, max_rate: float | None = None) -> Timing:
     """A source whose events come when they come, at most `max_rate` times a second if given."""
-    if max_rate is not None and not max_rate > 0:
+    number = isinstance(max_rate, int | float) and not isinstance(max_rate, bool)
+    if max_rate is not None and (not number or not 0 < max_rate < math.inf):
         raise DeclarationError(
-            "a highest rate must be positive", expected="more than 0 Hz", got=max_rate, fix="leave it out"
+            "a highest rate must be positive", expected="more than 0 Hz", got=repr(max_rate), fix="leave it out"
         )
     return Timing(max_rate=max_rate)
 
@@ -131,10 +145,14 @@ class Counted(Clock):
 
 @dataclass(frozen=True)
 class Condition(Clock):
-    """Ticks of `parent` at which the output called `name` turns out to be present."""
+    """Ticks of `parent` at which the output called `name` turns out to be present.
+
+    `owner` is the path of its block, which keeps apart what is only spelled alike.
+    """
 
     name: str
     parent: Clock
+    owner: str = ""
 
     def __str__(self) -> str:
         return self.name

@@ -69,6 +69,7 @@ def draw(
     Raises:
         UnknownNameError: for another ending or direction.
         MissingDependencyError: where nothing can lay out the diagram.
+        OutputError: where the file cannot be written.
     """
     path = None if file is None else Path(file)
     ending = ".svg" if path is None else path.suffix.lower()
@@ -79,8 +80,9 @@ def draw(
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
     made = source.encode() if ending in (".dot", ".gv") else _render(source, ending[1:])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(made)
+    with writes(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(made)
     return path
 
 

@@ -8,7 +8,9 @@ finds the same thing in the same place each time.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 
 class FlowgraphError(Exception):
@@ -59,7 +61,12 @@ class CycleError(DeclarationError):
 
 
 class LoweringError(FlowgraphError):
-    """A block's step does something that a fixed-size pipeline cannot hold; names the source line."""
+    """A block's step does something that a fixed-size pipeline cannot hold; names the source line.
+
+    `in_every_engine` is true for what no engine allows, such as an in-place write: it is refused at build.
+    """
+
+    in_every_engine = False
 
 
 class PipelineError(FlowgraphError):
@@ -68,6 +75,10 @@ class PipelineError(FlowgraphError):
 
 class DataError(FlowgraphError):
     """Input data are missing, malformed, out of order or not finite; names file and row, or the source."""
+
+
+class OutputError(FlowgraphError):
+    """A file cannot be written; names it."""
 
 
 class FifoOverflowError(FlowgraphError):
@@ -92,3 +103,18 @@ class UnknownNameError(FlowgraphError):
 
 class MissingDependencyError(FlowgraphError):
     """An optional package or program is absent; says what to install."""
+
+
+@contextmanager
+def writes(file: str | Path) -> Iterator[None]:
+    """What the system says against writing `file` or making its folder becomes an `OutputError`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            "this cannot be written",
+            path=str(file),
+            expected="a place where there is a folder and files can be made",
+            got=f"{type(error).__name__}: {error.strerror or error}",
+            fix="choose another file or folder, or make the folder first",
+        ) from error

@@ -140,6 +140,14 @@ def prepare(
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
     """
+    if not isinstance(inputs, Flight | Mapping):
+        raise DataError(
+            "these are no inputs",
+            path=graph.name,
+            expected="a Flight, or data by source name: " + ", ".join(graph.sources),
+            got=f"{type(inputs).__name__} {inputs!r}"[:80],
+            fix="write simulate(graph, {" + ", ".join(f"{n!r}: Series(...)" for n in graph.sources) + "})",
+        )
     given = dict(inputs.streams) if isinstance(inputs, Flight) else dict(inputs)
     if not isinstance(inputs, Flight):
         for name in given:
@@ -241,7 +249,7 @@ def _not_finite(name: str, time: int, where: str) -> None:
         path=f"{name}, {where}",
         expected="finite numbers",
         got=f"NaN or infinity at t = {time} ns",
-        fix='drop such events: arrays(time, values, not_finite="absent")',
+        fix='drop such events: arrays(time, values, not_finite="absent"), or "keep" NaN as data',
     )
 
 

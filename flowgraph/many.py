@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
@@ -125,9 +125,24 @@ def simulate_many(
         progress: told the number of finished runs.
 
     Raises:
+        DeclarationError: without a seed, or where one is none.
         DataError: where, in XLA, two runs have events at different times.
     """
     kept = _kept(graph, keep)
+    try:
+        seeds = tuple(seeds)
+    except TypeError:
+        seeds = ()
+    if not seeds:
+        raise DeclarationError(
+            "many runs need a seed each",
+            path=f"{graph.name}, seeds",
+            expected="one whole number or more",
+            got="none",
+            fix="write seeds=range(100)",
+        )
+    for seed in seeds:
+        seed_words(seed)
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress)
     return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress)

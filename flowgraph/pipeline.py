@@ -345,10 +345,13 @@ class Pipeline:
 
         Raises:
             PipelineError: where the folder holds another pipeline; nothing is overwritten in silence.
+            OutputError: where the folder or its files cannot be made.
         """
         target = Path(folder)
         text = json.dumps(self.to_json(), indent=1, allow_nan=False)
         file = target / _FILE
+        with writes(target):
+            target.mkdir(parents=True, exist_ok=True)
         if file.exists() and file.read_text() != text:
             raise PipelineError(
                 "another pipeline is already here",
@@ -357,9 +360,9 @@ class Pipeline:
                 got=f"a different {_FILE}",
                 fix="choose another folder, or remove the old one first",
             )
-        target.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-        (target / "pipeline.txt").write_text(self.listing())
+        with writes(file):
+            file.write_text(text)
+            (target / "pipeline.txt").write_text(self.listing())
         return target
 
     @classmethod

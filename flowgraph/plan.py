@@ -18,9 +18,11 @@ import numpy as np
 
 from flowgraph.block import When
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
+from flowgraph.errors import TypeMismatchError
 from flowgraph.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.namespaces import NUMPY
 from flowgraph.recording import StepTrace
+from flowgraph.types import Signal, as_value
 
 Presence = bool | str
 """Whether something is present: known for a pattern, or an expression of the reaction's variables."""
@@ -164,7 +166,7 @@ class _Writer:
             inputs.append(
                 f"{handed}="
                 + {
-                    "t": "t",
+                    "t": "int64(t)",
                     "xp": "xp",
                     "path": repr(call.path),
                     "dt": self.dt(call.stamp),
@@ -199,13 +201,67 @@ class _Writer:
         return f"real((t - r[{stamp}]) * 1e-9) if r[{stamp}] != NEVER else real(0.0)"
 
 
+def _locked(value: Any) -> None:
+    """Make the arrays of a value read-only: whoever else reads the stream must see what was sent."""
+    if isinstance(value, np.ndarray):
+        value.flags.writeable = False
+    elif isinstance(value, Signal):
+        for part in vars(value).values():
+            _locked(part)
+    elif isinstance(value, tuple | dict):
+        for part in value.values() if isinstance(value, dict) else value:
+            _locked(part)
+
+
+def _careful(graph: Graph, call: CallNode) -> Callable[..., Any]:
+    """The step of a block that could not be recorded: its inputs are locked, and its results checked."""
+
+    def output(value: Any, k: int) -> Any:
+        port = call.outputs[k]
+        there, inner = presence(value)
+        if not there and not call.dynamic[k]:
+            raise TypeMismatchError(
+                f"output {port.name!r} is absent",
+                path=call.path,
+                expected=str(port.type),
+                got="None",
+                fix="return a value, or annotate the output `| None`",
+            )
+        checked = as_value(inner, port.type, path=f"{call.path}.{port.name}") if there else inner
+        return When(there, checked) if call.dynamic[k] else checked
+
+    def step(*args: Any, **settings: Any) -> Any:
+        for value in args:
+            _locked(value)
+        result = call.block.step(*args, **settings)
+        state = None
+        if call.state is not None:
+            state, result = result
+            register = graph.nodes[call.state]
+            assert isinstance(register, RegisterNode)
+            state = as_value(state, register.type, path=f"{call.path} state")
+        outputs = [result] if len(call.outputs) == 1 else result or ()
+        made = tuple(output(value, k) for k, value in enumerate(outputs))
+        found = made[0] if len(call.outputs) == 1 else made
+        return found if call.state is None else (state, found)
+
+    return step
+
+
 def bindings(graph: Graph) -> dict[str, Any]:
     """The names that every reaction of a graph uses and no run changes: steps, settings, namespace."""
     from flowgraph.graph import NEVER
 
-    names: dict[str, Any] = {"xp": NUMPY, "NEVER": NEVER, "presence": presence, "real": np.float64}
+    names: dict[str, Any] = {
+        "xp": NUMPY,
+        "NEVER": NEVER,
+        "presence": presence,
+        "real": np.float64,
+        "int64": np.int64,
+    }
     for index, call in graph.calls:
-        names[f"f{index}"] = call.block.step
+        recorded = all(isinstance(v, StepTrace) for v in call.variants.values())
+        names[f"f{index}"] = call.block.step if recorded else _careful(graph, call)
         for key, value in call.settings.items():
             names[f"k{index}_{key}"] = value
     return names

@@ -235,7 +235,7 @@ def _reference(
                 if leaves is not None:
                     times.append(time)
                     kept.append(leaves)
-            if progress is not None and n % _METER_TICKS == 0:
+            if progress is not None and ((n + 1) % _METER_TICKS == 0 or n + 1 == len(events.time)):
                 progress.update(n + 1, time)
     wall = perf_counter() - start
     stacked = []

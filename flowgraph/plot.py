@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError
+from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError, writes
 from flowgraph.series import Series
 from flowgraph.types import ArrayType, leaves_of
 
@@ -186,8 +186,9 @@ def _save(figure: Figure, file: str | Path | None) -> Figure:
         path = Path(file)
         if path.suffix.lower() not in ENDINGS:
             raise UnknownNameError("file ending", path.suffix, ENDINGS, path=str(path))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        with writes(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, dpi=130)
     return figure
 
 

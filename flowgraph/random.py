@@ -140,6 +140,14 @@ class Site:
 
 def site(prefix: str, kind: str, name: str, shape: Any) -> Site:
     """The site `prefix/name`; refuses a shape that is not fixed."""
+    if not isinstance(name, str) or not name or "/" in name or "/" in prefix:
+        raise DeclarationError(
+            "a random stream cannot be called this",
+            path=f"{prefix}/{name}",
+            expected="names without /, which joins them",
+            got=f"{prefix!r}, {name!r}",
+            fix="use . or _ within a name",
+        )
     if not isinstance(shape, tuple) or not all(isinstance(n, int) for n in shape):
         raise DeclarationError(
             "a draw needs a fixed shape",
@@ -170,8 +178,14 @@ def seed_words(seed: int) -> np.ndarray:
     """(2,) uint32 from a seed in 0 .. 2^64 - 1.
 
     Raises:
-        UnknownNameError: for anything else.
+        DeclarationError: for anything else.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**64:
-        raise UnknownNameError("seed", seed, ["a whole number from 0 to 2^64 - 1"])
+        raise DeclarationError(
+            "this is no seed",
+            path="seed",
+            expected="a whole number from 0 to 2^64 - 1",
+            got=repr(seed),
+            fix="write seed=0, or seeds=range(100) for many runs",
+        )
     return np.array([int(seed) & _WORD, int(seed) >> 32], dtype=np.uint32)

@@ -195,6 +195,14 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
     presence: str | int = "always"
     if isinstance(value, When):
         flag = value.present
+        if getattr(flag, "shape", ()) != ():
+            raise DeclarationError(
+                "an output is present or absent as a whole",
+                path=f"{path}.{port.name}",
+                expected="one truth value",
+                got=f"shape {flag.shape}",
+                fix="reduce it with xp.all(...) or xp.any(...)",
+            )
         presence = (flag if isinstance(flag, Symbolic) else trace.constant(bool(flag))).cast("bool").number
         value = value.value
     given = _typed(value, known)
@@ -214,6 +222,13 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
 
 def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
     """The type of a result; a leaf passed through unchanged keeps its unit and frame."""
+    if isinstance(value, list):
+        raise DeclarationError(
+            "a step returns a list",
+            expected="an array, a signal or a tuple",
+            got="list",
+            fix="write xp.stack([...]), or xp.asarray([...]) of constants",
+        )
     if isinstance(value, Symbolic) and value.number in known:
         return known[value.number]
     if isinstance(value, tuple):

@@ -12,12 +12,13 @@ from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn, Protocol
 
-from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, CallNode, Graph
 from flowgraph.inputs import Inputs, batches, check_event, merged, prepare, stack
 from flowgraph.plan import Plan, bindings, bound, plan
 from flowgraph.random import NumpyDraw, seed_words
 from flowgraph.result import Result, statistics
+from flowgraph.series import Series
 from flowgraph.state import initial_registers, load_registers, state_tree
 
 
@@ -59,8 +60,18 @@ class Run:
         self._registers = initial_registers(graph, init)
         self._last = dict.fromkeys(graph.sources, NEVER)
         self._key = seed_words(seed)
+        self._stopped: int | None = None
+        if init is not None and state is not None:
+            raise DeclarationError(
+                "a run starts from initial values or from a state",
+                path=graph.name,
+                expected="init or state",
+                got="both",
+                fix="leave one of them out",
+            )
         if state is not None:
             self.state = state
+        self._recorded = True
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
         self._pushed: list[deque[Any]] | None = None
@@ -71,6 +82,7 @@ class Run:
         else:
             self._prepared = prepare(graph, inputs, self._last)
             self._ticks, feeds = merged(self._prepared)
+            self._recorded = all(isinstance(s, Series) for s in self._prepared.values())
         self._names = {
             **bindings(graph),
             "r": self._registers,
@@ -89,13 +101,14 @@ class Run:
 
     def step(self) -> bool:
         """Advance one tick; False when the inputs have ended."""
+        self._refuse_if_stopped()
         tick = next(self._ticks, None)
         if tick is None:
             return False
         self._advance([tick])
         return True
 
-    def push(self, time: int, **values: Any) -> None:
+    def push(self, time: int, /, **values: Any) -> None:
         """One tick at `time` (int ns) in which the named sources have these values."""
         if self._pushed is None:
             raise DataError(
@@ -105,15 +118,25 @@ class Run:
                 got="push",
                 fix="start it as Run(graph)",
             )
+        if not values:
+            raise DataError(
+                "a tick needs an event",
+                path=self.graph.name,
+                expected="a value for one source or more: " + ", ".join(self.graph.sources),
+                got="none",
+                fix="call push(time, name=value)",
+            )
         key = 0
-        checked = {}
-        for name, value in values.items():
-            if name not in self.graph.sources:
-                raise UnknownNameError("source", name, self.graph.sources, path=self.graph.name)
-            node = self.graph.sources[name]
-            before = self._last[name]
-            _, checked[name] = check_event(name, time, value, node.type, node.clock.timing, before)
-        if self.time != NEVER and time <= self.time:
+        checked: list[tuple[deque[Any], Any]] = []
+        for k, (name, node) in enumerate(self.graph.sources.items()):
+            if name in values:
+                before, timing = self._last[name], node.clock.timing
+                time, value = check_event(name, time, values.pop(name), node.type, timing, before)
+                checked.append((self._pushed[k], value))
+                key |= 1 << k
+        if values:
+            raise UnknownNameError("source", next(iter(values)), self.graph.sources, path=self.graph.name)
+        if time <= self.time:
             raise DataError(
                 "time goes backwards",
                 path=self.graph.name,
@@ -121,16 +144,20 @@ class Run:
                 got=f"{time} ns",
                 fix="push all events of one time in one call, in order",
             )
-        for k, name in enumerate(self.graph.sources):
-            if name in checked:
-                key |= 1 << k
-                self._pushed[k].append(checked[name])
-                self._last[name] = int(time)
-        self._advance([(int(time), key)])
+        for queue, value in checked:
+            queue.append(value)
+        try:
+            self._advance([(time, key)])
+        except BaseException:
+            for queue, _ in checked:
+                queue.clear()
+            self._stopped = None  # this tick did not happen; the next may be pushed
+            raise
 
     def to_end(self, meter: Meter | None = None) -> Run:
         """Run until the inputs end, telling `meter` now and then."""
-        for batch in batches(self._ticks, _BATCH):
+        self._refuse_if_stopped()
+        for batch in batches(self._ticks, _BATCH if self._recorded else 1):
             self._advance(batch)
             if meter is not None:
                 meter.update(self.ticks, self.time)
@@ -139,16 +166,28 @@ class Run:
     def _advance(self, batch: list[tuple[int, int]]) -> None:
         start = perf_counter()
         reactions = self._reactions
-        time = batch[0][0]
+        done = 0
         try:
             for time, key in batch:
                 reactions[key](time)
-        except Exception as error:
-            self._account([tick for tick in batch if tick[0] < time])  # the ticks before the one that failed
-            self._explain(error, time)
+                done += 1
+        except BaseException as error:
+            self._account(batch[:done])
+            self._stopped = batch[done][0]
+            self._explain(error, self._stopped)
             raise
         self._account(batch)
         self.wall_s += perf_counter() - start
+
+    def _refuse_if_stopped(self) -> None:
+        if self._stopped is not None:
+            raise DataError(
+                "this run stopped at an error and cannot go on",
+                path=f"{self.graph.name}, t = {self._stopped} ns",
+                expected="a run without errors",
+                got="another step after one",
+                fix="start a new one: Run(graph, inputs from that time on, state=run.state)",
+            )
 
     def _account(self, batch: list[tuple[int, int]]) -> None:
         self.ticks += len(batch)

@@ -78,7 +78,9 @@ class Series:
                     got=f"shape {array.shape}",
                     fix="give every field a leading axis of the same length as time",
                 )
-            self._leaves.append(array)
+            view = array.view()
+            view.flags.writeable = False  # a block must not change what others read
+            self._leaves.append(view)
 
     @classmethod
     def from_seconds(cls, seconds: npt.ArrayLike, values: Any, **more: Any) -> Series:

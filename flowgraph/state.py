@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DataError, UnknownNameError, writes
 from flowgraph.graph import Graph
 from flowgraph.types import ArrayType, Type, as_value, flatten, leaves_of, unflatten
 
@@ -81,7 +81,11 @@ def load_registers(graph: Graph, tree: Mapping[str, Any]) -> tuple[list[Any], di
 
 
 def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
-    """Write a state tree to an .npz file, exactly."""
+    """Write a state tree to an .npz file, exactly.
+
+    Raises:
+        OutputError: where the file cannot be written.
+    """
     flat: dict[str, np.ndarray] = {}
     for group, members in tree.items():
         if not isinstance(members, Mapping):
@@ -90,7 +94,7 @@ def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
         for path, part in members.items():
             leaves = part.items() if isinstance(part, Mapping) else [("", part)]
             flat.update({f"{group}\n{path}\n{leaf}": np.asarray(a) for leaf, a in leaves})
-    with open(file, "wb") as out:
+    with writes(file), open(file, "wb") as out:
         np.savez(out, **flat)  # type: ignore[arg-type]
 
 

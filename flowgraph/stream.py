@@ -149,6 +149,9 @@ class Stream(Generic[T]):
             fix="take the parts with .map(lambda v: v[0])",
         )
 
+    def __array__(self, *_: Any, **__: Any) -> typing.NoReturn:
+        _refuse_as_value(self)
+
     def __repr__(self) -> str:
         return f"<Stream {self.label}: {self.type} at {self.clock}>"
 
@@ -167,6 +170,9 @@ class Held(Generic[T]):
         """Write `stream` into this register at the end of each tick in which it is present."""
         self.builder.feed(self, stream)
 
+    def __array__(self, *_: Any, **__: Any) -> typing.NoReturn:
+        _refuse_as_value(self)
+
     def __repr__(self) -> str:
         return f"<Held {self.label}: {self.type}>"
 
@@ -174,11 +180,25 @@ class Held(Generic[T]):
 _SAMPLE: Block[Any] = Block(lambda value: value, name="sample")
 
 
+def _refuse_as_value(thing: Stream[Any] | Held[Any]) -> typing.NoReturn:
+    """Refuse a stream where a value is meant: mostly one that a lambda has captured."""
+    kind = "stream" if isinstance(thing, Stream) else "held value"
+    raise DeclarationError(
+        f"{thing.label} is a {kind}, not a value: a step sees only what comes through its ports",
+        path=thing.label,
+        expected="values of the step's own parameters",
+        got=repr(thing),
+        fix="pass it as a port: apply(lambda v, w: v + w, a, b)",
+    )
+
+
 def _operate(
     function: Callable[..., Any], stream: Stream[Any], other: Any, *, swap: bool = False
 ) -> Stream[Any]:
     if isinstance(other, Stream | Held):
         return apply(function, stream, other)
+    if isinstance(other, Symbolic):
+        _refuse_as_value(stream)
     if swap:
         return apply(Block(lambda x: function(other, x), name=function.__name__), stream)
     return apply(Block(lambda x: function(x, other), name=function.__name__), stream)

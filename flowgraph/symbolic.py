@@ -135,9 +135,11 @@ def _is_machinery(module: str) -> bool:
     return module in MACHINERY or module.partition(".")[0] == "numpy"
 
 
-def refuse(what: str, expected: str, got: str, fix: str) -> NoReturn:
+def refuse(what: str, expected: str, got: str, fix: str, *, in_every_engine: bool = False) -> NoReturn:
     """Raise the error that names the block's source line."""
-    raise LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
+    error = LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
+    error.in_every_engine = in_every_engine
+    raise error
 
 
 class Symbolic:
@@ -199,7 +201,11 @@ class Symbolic:
 
     def __setitem__(self, index: Any, value: Any) -> None:
         refuse(
-            "in-place write", "a new array", "x[...] = value", "build it with xp.concat, xp.stack or xp.where"
+            "in-place write",
+            "a new array",
+            "x[...] = value",
+            "build it with xp.concat, xp.stack or xp.where",
+            in_every_engine=True,
         )
 
     def __bool__(self) -> bool:
@@ -350,6 +356,7 @@ def _augmented(name: str) -> Callable[..., NoReturn]:
             "a new array",
             f"x {name}= y",
             f"write x = x {name} y: NumPy would change x itself",
+            in_every_engine=True,
         )
 
     return method

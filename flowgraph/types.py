@@ -368,7 +368,7 @@ def as_value(value: Any, type_: Type, *, path: str, real_dtype: Any = np.float64
     """
     given = type_of(value)
     if isinstance(type_, ArrayType) and isinstance(given, ArrayType):
-        if type_.dtype != given.dtype and np.can_cast(
+        if type_.dtype != given.dtype != "bool" and np.can_cast(
             np.asarray(value).dtype, DTYPES[type_.dtype], "same_kind"
         ):
             given = replace(given, dtype=type_.dtype)  # an int literal where a real is meant

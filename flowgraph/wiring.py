@@ -226,6 +226,8 @@ def _variants(
         try:
             found[choice] = record(block, types, settings, state, path, draws)
         except LoweringError as error:
+            if error.in_every_engine:
+                raise
             found[choice] = error
     return found
 
@@ -289,7 +291,7 @@ def _outputs(
             ruled = (
                 rule(firing, [s.clock for _, s in clocked], settings) if rule is not None and k == 0 else None
             )
-            clock = ruled or Condition(label, clock)
+            clock = ruled or Condition(label, clock, path)
         ports.append(OutputPort(name, type_, clock))
         dynamic.append(unsure)
     return tuple(ports), tuple(dynamic)

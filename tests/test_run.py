@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -12,14 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flowgraph import (
+    ClockError,
     DataError,
     DeclarationError,
+    LoweringError,
     Run,
     Scalar,
     Series,
     Stream,
     TypeMismatchError,
     UnknownNameError,
+    apply,
     block,
     delay,
     every,
@@ -30,8 +33,11 @@ from flowgraph import (
     match,
     merge,
     periodic,
+    real,
     save_state,
     simulate,
+    sink,
+    when,
     zip,
 )
 from tests.support import MS, all_engines, pairs, same, same_state, scalars
@@ -487,3 +493,161 @@ def test_results_are_series_by_name():
     with pytest.raises(AttributeError):
         _ = result.nwo
     assert set(result.stats) == {"match.expired_a", "match.expired_b"}
+
+
+# -- what an error, an impure block or a careless name must not break --------------------------------
+
+
+Pair = Annotated[Any, real(2)]
+
+
+@block
+def in_place(x: Pair) -> Pair:
+    x += 1.0
+    return x
+
+
+def test_an_in_place_write_is_refused_at_build():
+    @graph
+    def g(a: Stream[Pair]):
+        return in_place(a)
+
+    with pytest.raises(LoweringError, match="in-place"):
+        g.build()
+
+
+@block(host=True)
+def scribble(x: Pair) -> Pair:
+    x[0] = 99.0
+    return x
+
+
+@block(host=True)
+def shaky(x: Scalar) -> Scalar:
+    return None if x > 2 else np.ones(3) if x > 1 else x
+
+
+def test_host_blocks_can_neither_change_their_inputs_nor_break_their_promises():
+    @graph
+    def writes(a: Stream[Pair]):
+        return scribble(a)
+
+    values = np.zeros((2, 2))
+    with pytest.raises(ValueError, match="read-only"):
+        simulate(writes.build(), {"a": Series([0, 1], values)})
+    assert not values.any()
+
+    @graph
+    def promises(a: Stream[Scalar]):
+        return shaky(a)
+
+    with pytest.raises(TypeMismatchError, match="shape"):
+        simulate(promises.build(), {"a": Series([0, 1], [1.0, 2.0])})
+    with pytest.raises(TypeMismatchError, match="absent"):
+        simulate(promises.build(), {"a": Series([0, 1], [1.0, 3.0])})
+
+
+def test_a_run_that_stopped_at_an_error_does_not_go_on_with_the_wrong_values():
+    def bad_at_three(x):
+        if x == 3.0:
+            raise KeyboardInterrupt
+        return x
+
+    @graph
+    def g(a: Stream[Scalar]):
+        return a.map(bad_at_three, out=real())
+
+    events = Series(np.arange(6), np.arange(6.0))
+    run = Run(g.build(), {"a": events})
+    with pytest.raises(KeyboardInterrupt):
+        run.to_end()
+    assert (run.ticks, run.time, int(run.state["sources"]["a"])) == (3, 2, 2)
+    with pytest.raises(DataError, match="stopped at an error"):
+        run.step()
+    rest = Run(g.build(), {"a": events[4:]}, state=run.state).to_end().result()
+    assert rest.output.value.tolist() == [4.0, 5.0]
+
+
+def test_a_failed_push_leaves_no_trace_and_may_be_repeated():
+    def bad(x):
+        if x > 1.0:
+            raise RuntimeError("no")
+        return x
+
+    @graph
+    def g(a: Stream[Scalar], b: Stream[Scalar]):
+        return {"a": a.map(bad, out=real()), "b": b}
+
+    run = Run(g.build())
+    with pytest.raises(RuntimeError):
+        run.push(10, a=2.0, b=1.0)
+    assert int(run.state["sources"]["a"]) == int(run.state["sources"]["b"]) == run.time
+    run.push(10, a=0.5, b=3.0)
+    assert run.result()["b"].value.tolist() == [3.0]
+    for time, values in ((1.5, {"a": 1.0}), ("x", {"a": 1.0}), (20, {})):
+        with pytest.raises(DataError):
+            run.push(time, **values)
+    with pytest.raises(TypeMismatchError):
+        run.push(30, a=True)
+
+
+def test_iterables_are_read_one_event_ahead():
+    read = []
+    seen = []
+
+    def events():
+        for k in range(5):
+            read.append(k)
+            yield k, float(k)
+
+    @graph
+    def g(a: Stream[Scalar]):
+        sink(a, lambda x: seen.append((x, len(read))))
+        return {"a": a}
+
+    simulate(g.build(), {"a": events()})
+    assert all(ahead <= x + 2 for x, ahead in seen)
+
+
+@pytest.mark.parametrize("engine", ["python", "reference"])
+def test_t_is_an_array_number_in_every_engine(engine):
+    @block
+    def late(x: Scalar, *, t, xp) -> Scalar:
+        return xp.where(~(t > 15), -1.0, x) + 0.0 * xp.astype(t, xp.float64)
+
+    @graph
+    def g(a: Stream[Scalar]):
+        return late(a)
+
+    result = simulate(g.build(), {"a": Series([0, 10, 20, 30], [1.0, 2.0, 3.0, 4.0])}, engine=engine)
+    assert result.output.value.tolist() == [-1.0, -1.0, 3.0, 4.0]
+
+
+def test_a_stamp_register_does_not_hide_one_of_the_same_name():
+    @block
+    def step(x: Scalar, *, dt) -> Scalar:
+        return x + dt
+
+    @graph
+    def g(a: Stream[Scalar]):
+        held = delay(5.0, name="last(a)")
+        held.feed(a)
+        return {"x": step(a), "y": held.at(a)}
+
+    registers = Run(g.build(), {"a": Series([0, 1], [1.0, 2.0])}).to_end().state["registers"]
+    assert sorted(registers) == ["last(a)", "last(a)_2"]
+    assert registers["last(a)"] == 2.0
+
+
+def test_clock_proofs_are_not_fooled_by_names():
+    @block
+    def gate(x: Scalar) -> tuple[Scalar | None, Scalar | None]:
+        return when(x > 1.0, x), when(x > 2.0, x)
+
+    @graph
+    def g(a: Stream[Scalar]):
+        _, q = gate(a, name="g")
+        return apply(lambda x, y: x + y, q, a.filter(lambda v: v < 2.0, name="g.out_2"))
+
+    with pytest.raises(ClockError):
+        g.build()
