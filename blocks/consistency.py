@@ -37,8 +37,8 @@ __all__ = [
 def chi_square_band(parts: int, *, runs: int = 1, probability: float = 0.95) -> tuple[float, float]:
     """The two-sided band of the mean over `runs` of a chi-square variable with `parts` degrees of freedom."""
     tail = 0.5 * (1.0 - probability)
-    low, high = chi2.ppf([tail, 1.0 - tail], parts * runs) / runs
-    return float(low), float(high)
+    low, high = (float(chi2.ppf(p, parts * runs)) / runs for p in (tail, 1.0 - tail))
+    return low, high
 
 
 def chi_square_gate(parts: int, probability: float = 0.999) -> float:
@@ -130,8 +130,7 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
 
 
 def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
-    """Compare beliefs about a point with the truth, at ticks that it covers, `settle` seconds after the first
-    on.
+    """Compare beliefs about a point with the truth, where it covers them and after `settle` seconds.
 
     Returns:
         position_rmse_m, position_mean_m, position_max_m, velocity_rmse_mps, nees_mean (6 in a consistent
@@ -140,10 +139,10 @@ def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dic
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
-    first = estimate.time[:1] + round(settle * 1e9)
-    covered = (estimate.time >= truth.time[:1]) & (estimate.time <= truth.time[-1:])
-    chosen = estimate[(estimate.time >= first) & covered] if len(truth) and len(estimate) else estimate[:0]
-    if not len(chosen):
+    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
+    if len(truth):
+        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
+    if not len(truth) or not len(chosen):
         raise DataError(
             "no tick of the estimate lies within the truth",
             path=estimate.name,

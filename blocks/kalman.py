@@ -1,16 +1,14 @@
 """The Kalman filter: predict and correct a Gaussian, with what its users ask for first.
 
-- The covariance is corrected in Joseph form, so it stays symmetric, and positive up to rounding;
-  `predict_root` and `update_root` carry a triangular root of it instead, whose square cannot become negative.
+- The covariance is corrected in Joseph form, so it stays symmetric, and positive up to rounding; the
+  blocks of `roots` carry a triangular root of it instead, whose square cannot become negative.
 - A measurement of which some entries are NaN corrects with the others (`arrays(..., not_finite="keep")` lets
   NaN pass as data). Nothing of the missing entries reaches the result.
 - The innovation is an output with its normalised square (NIS), and an optional gate on it.
 - A state or measurement of angles and quaternions is declared once, as a `StateSpace`.
 
-Sources: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation",
-2001: secs. 5.2 (filter), 5.4 (NIS), 7.2-7.4 (Joseph form, square roots); P. Kaminski, A. Bryson, S. Schmidt,
-"Discrete square root filtering: a survey", IEEE TAC 16(6), 1971 (the covariance root by orthogonal
-triangularisation).
+Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+2001: secs. 5.2 (filter, Joseph form) and 5.4 (NIS).
 """
 
 from __future__ import annotations
@@ -18,26 +16,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, Signal, block, boolean, real, when
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.manifold import StateSpace
-from flowgraph.blocks.roots import lower_root, semidefinite_root
 
 __all__ = [
     "Correction",
     "Gaussian",
-    "GaussianRoot",
     "KalmanInnovation",
     "Vector",
     "correct",
     "predict_linear",
-    "predict_root",
     "update_extended",
     "update_linear",
-    "update_root",
 ]
 
 Vector = Annotated[Any, real("m")]
@@ -49,13 +42,6 @@ class Gaussian(Signal):
 
     mean: Array = real("n")
     covariance: Array = real("t", "t")
-
-
-class GaussianRoot(Signal):
-    """A Gaussian belief by the lower triangular root of its covariance: covariance = root root^T."""
-
-    mean: Array = real("n")
-    root: Array = real("t", "t")
 
 
 class KalmanInnovation(Signal):
@@ -176,72 +162,6 @@ def update_extended(
     return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
 
 
-@block
-def predict_root(
-    belief: GaussianRoot, control: Vector, *, model: LinearModel, dt: float, xp: Any
-) -> GaussianRoot:
-    """`predict_linear` on a root: L' is the triangle of [F L, Q^(1/2)], so P' = F P F^T + Q without being
-    formed.
-
-    Source: Kaminski et al. 1971, sec. IV.
-    """
-    F, G, Q = model.discrete(dt, xp, belief.mean.dtype)
-    wide = xp.concat([F @ belief.root, semidefinite_root(Q, xp=xp)], axis=-1)
-    return GaussianRoot(
-        mean=(F @ belief.mean[..., None] + G @ control[..., None])[..., 0], root=lower_root(wide, xp=xp)
-    )
-
-
-@block
-def update_root(
-    prior: GaussianRoot,
-    measured: Vector | None,
-    *,
-    H: npt.ArrayLike,
-    R: npt.ArrayLike,
-    space: StateSpace | None = None,
-    measured_space: StateSpace | None = None,
-    gate: float | None = None,
-    xp: Any,
-) -> tuple[GaussianRoot, KalmanInnovation | None]:
-    """`update_linear` on a root. One triangularisation holds all of it:
-
-        [R^(1/2)  H L]          [S^(1/2)    0 ]
-        [0          L]  Theta = [K S^(1/2)  L']        Theta orthogonal
-
-    Nothing is subtracted from a covariance, so P' = L' L'^T cannot become negative.
-
-    Source: Kaminski et al. 1971, sec. IV.
-    """
-    if measured is None:
-        return prior, None
-    kind, m = prior.mean.dtype, np.shape(H)[0]
-    H, R = xp.asarray(H, dtype=kind), xp.asarray(R, dtype=kind)
-    residual, present = _residual(measured, (H @ prior.mean[..., None])[..., 0], measured_space, xp)
-    H, R = _masked(H, R, present, xp)
-    L = prior.root
-    top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
-    below = xp.concat([0.0 * (H @ L).mT, L], axis=-1)
-    whole = lower_root(xp.concat([top, below], axis=-2), xp=xp)
-    root_S, gain, new = whole[..., :m, :m], whole[..., m:, :m], whole[..., m:, m:]
-    white = xp.linalg.solve(root_S, residual[..., None])
-    nis = xp.linalg.vecdot(white[..., 0], white[..., 0])
-    accepted = _accepted(nis, gate)
-    shift = (gain @ white)[..., 0] * xp.astype(accepted, kind)[..., None]
-    turn = None if space is None else space.reset(shift, xp)
-    new = new if turn is None else lower_root(turn @ new, xp=xp)
-    innovation = KalmanInnovation(
-        residual=residual,
-        covariance=root_S @ root_S.mT,
-        nis=nis,
-        parts=xp.sum(xp.astype(present, kind), axis=-1),
-        accepted=accepted,
-    )
-    root = xp.where(accepted[..., None, None], new, L)
-    posterior = GaussianRoot(mean=_moved(prior.mean, shift, space, xp), root=root)
-    return posterior, _where_any(present, innovation, xp)
-
-
 def correct(
     P: Array,
     residual: Array,
@@ -265,13 +185,13 @@ def correct(
     """
     if present is None:
         present = residual == residual
-    H, R = _masked(H, R, present, xp)
+    H, R = masked(H, R, present, xp)
     HP = H @ P
     S = HP @ H.mT + R
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
-    accepted = _accepted(nis, gate)
+    accepted = accepts(nis, gate)
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
@@ -292,36 +212,39 @@ def _update(
     prior: Gaussian, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
-    residual, present = _residual(measured, predicted, measured_space, xp)
+    residual, present = innovate(measured, predicted, measured_space, xp)
     noise = xp.asarray(R, dtype=prior.mean.dtype)
     found = correct(prior.covariance, residual, H, noise, present=present, gate=gate, space=space, xp=xp)
-    mean = _moved(prior.mean, found.shift, space, xp)
-    return Gaussian(mean=mean, covariance=found.covariance), _where_any(present, found.innovation, xp)
+    mean = moved(prior.mean, found.shift, space, xp)
+    return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
 
 
-def _residual(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:
+def innovate(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:
     """Measured minus predicted, 0 where an entry is NaN, and which entries there are."""
     apart = measured - predicted if space is None else space.minus(measured, predicted, xp)
     present = ~xp.isnan(apart)
     return xp.where(present, apart, 0.0), present
 
 
-def _masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
+def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
     """H and R with zero rows and unit variance for entries that are missing: they then say nothing."""
     here = xp.astype(present, H.dtype)
     both = here[..., :, None] * here[..., None, :]
     return H * here[..., :, None], R * both + xp.eye(H.shape[-2], dtype=H.dtype) * (1.0 - here)[..., None]
 
 
-def _accepted(nis: Array, gate: float | None) -> Array:
+def accepts(nis: Array, gate: float | None) -> Array:
+    """Whether an innovation passes the gate; all do without one."""
     return nis == nis if gate is None else nis <= gate
 
 
-def _moved(mean: Array, shift: Array, space: StateSpace | None, xp: Any) -> Array:
+def moved(mean: Array, shift: Array, space: StateSpace | None, xp: Any) -> Array:
+    """The mean, moved by a tangent vector."""
     return mean + shift if space is None else space.plus(mean, shift, xp)
 
 
-def _where_any(present: Array, innovation: KalmanInnovation, xp: Any) -> Any:
+def where_any(present: Array, innovation: KalmanInnovation, xp: Any) -> Any:
+    """The innovation, present where any entry was measured."""
     return when(xp.any(present), innovation)
 
 

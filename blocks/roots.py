@@ -1,10 +1,12 @@
-"""Triangular roots of covariances, out of operations that every backend has.
+"""The Kalman filter on triangular roots of covariances, out of operations that every backend has.
 
 A covariance P = L L^T kept as its root L has twice the digits and cannot become negative. Filters on roots
 need one thing: the triangle of a wide matrix, usually by a QR factorization. That is no instruction of a
 pipeline, so here it is written out: one Householder reflection a row, a fixed number of them.
 
-Source: G. Golub and C. Van Loan, "Matrix Computations", 4th ed., 2013: algorithms 5.1.1, 5.2.1 and 4.2.2.
+Sources: G. Golub and C. Van Loan, "Matrix Computations", 4th ed., 2013: algorithms 5.1.1, 5.2.1 and 4.2.2
+(the triangles); P. Kaminski, A. Bryson, S. Schmidt, "Discrete square root filtering: a survey", IEEE TAC
+16(6), 1971 (the filter).
 """
 
 from __future__ import annotations
@@ -12,10 +14,95 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from flowgraph import Array
+from flowgraph import Array, Signal, block, real
+from flowgraph.blocks.kalman import (
+    KalmanInnovation,
+    Vector,
+    accepts,
+    innovate,
+    masked,
+    moved,
+    where_any,
+)
+from flowgraph.blocks.linear import LinearModel
+from flowgraph.blocks.manifold import StateSpace
 
-__all__ = ["lower_root", "semidefinite_root"]
+__all__ = ["GaussianRoot", "lower_root", "predict_root", "semidefinite_root", "update_root"]
+
+
+class GaussianRoot(Signal):
+    """A Gaussian belief by the lower triangular root of its covariance: covariance = root root^T."""
+
+    mean: Array = real("n")
+    root: Array = real("t", "t")
+
+
+@block
+def predict_root(
+    belief: GaussianRoot, control: Vector, *, model: LinearModel, dt: float, xp: Any
+) -> GaussianRoot:
+    """`predict_linear` on a root: L' is the triangle of [F L, Q^(1/2)], so P' = F P F^T + Q without being
+    formed.
+
+    Source: Kaminski et al. 1971, sec. IV.
+    """
+    F, G, Q = model.discrete(dt, xp, belief.mean.dtype)
+    wide = xp.concat([F @ belief.root, semidefinite_root(Q, xp=xp)], axis=-1)
+    return GaussianRoot(
+        mean=(F @ belief.mean[..., None] + G @ control[..., None])[..., 0], root=lower_root(wide, xp=xp)
+    )
+
+
+@block
+def update_root(
+    prior: GaussianRoot,
+    measured: Vector | None,
+    *,
+    H: npt.ArrayLike,
+    R: npt.ArrayLike,
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[GaussianRoot, KalmanInnovation | None]:
+    """`update_linear` on a root. One triangularisation holds all of it:
+
+        [R^(1/2)  H L]          [S^(1/2)    0 ]
+        [0          L]  Theta = [K S^(1/2)  L']        Theta orthogonal
+
+    Nothing is subtracted from a covariance, so P' = L' L'^T cannot become negative.
+
+    Source: Kaminski et al. 1971, sec. IV.
+    """
+    if measured is None:
+        return prior, None
+    kind, m = prior.mean.dtype, np.shape(H)[0]
+    H, R = xp.asarray(H, dtype=kind), xp.asarray(R, dtype=kind)
+    residual, present = innovate(measured, (H @ prior.mean[..., None])[..., 0], measured_space, xp)
+    H, R = masked(H, R, present, xp)
+    L = prior.root
+    top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
+    below = xp.concat([0.0 * (H @ L).mT, L], axis=-1)
+    whole = lower_root(xp.concat([top, below], axis=-2), xp=xp)
+    root_S, gain, new = whole[..., :m, :m], whole[..., m:, :m], whole[..., m:, m:]
+    white = xp.linalg.solve(root_S, residual[..., None])
+    nis = xp.linalg.vecdot(white[..., 0], white[..., 0])
+    accepted = accepts(nis, gate)
+    shift = (gain @ white)[..., 0] * xp.astype(accepted, kind)[..., None]
+    turn = None if space is None else space.reset(shift, xp)
+    new = new if turn is None else lower_root(turn @ new, xp=xp)
+    innovation = KalmanInnovation(
+        residual=residual,
+        covariance=root_S @ root_S.mT,
+        nis=nis,
+        parts=xp.sum(xp.astype(present, kind), axis=-1),
+        accepted=accepted,
+    )
+    root = xp.where(accepted[..., None, None], new, L)
+    posterior = GaussianRoot(mean=moved(prior.mean, shift, space, xp), root=root)
+    return posterior, where_any(present, innovation, xp)
 
 
 def lower_root(wide: Array, *, xp: Any) -> Array:

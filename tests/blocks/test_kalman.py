@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -24,16 +24,13 @@ from flowgraph.block import When
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.kalman import (
     Gaussian,
-    GaussianRoot,
     predict_linear,
-    predict_root,
     update_extended,
     update_linear,
-    update_root,
 )
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.roots import lower_root, semidefinite_root
+from flowgraph.blocks.roots import GaussianRoot, lower_root, predict_root, semidefinite_root, update_root
 from tests.support import all_engines
 
 RNG = np.random.default_rng(5)
@@ -287,8 +284,8 @@ def test_a_space_needs_parts():
 @pytest.mark.parametrize("which", [update_linear, update_root])
 def test_a_heading_is_corrected_the_short_way(which):
     space = StateSpace(euclidean(1), angle())
-    prior = Gaussian(mean=np.array([0.0, 3.1]), covariance=np.eye(2) * 0.1)
-    prior = prior if which is update_linear else rooted(prior)
+    plain = Gaussian(mean=np.array([0.0, 3.1]), covariance=np.eye(2) * 0.1)
+    prior = plain if which is update_linear else rooted(plain)
     options = {"H": [[0.0, 1.0]], "R": [[0.1]], "space": space, "measured_space": StateSpace(angle())}
     posterior, innovation = update(prior, np.array([-3.1]), which, **options)
     np.testing.assert_allclose(innovation.residual, [2 * np.pi - 6.2])
@@ -322,7 +319,8 @@ def test_a_quaternion_is_corrected_by_a_rotation_whatever_its_sign():
 
 TRACK = LinearModel([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], np.diag([0.0, 0.5]))
 
-Push, Pair = Annotated[Any, real(1)], Annotated[Any, real(2)]
+Push: TypeAlias = Annotated[Any, real(1)]
+Pair: TypeAlias = Annotated[Any, real(2)]
 
 
 @graph

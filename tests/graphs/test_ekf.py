@@ -18,6 +18,8 @@ from flowgraph.graphs import ekf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
 
 RUNS = 50
+BASES = [0, *(pytest.param(base, marks=pytest.mark.slow) for base in (100, 200))]
+"""The first seed of three sets of runs."""
 DT, LEVER = 0.01, np.array([0.1, -0.2, 0.3])
 
 
@@ -206,17 +208,15 @@ def is_consistent(base: int, factor: float = 1.0) -> bool:
     return consistent_ticks(base, factor) >= 0.8
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("base", [0, 100, 200])
+@pytest.mark.parametrize("base", BASES)
 def test_the_nees_of_50_runs_lies_in_its_band(base):
     """On smooth flights. In those of the thesis the body rate jumps, which readings at 200 Hz cannot tell."""
     pytest.importorskip("jax")
     assert is_consistent(base)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.0, 0.5])
-@pytest.mark.parametrize("base", [0, 100, 200])
+@pytest.mark.parametrize("base", BASES)
 def test_the_same_test_fails_with_a_wrong_noise(base, factor):
     pytest.importorskip("jax")
     assert not is_consistent(base, factor)
