@@ -1,6 +1,6 @@
 """Pictures and reference tables of the site, made when it is built and kept out of the tree.
 
-`generated/NAME.svg` is the diagram of each installed graph, started on the simulated flight. The pages named
+`generated/NAME.svg` is the diagram of each installed graph, started on a simulated flight. The pages named
 in `RUN` are run as programs, and the pictures that they write are taken as they are.
 """
 
@@ -28,7 +28,7 @@ from flowgraph.registry import graph_names
 
 matplotlib.use("Agg")
 
-RUN = ("index.md", "tutorial.md")
+RUN = ("index.md", "tutorial.md", "complementary.md")
 drawn: set[str] = set()
 log = logging.getLogger("mkdocs.hooks.pictures")
 
@@ -50,12 +50,14 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def graphs() -> Iterator[tuple[str, bytes]]:
     """The diagram of each installed graph."""
-    flight = load_flight("sim", seed=0)
+    flights = [load_flight("sim", seed=0), load_flight("sim:thesis", settings={"sensors": "all"})]
     for name in graph_names():
-        try:
-            yield name, find_graph(name).case(flight).graph.draw().encode()
-        except FlowgraphError as error:  # such as a graph that needs another flight
-            log.info("no diagram of %s: %s", name, error)
+        for flight in flights:
+            try:
+                yield name, find_graph(name).case(flight).graph.draw().encode()
+                break
+            except FlowgraphError as error:  # such as a graph that needs another flight
+                log.info("no diagram of %s on %s: %s", name, flight.name, error)
 
 
 def written_by_pages(docs: Path) -> Iterator[tuple[str, bytes]]:

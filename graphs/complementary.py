@@ -1,0 +1,107 @@
+"""The complementary filter: attitude from a gyroscope, high-passed, and an accelerometer, low-passed.
+
+With Q the attitude by the gyroscope alone, and u = R(Q) f the specific force as Q carries it to the world:
+where the body does not accelerate, u would point up if Q were right. What is slow in u is Q's drift, what is
+fast is noise and acceleration of the body:
+
+    Q_k = Q_(k-1) * Exp(w dt)     s_k = low_pass(R(Q_k) f_k)     q_k = [shortest arc from s_k to +z] * Q_k
+
+The arc takes out of Q what the low pass lets through, so q = high_pass(Q) + low_pass(accelerometer) on the
+rotations: on one axis, y_k = a (y_(k-1) + w dt) + (1 - a) z_k. The filtering is done in the world, where
+drift is slow however fast the body turns. Gravity shows no heading: it stays that of the gyroscope.
+
+It fails on a flying quadrotor, whose specific force is its thrust, always along body z: the accelerometer
+says "level" whatever the attitude. See `orientation_complementary`.
+
+Source: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear complementary filters on the special orthogonal
+group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (rotations); R. Fiszel, thesis
+(2017), section on the complementary filter.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flowgraph import (
+    Case,
+    Flight,
+    Result,
+    Stream,
+    collect,
+    delay,
+    graph,
+    high_pass,
+    latest,
+    low_pass,
+    timing_of,
+)  # fmt: skip
+from flowgraph.blocks.complementary import (
+    WorldForce,
+    attitude_errors,
+    carry_to_world,
+    check_alpha,
+    first_attitude,
+    inertial_streams,
+    level_near,
+    needed,
+    turn_by_gyro,
+)
+from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
+
+
+@graph
+def complementary(
+    gyro: Stream[Gyro],
+    accelerometer: Stream[SpecificForce],
+    *,
+    start: Attitude,
+    alpha: float = 0.98,
+):
+    """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
+
+    `alpha` is the gyroscope's share at each reading of the accelerometer; 1 is the gyroscope alone. Its time
+    constant is period * alpha / (1 - alpha): 0.245 s for 0.98 at 200 Hz.
+
+    Collected: at each reading of the gyroscope `attitude`, and for comparison `gyroscope` and
+    `accelerometer`, the attitudes by one of them alone; at each reading of the accelerometer `rejected`, what
+    the filter took for noise in it.
+    """
+    at_rest = WorldForce.at_rest()
+    previous = delay(start, name="turned")
+    turned = turn_by_gyro(previous, gyro, name="gyroscope")
+    previous.feed(turned)
+
+    force = carry_to_world(latest(turned, init=start, name="by_gyro"), accelerometer, name="carried")
+    collect(high_pass(force, alpha=alpha, init=at_rest), "rejected")
+    last = latest(force, init=at_rest, name="last_force")
+    collect(level_near(turned, last, name="by_force"), "accelerometer")
+
+    attitude = turned
+    if alpha < 1.0:
+        steady = low_pass(force, alpha=1.0 - alpha, init=at_rest)
+        attitude = level_near(turned, latest(steady, init=at_rest, name="steady"), name="attitude")
+    return {"attitude": attitude, "gyroscope": turned}
+
+
+@complementary.on_flight
+def for_flight(flight: Flight, *, alpha: float = 0.98, settle: float = 1.0) -> Case:
+    """Start the filter on a flight with a gyroscope and an accelerometer, at the truth's first attitude.
+
+    Args:
+        flight: with the streams `gyro` (Gyro) and `accelerometer` (SpecificForce), or `imu`, which holds
+            both.
+        alpha: the gyroscope's share, in (0, 1].
+        settle: seconds at the start that the errors leave out.
+    """
+    check_alpha("complementary", alpha)
+    streams = inertial_streams(flight)
+    inputs = needed("complementary", flight, streams, "gyro", "accelerometer", otherwise="imu")
+    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
+    start = first_attitude(flight, inputs["gyro"], inputs["accelerometer"]["force"][0])
+    built = complementary.build(**clocks, start=start, alpha=alpha)
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else attitude_errors(result["attitude"], truth, settle=settle)
+
+    return Case(built, inputs, score, estimate="attitude")
