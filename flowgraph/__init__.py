@@ -1,5 +1,7 @@
 """Declare a filter once as a graph; draw it, simulate it, and lower it to a fixed-size pipeline."""
 
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 from flowgraph.block import Block, block, when
 from flowgraph.clock import aperiodic, periodic
 from flowgraph.declare import delay, graph
@@ -12,6 +14,7 @@ from flowgraph.errors import (
     FlowgraphError,
     LoweringError,
     MissingDependencyError,
+    OutputError,
     PipelineError,
     TypeMismatchError,
     UnknownNameError,
@@ -34,6 +37,18 @@ from flowgraph.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 from flowgraph.windows import batch, flat_map, padded, reduce, stacked, window
 
+if _TYPE_CHECKING:
+    from flowgraph.progress import ProgressBar
+
+
+def __getattr__(name: str) -> object:
+    if name == "ProgressBar":  # with it comes rich, which a program without a bar need not import
+        from flowgraph.progress import ProgressBar
+
+        return ProgressBar
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 __all__ = [
     "Array",
     "Batch",
@@ -50,8 +65,10 @@ __all__ = [
     "Held",
     "LoweringError",
     "MissingDependencyError",
+    "OutputError",
     "Pipeline",
     "PipelineError",
+    "ProgressBar",
     "Result",
     "Run",
     "Scalar",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from flowgraph.block import REQUIRED, Block
@@ -27,6 +28,19 @@ def need_stream(operation: str, stream: object) -> None:
         )
 
 
+def need_streams(join: str, **given: Any) -> None:
+    """Refuse what is not a stream, by the name of its port."""
+    for port, value in given.items():
+        if not isinstance(value, Stream):
+            raise DeclarationError(
+                f"{join} needs a stream as {port!r}",
+                path=join,
+                expected="a Stream",
+                got=repr(value),
+                fix="a held value has no times: read it with map or apply, or sample it with .at(clock)",
+            )
+
+
 def need_count(operation: str, name: str, n: object, *, least: int) -> int:
     """`n` as a whole number of at least `least`."""
     if not isinstance(n, int) or isinstance(n, bool) or not least <= n < 2**31:
@@ -38,6 +52,32 @@ def need_count(operation: str, name: str, n: object, *, least: int) -> int:
             fix=f"write {name}={max(least, 5)}",
         )
     return n
+
+
+MOST = 1e9
+"""No setting of a filter is as large, in SI units; its square is still a number."""
+
+
+def need_numbers(
+    where: str,
+    *,
+    positive: Mapping[str, object] | None = None,
+    not_negative: Mapping[str, object] | None = None,
+) -> None:
+    """Refuse settings, by name, that are no numbers below `MOST`; None, which is left out, passes."""
+    for least, given in ((math.ulp(0.0), positive or {}), (0.0, not_negative or {})):
+        for name, value in given.items():
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if value is not None and not (number and least <= typing.cast(float, value) < MOST):
+                raise DeclarationError(
+                    f"setting {name!r} is out of range",
+                    path=f"{where}.{name}",
+                    expected=f"a {'positive ' if least else ''}number"
+                    + ("" if least else " that is not negative")
+                    + f", below {MOST:g}",
+                    got=repr(value),
+                    fix=f"leave {name} out, or write {name}=1.0",
+                )
 
 
 def need_reals(operation: str, stream: Stream[Any]) -> None:

@@ -9,9 +9,12 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import math
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -19,12 +22,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError
-from flowgraph.inputs import event_count
+from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError, writes
 from flowgraph.lowering import lower as lower_graph
+from flowgraph.progress import ProgressBar
 from flowgraph.registry import (
     Case,
     find_graph,
@@ -53,13 +55,27 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
 ]
-Seed = Annotated[int, typer.Option(help="Of a simulated flight, and of the graph's draws.")]
+Seed = Annotated[
+    int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def main() -> None:
     """The entry point of the `flowgraph` command."""
-    app()
+    try:
+        app()
+    except OSError as error:  # from what prints the help
+        _give_up(f"{type(error).__name__}: {error}")
+        sys.exit(1)
+
+
+def _give_up(message: str) -> None:
+    """Say why, and let nothing more be written to standard output, which may be what has failed."""
+    with suppress(OSError):
+        _err.print(f"error: {message}", markup=False)
+    with suppress(OSError, ValueError):  # ValueError: it is no file, as in tests
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _reports_errors(command: Callable[..., None]) -> Callable[..., None]:
@@ -69,10 +85,17 @@ def _reports_errors(command: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, **options: Any) -> None:
         try:
             command(*args, **options)
+            sys.stdout.flush()
         except FlowgraphError as error:
             _err.print(f"error: {error}", markup=False)
             raise typer.Exit(2 if isinstance(error, UnknownNameError | DeclarationError) else 1) from None
         except BrokenPipeError:
+            raise typer.Exit(1) from None
+        except OSError as error:
+            _give_up(f"{type(error).__name__}: {error}")
+            raise typer.Exit(1) from None
+        except MemoryError as error:
+            _give_up(f"there is not enough memory for this: {error}")
             raise typer.Exit(1) from None
 
     return run
@@ -105,7 +128,7 @@ def show(
     if output is None:
         print(case.graph.text())
         return
-    with _writing(output):
+    with _writing(output), _without_font_warnings():
         case.graph.draw(str(output))
 
 
@@ -122,6 +145,8 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
+    if out is not None:
+        _make_ready(out)
     case, flight = _case(graph, data, settings, seed)
     for note in flight.notes:
         _err.print(f"note: {note}", markup=False)
@@ -159,13 +184,15 @@ def lower(
 @app.command()
 @_reports_errors
 def demo(
+    graphs: Annotated[list[str] | None, typer.Argument(metavar="[GRAPH]...")] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="For diagrams and plots.")] = Path("out"),
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Run the filters on the simulated flight in both engines, and draw them."""
+    """Run filters on the simulated flight in both engines, and draw them: ins_eskf and rbpf_indoor."""
+    _make_ready(out)
     rows = []
-    for name in graph_names():
+    for name in graphs or ("ins_eskf", "rbpf_indoor"):
         case, flight = _case(name, "sim", None, seed)
         for engine in ("python", "xla"):
             try:
@@ -185,7 +212,16 @@ def demo(
 
 def _case(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
     graph = find_graph(name)
-    given = dict(_pair(text) for text in settings or [])
+    given: dict[str, str] = {}
+    for key, value in map(_pair, settings or []):
+        if given.setdefault(key, value) != value:
+            raise DeclarationError(
+                "a setting is given twice",
+                path=f"--set {key}",
+                expected="one value",
+                got=f"{given[key]} and {value}",
+                fix="leave one of them out",
+            )
     if graph.prepare is None:
         return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
     mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
@@ -212,39 +248,63 @@ def _measure(
     case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
-    with _meter(event_count(case.inputs), name, engine, quiet) as meter:
+    hidden = quiet or not _err.is_terminal
+    with (
+        nullcontext()
+        if hidden
+        else ProgressBar(f"{name} ({engine})", total=case.inputs, console=_err) as meter
+    ):
         result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter)
     total = perf_counter() - start
     row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
-    return result, {**row, "setup_s": total - result.wall_s, **case.score(result), **result.stats}
+    row.update({"setup_s": total - result.wall_s, **case.score(result), **result.stats})
+    for key, value in row.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise DataError(
+                "the estimate went astray",
+                path=f"{name}.{key}",
+                expected="a finite number",
+                got=str(value),
+                fix="look at the settings and at the data: the filter divides by zero, or overflows",
+            )
+    return result, row
 
 
-class _Bar:
-    def __init__(self, progress: Progress, task: Any) -> None:
-        self._progress, self._task = progress, task
-
-    def update(self, ticks: int, time: int) -> None:
-        self._progress.update(self._task, completed=ticks)
+def _make_ready(folder: Path) -> None:
+    """Make a folder for results, and see that files can be made in it, before time is spent."""
+    with writes(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
 
 
 @contextmanager
-def _meter(total: int | None, name: str, engine: str, quiet: bool) -> Iterator[_Bar | None]:
-    if quiet or not _err.is_terminal:
-        yield None
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_err, transient=True) as progress:
-        yield _Bar(progress, progress.add_task(f"{name} ({engine})", total=total))
+def _without_font_warnings() -> Iterator[None]:
+    """Keep what Fontconfig says of the system's own files, in C, out of standard error; nothing else."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(kept, 2)
+            os.close(kept)
+            said.seek(0)
+            for line in said:
+                if not line.startswith(b"Fontconfig "):
+                    os.write(2, line)
 
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
     from flowgraph.plot import plot_navigation, plot_result
 
-    out.mkdir(parents=True, exist_ok=True)
-    with _writing(out / "diagram.svg") as file:
+    with writes(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with _writing(out / "diagram.svg") as file, _without_font_warnings():
         case.graph.draw(str(file))
     with _writing(out / "metrics.json") as file:
-        file.write_text(json.dumps(report, indent=1) + "\n")
+        file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     if case.estimate not in result.series:
         return
     if "position" in result[case.estimate].leaves:
@@ -259,7 +319,8 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
 def _writing(file: Path) -> Iterator[Path]:
     """Say what is written, and whether something was there before."""
     before = file.exists()
-    yield file
+    with writes(file):
+        yield file
     _err.print(f"{'replaced' if before else 'wrote'} {file}", markup=False)
 
 
@@ -268,8 +329,7 @@ def _first_line(doc: str) -> str:
 
 
 def _print_json(value: Any) -> None:
-    json.dump(value, sys.stdout, indent=1)
-    print()
+    print(json.dumps(value, indent=1, allow_nan=False))
 
 
 _WORDS: dict[str, tuple[str, Callable[[Any], str]]] = {

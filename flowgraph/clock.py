@@ -102,7 +102,10 @@ def aperiodic(*, max_rate: float | None = None) -> Timing:
     number = isinstance(max_rate, int | float) and not isinstance(max_rate, bool)
     if max_rate is not None and (not number or not 0 < max_rate < math.inf):
         raise DeclarationError(
-            "a highest rate must be positive", expected="more than 0 Hz", got=repr(max_rate), fix="leave it out"
+            "a highest rate must be positive",
+            expected="more than 0 Hz",
+            got=repr(max_rate),
+            fix="leave it out",
         )
     return Timing(max_rate=max_rate)
 

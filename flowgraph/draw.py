@@ -29,7 +29,7 @@ from flowgraph.draw_text import (
     to_networkx,
     type_words,
 )
-from flowgraph.errors import DeclarationError, MissingDependencyError, UnknownNameError
+from flowgraph.errors import DeclarationError, MissingDependencyError, UnknownNameError, writes
 from flowgraph.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 
 ENDINGS = (".svg", ".png", ".pdf", ".dot", ".gv")

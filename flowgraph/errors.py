@@ -114,7 +114,7 @@ def writes(file: str | Path) -> Iterator[None]:
         raise OutputError(
             "this cannot be written",
             path=str(file),
-            expected="a place where there is a folder and files can be made",
+            expected="a folder in which files can be made",
             got=f"{type(error).__name__}: {error.strerror or error}",
             fix="choose another file or folder, or make the folder first",
         ) from error

@@ -130,6 +130,18 @@ def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
     return time if rows is None else time.take(rows, mode="clip")
 
 
+def need_inputs(graph: Graph, inputs: object) -> None:
+    """Refuse what is neither a flight nor data by source name."""
+    if not isinstance(inputs, Flight | Mapping):
+        raise DataError(
+            "these are no inputs",
+            path=graph.name,
+            expected="a Flight, or data by source name: " + ", ".join(graph.sources),
+            got=f"{type(inputs).__name__} {inputs!r}"[:80],
+            fix="write simulate(graph, {" + ", ".join(f"{n!r}: Series(...)" for n in graph.sources) + "})",
+        )
+
+
 def prepare(
     graph: Graph, inputs: Inputs, last: Mapping[str, int] | None = None
 ) -> dict[str, Series | Iterator[tuple[int, Any]]]:
@@ -140,14 +152,7 @@ def prepare(
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
     """
-    if not isinstance(inputs, Flight | Mapping):
-        raise DataError(
-            "these are no inputs",
-            path=graph.name,
-            expected="a Flight, or data by source name: " + ", ".join(graph.sources),
-            got=f"{type(inputs).__name__} {inputs!r}"[:80],
-            fix="write simulate(graph, {" + ", ".join(f"{n!r}: Series(...)" for n in graph.sources) + "})",
-        )
+    need_inputs(graph, inputs)
     given = dict(inputs.streams) if isinstance(inputs, Flight) else dict(inputs)
     if not isinstance(inputs, Flight):
         for name in given:
@@ -184,13 +189,6 @@ def prepare(
                 fix="write Series(time, values)",
             )
     return found
-
-
-def event_count(inputs: Inputs) -> int | None:
-    """How many events the inputs hold, or None where an iterable does not tell."""
-    given = inputs.streams if isinstance(inputs, Flight) else inputs
-    sizes = [len(s) if isinstance(s, Series) else None for s in given.values()]
-    return None if None in sizes else sum(s for s in sizes if s is not None)
 
 
 def _typed(name: str, series: Series, wanted: Type) -> Series:

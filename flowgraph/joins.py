@@ -18,6 +18,7 @@ import numpy as np
 from flowgraph import clock as clocks
 from flowgraph.block import REQUIRED, Block, block, when
 from flowgraph.builder import builder
+from flowgraph.checks import need_streams
 from flowgraph.clock import Clock, Counted, Source, clock_of, nanoseconds, within
 from flowgraph.errors import ClockError, DeclarationError
 from flowgraph.graph import NEVER
@@ -26,18 +27,6 @@ from flowgraph.stream import Stream
 from flowgraph.types import ArrayType, Type, annotation_type, flatten, tuple_type, unflatten
 
 T = TypeVar("T")
-
-
-def _need_streams(join: str, **given: Any) -> None:
-    for port, value in given.items():
-        if not isinstance(value, Stream):
-            raise DeclarationError(
-                f"{join} needs a stream as {port!r}",
-                path=join,
-                expected="a Stream",
-                got=repr(value),
-                fix="a held value has no times: read it with map or apply, or sample it with .at(clock)",
-            )
 
 
 def latest(
@@ -125,11 +114,12 @@ def _(*, n: int, phase: int) -> Any:
 
 def every(n: int, stream: Stream[T] | Clock, *, phase: int = 0, name: str | None = None) -> Stream[T]:
     """Each n-th value of a stream (or tick of a clock), starting with number `phase`."""
-    if not isinstance(n, int) or n < 1 or not 0 <= phase < n:
+    whole = all(isinstance(k, int) and not isinstance(k, bool) for k in (n, phase))
+    if not whole or not 1 <= n < 2**31 or not 0 <= phase < n:
         raise DeclarationError(
             "every needs a positive whole number and a phase below it",
             path=name or "every",
-            expected="n >= 1, 0 <= phase < n",
+            expected="whole numbers, 1 <= n < 2^31, 0 <= phase < n",
             got=f"n={n!r}, phase={phase!r}",
             fix="write every(5, imu)",
         )
@@ -158,7 +148,7 @@ def merge(a: Stream[T], b: Stream[T], *, tie: Any = None, name: str | None = Non
     Raises:
         ClockError: where the clocks can coincide and no `tie` is named.
     """
-    _need_streams(name or "merge", a=a, b=b)
+    need_streams(name or "merge", a=a, b=b)
     if tie is None and not clocks.disjoint(a.clock, b.clock):
         raise ClockError(
             f"{a.label} and {b.label} can be present together",
@@ -298,7 +288,7 @@ def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[An
     Raises:
         ClockError: where rates are unequal (use `latest`) or only nominally equal (use `match`).
     """
-    _need_streams(name or "zip", a=a, b=b)
+    need_streams(name or "zip", a=a, b=b)
     label = name or f"zip({a.label}, {b.label})"
     if clocks.equal(a.clock, b.clock):
         return typing.cast("Stream[Any]", _pair(a, b, name=name))
@@ -308,7 +298,15 @@ def zip(a: Stream[Any], b: Stream[Any], *, name: str | None = None) -> Stream[An
 
 def zip_latest(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
     """Pairs whenever either comes, with the last value of the other; `init` is the pair before the first."""
-    _need_streams(name or "zip_latest", a=a, b=b)
+    need_streams(name or "zip_latest", a=a, b=b)
+    if not isinstance(init, tuple | list) or len(init) != 2:
+        raise DeclarationError(
+            "zip_latest starts from a pair",
+            path=name or f"zip_latest({a.label}, {b.label})",
+            expected="init=(value of a, value of b)",
+            got=repr(init),
+            fix="write init=(0.0, 0.0)",
+        )
     first, second = init
     left, right = latest(a, init=first), latest(b, init=second)
     return typing.cast("Stream[Any]", _pair_latest(left, right, at=a | b, name=name))
@@ -316,6 +314,7 @@ def zip_latest(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = 
 
 def zip_latest_right(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | None = None) -> Stream[Any]:
     """Pairs whenever `a` comes, with the last value of `b`; `init` is the value of `b` before its first."""
+    need_streams(name or "zip_latest_right", a=a, b=b)
     return typing.cast("Stream[Any]", _pair_latest(a, latest(b, init=init), name=name))
 
 
@@ -367,6 +366,10 @@ def _(a: Type, b: Type, *, tolerance: int, size: int, types: Any) -> Any:
     return {"a": left, "b": right, "expired_a": none, "expired_b": none, "overflow": np.int64(NEVER)}
 
 
+_EMPTY_SLOT_AGE = 2**62  # ns: older than any tolerance, so an empty slot is never near
+_LONGEST_QUEUE = 2**24
+
+
 def _distances(queue: dict[str, Any], t: Any, xp: Any) -> tuple[Any, Any]:
     held = xp.arange(queue["items"][0].shape[0], dtype=xp.int32) < queue["count"]
     return held, t - queue["items"][0]
@@ -375,7 +378,7 @@ def _distances(queue: dict[str, Any], t: Any, xp: Any) -> tuple[Any, Any]:
 def _nearest(queue: dict[str, Any], t: Any, tolerance: int, xp: Any) -> tuple[Any, Any]:
     """Place of the value nearest in time, and whether it is within the tolerance."""
     held, age = _distances(queue, t, xp)
-    gap = xp.where(held, age, 2**62)
+    gap = xp.where(held, age, _EMPTY_SLOT_AGE)
     return xp.argmin(gap), xp.min(gap) <= tolerance
 
 
@@ -397,18 +400,27 @@ def match(
         size: how many values of one stream may wait; more is an error at run time.
 
     Raises:
-        DeclarationError: without a size.
+        DeclarationError: without a size, or with a tolerance that is no duration.
     """
-    _need_streams(name or "match", a=a, b=b)
-    if not isinstance(size, int) or size < 1:
+    need_streams(name or "match", a=a, b=b)
+    label = name or f"match({a.label}, {b.label})"
+    if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= _LONGEST_QUEUE:
         raise DeclarationError(
             "match needs the size of its queues",
-            path=name or f"match({a.label}, {b.label})",
-            expected="size=, a positive whole number",
+            path=label,
+            expected=f"size=, a whole number from 1 to {_LONGEST_QUEUE}",
             got=repr(size),
             fix="write match(a, b, tolerance=..., size=8): how many values may wait for a partner",
         )
     span = nanoseconds(tolerance, what="tolerance")
+    if not 0 <= span < _EMPTY_SLOT_AGE:
+        raise DeclarationError(
+            "this tolerance cannot be kept",
+            path=label,
+            expected="0 ns or more, below 2^62 ns",
+            got=repr(tolerance),
+            fix='write tolerance="5ms"',
+        )
     return typing.cast(
         "Stream[Any]", _match(a, b, tolerance=span, size=size, types=(a.type, b.type), name=name)
     )

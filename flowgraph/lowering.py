@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
+from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source, Timing
 from flowgraph.errors import LoweringError
 from flowgraph.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.ops import OPS, Spec
 from flowgraph.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
 from flowgraph.random import Site
 from flowgraph.recording import StepTrace
+from flowgraph.state import join_states
 from flowgraph.symbolic import Instruction, Trace
 from flowgraph.symbolic_namespace import namespace
 from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
@@ -74,6 +75,7 @@ class _Lowering:
                         f"{node.clock}: {node.clock.timing}",
                         self.sources[node.clock],
                         numbers,
+                        node.clock.timing,
                     )
                 )
         for index, register in graph.registers:
@@ -212,6 +214,7 @@ class _Lowering:
 
     def registers(self) -> list[Register]:
         made = []
+        joins = join_states(self.graph)
         for index, node in self.graph.registers:
             written = self.writes.get(index, self.reads[index])
             initial = flatten(node.initial, node.type)
@@ -231,7 +234,7 @@ class _Lowering:
                     leaves_of(node.type), self.reads[index], written, initial, strict=True
                 )
             ]
-            made.append(Register(node.path, node.role, tuple(cells)))
+            made.append(Register(node.path, "join" if index in joins else node.role, tuple(cells)))
         return made
 
     def faults(self) -> list[Fault]:
@@ -357,12 +360,20 @@ class _Lowering:
         pairs = zip(self.choose(options[1:], present), self.choose(options[1:], absent), strict=True)
         return [self.select(options[0], yes, no) for yes, no in pairs]
 
-    def port(self, name: str, type_: Type, clock: str, present: int, numbers: list[int]) -> Port:
+    def port(
+        self,
+        name: str,
+        type_: Type,
+        clock: str,
+        present: int,
+        numbers: list[int],
+        timing: Timing | None = None,
+    ) -> Port:
         leaves = [
             Leaf(leaf, n, _fixed(t.shape), t.dtype, t.unit, t.frame, axis_names(t))
             for (leaf, t), n in zip(leaves_of(type_), numbers, strict=True)
         ]
-        return Port(name, str(type_), clock, present, tuple(leaves))
+        return Port(name, str(type_), clock, present, tuple(leaves), timing)
 
 
 def _axis(types: Sequence[Type]) -> str | None:

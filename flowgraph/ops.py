@@ -7,6 +7,7 @@ backend read this one table, so an operation exists either everywhere or nowhere
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,6 +42,19 @@ class Op:
     rule: Callable[..., Spec]
     run: Callable[..., Any]
     operands: str = "as is"
+
+    @property
+    def count(self) -> int | None:
+        """How many arguments it takes; None: one or more."""
+        kinds = [p.kind for p in inspect.signature(self.rule).parameters.values()]
+        if inspect.Parameter.VAR_POSITIONAL not in kinds:
+            return kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        return None if self.name in ("concat", "stack") else 1 if self.name in _UNARY.split() else 2
+
+
+_UNARY = """abs negative sign square positive sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh
+cosh tanh floor ceil round trunc logical_not isfinite isnan bitwise_invert"""
+"""Those among the operations element by element that take one argument; the others take two."""
 
 
 _RANK = {"bool": 0, "uint32": 1, "int32": 1, "int64": 2, "uint64": 3, "real": 4}

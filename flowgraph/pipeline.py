@@ -3,29 +3,30 @@
 Values are numbered and assigned once. Inputs, registers and constants give the first values, stages of
 typed instructions the rest; outputs name values, and each register names the value written back at the end
 of a tick. Whether a source is present in a tick is a Boolean input like any other, and every stage names
-the value that enables it. The JSON form holds the same, whole, with a version and a JSON Schema.
+the value that enables it. The JSON form (`description`) holds the same, whole, with a version and a schema.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowgraph.errors import PipelineError
-from flowgraph.ops import OPS, Spec
+from flowgraph.clock import Timing
+from flowgraph.errors import PipelineError, writes
+from flowgraph.ops import Spec
 from flowgraph.symbolic import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
 
 if TYPE_CHECKING:
     from flowgraph.result import Result
+    from flowgraph.series import Flight
 
 FORMAT, VERSION = "flowgraph-pipeline", 1
 _FILE = "pipeline.json"
@@ -47,13 +48,14 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Port:
-    """An input or output: `present` is the number of a Boolean value."""
+    """An input or output: `present` is the number of a Boolean value; an input's stamps keep `timing`."""
 
     name: str
     type: str
     clock: str
     present: int
     leaves: tuple[Leaf, ...]
+    timing: Timing | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Register:
-    """Memory between ticks: `role` is "latest", "delay", "state" or "stamp"."""
+    """Memory between ticks: `role` is "latest", "delay", "state", "join" (the state of one) or "stamp"."""
 
     path: str
     role: str
@@ -151,11 +153,12 @@ class Pipeline:
         """All instructions in order."""
         return tuple(i for stage in self.stages for i in stage.instructions)
 
-    def run(self, inputs: Mapping[str, Any], **options: Any) -> Result:
+    def run(self, inputs: Flight | Mapping[str, Any], **options: Any) -> Result:
         """Play the pipeline over recorded events.
 
         Args:
-            inputs: for each input a `Series`, or `(times, {leaf: array})` with int64 ns and a leading axis.
+            inputs: a `Flight`, or for each input a `Series`, `(times, {leaf: array})` with int64 ns and a
+                leading axis, or an iterable of `(time, value)`.
             **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress` as in `simulate`.
         """
         from flowgraph.playback import run_pipeline
@@ -194,151 +197,37 @@ class Pipeline:
     @cached_property
     def specs(self) -> dict[int, Spec]:
         """Shape and dtype of every value."""
-        return dict(self._given()) | {i.out: i.spec for i in self.instructions}
+        return dict(self.given()) | {i.out: i.spec for i in self.instructions}
 
-    def _given(self) -> list[tuple[int, Spec]]:
+    def given(self) -> list[tuple[int, Spec]]:
         """The values that no instruction makes."""
         found = [(self.time, Spec((), "int64")), (self.seed, Spec((2,), "uint32"))]
         for port in self.inputs:
-            found += [(port.present, Spec((), "bool")), *((leaf.value, _spec(leaf)) for leaf in port.leaves)]
-        found += [(c.read, _spec(c)) for r in self.registers for c in r.cells]
-        return found + [(n, Spec(a.shape, _kind(a))) for n, a in self.constants.items()]
+            found += [
+                (port.present, Spec((), "bool")),
+                *((leaf.value, spec_of(leaf)) for leaf in port.leaves),
+            ]
+        found += [(c.read, spec_of(c)) for r in self.registers for c in r.cells]
+        return found + [(n, Spec(a.shape, kind_of(a))) for n, a in self.constants.items()]
 
     # -- JSON ----------------------------------------------------------------------------------------
 
     def to_json(self) -> dict[str, Any]:
         """The whole description as plain JSON values."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "name": self.name,
-            "doc": self.doc,
-            "time": self.time,
-            "seed": self.seed,
-            "inputs": [_plain(p) for p in self.inputs],
-            "outputs": [_plain(p) for p in self.outputs],
-            "registers": [_plain(r) for r in self.registers],
-            "constants": [
-                {"value": n, "shape": list(a.shape), "dtype": _kind(a), "data": _numbers(a)}
-                for n, a in self.constants.items()
-            ],
-            "stages": [
-                {
-                    "path": s.path,
-                    "block": s.block,
-                    "enable": s.enable,
-                    "reads": list(s.reads),
-                    "writes": list(s.writes),
-                    "axis": s.axis,
-                    "instructions": [_instruction(i) for i in s.instructions],
-                }
-                for s in self.stages
-            ],
-            "faults": [_plain(f) for f in self.faults],
-            "random": [_plain(r) for r in self.random],
-            "totals": self.totals(),
-            "latency": self.latency(),
-        }
+        from flowgraph.description import to_json
+
+        return to_json(self)
 
     @classmethod
     def from_json(cls, data: Any, *, path: str = "pipeline") -> Pipeline:
-        """A pipeline from `to_json`'s form, checked against the schema and for single assignment.
+        """A pipeline from `to_json`'s form, checked against the schema and, value by value, for sense.
 
         Raises:
             PipelineError: saying where it is malformed.
         """
-        _check_version(data, path)
-        _check_schema(data, path)
-        pipeline = cls(
-            name=data["name"],
-            doc=data["doc"],
-            time=data["time"],
-            seed=data["seed"],
-            inputs=tuple(_port(p) for p in data["inputs"]),
-            outputs=tuple(_port(p) for p in data["outputs"]),
-            registers=tuple(
-                Register(r["path"], r["role"], tuple(_cell(c) for c in r["cells"])) for r in data["registers"]
-            ),
-            constants={c["value"]: _array(c["data"], c["shape"], c["dtype"]) for c in data["constants"]},
-            stages=tuple(
-                Stage(
-                    s["path"],
-                    s["block"],
-                    s["enable"],
-                    tuple(s["reads"]),
-                    tuple(s["writes"]),
-                    tuple(_from_instruction(i) for i in s["instructions"]),
-                    s["axis"],
-                )
-                for s in data["stages"]
-            ),
-            faults=tuple(Fault(**f) for f in data["faults"]),
-            random=tuple(RandomSite(**{**r, "shape": tuple(r["shape"])}) for r in data["random"]),
-        )
-        pipeline._check_values(path)
-        return pipeline
+        from flowgraph.description import from_json
 
-    def _check_values(self, path: str) -> None:
-        """Every value is assigned once, before it is used, with the shape that its instruction gives."""
-        given = self._given()
-        specs = dict(given)
-        if len(specs) < len(given):
-            raise PipelineError(
-                "a value is assigned twice",
-                path=path,
-                expected="one number a value",
-                got=str(sorted(n for n, k in Counter(n for n, _ in given).items() if k > 1)),
-                fix="lower the graph again",
-            )
-        for stage in self.stages:
-            for i in stage.instructions:
-                where = f"{path}: stage {stage.path}, value {i.out}"
-                missing = [a for a in i.args if a not in specs]
-                if i.op not in OPS or missing or i.out in specs:
-                    raise PipelineError(
-                        "an instruction is malformed",
-                        path=where,
-                        expected="a known operation on values assigned before",
-                        got=f"{i.op}{list(i.args)}",
-                        fix="lower the graph again",
-                    )
-                try:
-                    derived = OPS[i.op].rule(*(specs[a] for a in i.args), **i.attrs)
-                except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
-                    derived = Spec((-1,), str(error))
-                if derived != i.spec:
-                    raise PipelineError(
-                        "an instruction's result does not have the shape it claims",
-                        path=where,
-                        expected=str(derived),
-                        got=str(i.spec),
-                        fix="lower the graph again",
-                    )
-                specs[i.out] = i.spec
-        flag = Spec((), "bool")
-        ends = [(f"output {o.name}", leaf.value, _spec(leaf)) for o in self.outputs for leaf in o.leaves]
-        ends += [(f"output {o.name}", o.present, flag) for o in self.outputs]
-        ends += [(f"register {r.path}", c.write, _spec(c)) for r in self.registers for c in r.cells]
-        ends += [(f"stage {s.path}", s.enable, flag) for s in self.stages]
-        for where, n, wanted in ends:
-            if specs.get(n) != wanted:
-                raise PipelineError(
-                    f"value {n} is never assigned" if n not in specs else f"value {n} is of another kind",
-                    path=f"{path}: {where}",
-                    expected=str(wanted),
-                    got=str(specs.get(n, "nothing")),
-                    fix="lower the graph again",
-                )
-        cells = {(r.path, c.name) for r in self.registers for c in r.cells}
-        for fault in self.faults:
-            if (fault.register, fault.cell) not in cells:
-                raise PipelineError(
-                    "a fault is kept nowhere",
-                    path=f"{path}: fault of {fault.path}",
-                    expected="a register cell that exists",
-                    got=f"{fault.register}, {fault.cell}",
-                    fix="lower the graph again",
-                )
+        return from_json(data, path=path)
 
     def save(self, folder: str | Path) -> Path:
         """Write `pipeline.json` and a listing `pipeline.txt` into a folder, made if missing; returns it.
@@ -375,7 +264,7 @@ class Pipeline:
         file = Path(folder)
         file = file / _FILE if file.is_dir() else file
         try:
-            data = json.loads(file.read_text())
+            data = json.loads(file.read_text(), parse_constant=_no_number)
         except (OSError, ValueError, RecursionError) as error:
             raise PipelineError(
                 "no pipeline can be read here",
@@ -441,112 +330,22 @@ def type_of_leaves(name: str, leaves: tuple[Leaf, ...] | tuple[Cell, ...]) -> Ty
     return StructType(name, tuple(fields), dict)
 
 
+def spec_of(part: Leaf | Cell) -> Spec:
+    """Shape and dtype of a leaf or cell."""
+    return Spec(part.shape, part.dtype)
+
+
+def kind_of(array: np.ndarray) -> str:
+    """The kind of number of a constant: "real", "bool", or an integer's name."""
+    return "real" if array.dtype.kind == "f" else "bool" if array.dtype.kind == "b" else array.dtype.name
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is not JSON")
+
+
 @lru_cache(maxsize=1)
 def schema() -> dict[str, Any]:
     """The JSON Schema of the description."""
     found: dict[str, Any] = json.loads(_SCHEMA.read_text())
     return found
-
-
-def _check_version(data: Any, path: str) -> None:
-    if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
-        got = (
-            {k: data.get(k) for k in ("format", "version")} if isinstance(data, dict) else type(data).__name__
-        )
-        raise PipelineError(
-            "this is not a pipeline of a known version",
-            path=path,
-            expected=f"format {FORMAT!r}, version {VERSION}",
-            got=got,
-            fix="lower the graph again with this version of flowgraph",
-        )
-
-
-def _check_schema(data: Any, path: str) -> None:
-    import jsonschema
-
-    error = jsonschema.Draft202012Validator(schema()).iter_errors(data)
-    first = next(iter(error), None)
-    if first is not None:
-        place = "/".join(map(str, first.absolute_path)) or "the top"
-        raise PipelineError(
-            "the description does not keep to its schema",
-            path=f"{path}, at {place}",
-            expected=json.dumps(first.schema)[:200],
-            got=first.message[:200],
-            fix="lower the graph again",
-        )
-
-
-def _spec(part: Leaf | Cell) -> Spec:
-    return Spec(part.shape, part.dtype)
-
-
-def _kind(array: np.ndarray) -> str:
-    return "real" if array.dtype.kind == "f" else "bool" if array.dtype.kind == "b" else array.dtype.name
-
-
-def _numbers(array: Any) -> Any:
-    """Nested lists; numbers that JSON lacks as text."""
-    flat = np.asarray(array)
-    if flat.dtype.kind == "f" and not np.isfinite(flat).all():
-        spelled = np.array([x if math.isfinite(x) else str(x) for x in flat.ravel().tolist()], dtype=object)
-        return spelled.reshape(flat.shape).tolist()
-    return flat.tolist()
-
-
-def _array(data: Any, shape: list[int], dtype: str) -> np.ndarray:
-    try:
-        array: np.ndarray = np.asarray(data, dtype=object if dtype == "real" else DTYPES[dtype])
-        return array.astype(DTYPES[dtype]).reshape(shape)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise PipelineError(
-            "numbers are malformed",
-            path="pipeline",
-            expected=f"{dtype} of shape {tuple(shape)}",
-            got=str(error),
-            fix="lower the graph again",
-        ) from None
-
-
-def _plain(record: Any) -> Any:
-    data = asdict(record)
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {k: clean(v) for k, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [clean(v) for v in value]
-        return _numbers(value) if isinstance(value, np.ndarray | np.generic) else value
-
-    return clean(data)
-
-
-def _instruction(i: Instruction) -> dict[str, Any]:
-    record: dict[str, Any] = {"value": i.out, "op": i.op, "args": list(i.args)}
-    if i.attrs:
-        record["attrs"] = i.attrs
-    return record | {"shape": list(i.spec.shape), "dtype": i.spec.dtype, "line": i.line}
-
-
-def _from_instruction(r: Mapping[str, Any]) -> Instruction:
-    spec = Spec(tuple(r["shape"]), r["dtype"])
-    return Instruction(r["op"], tuple(r["args"]), r.get("attrs", {}), r["value"], spec, r["line"])
-
-
-def _port(r: Mapping[str, Any]) -> Port:
-    leaves = tuple(
-        Leaf(**{**leaf, "shape": tuple(leaf["shape"]), "axes": tuple(leaf["axes"])}) for leaf in r["leaves"]
-    )
-    return Port(r["name"], r["type"], r["clock"], r["present"], leaves)
-
-
-def _cell(r: Mapping[str, Any]) -> Cell:
-    return Cell(
-        **{
-            **r,
-            "shape": tuple(r["shape"]),
-            "axes": tuple(r["axes"]),
-            "reset": _array(r["reset"], r["shape"], r["dtype"]),
-        }
-    )

@@ -12,19 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.clock import Timing
+from flowgraph.clock import Source, Timing
 from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
-from flowgraph.graph import NEVER, Graph
-from flowgraph.inputs import Inputs, Tape, check_finite, check_times, prepare, tape
+from flowgraph.graph import NEVER, Graph, SourceNode
+from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
-from flowgraph.pipeline import Pipeline, type_of_leaves
+from flowgraph.pipeline import Cell, Leaf, Pipeline, Port, type_of_leaves
 from flowgraph.random import seed_words
 from flowgraph.reference import Player
 from flowgraph.result import Result
 from flowgraph.run import Meter
-from flowgraph.series import Series
-from flowgraph.state import initial_registers, load_registers
-from flowgraph.types import DTYPES, Type, as_value, flatten, unflatten
+from flowgraph.series import Flight, Series
+from flowgraph.state import check_settable, check_start, initial_registers, load_registers, read_tree
+from flowgraph.types import (
+    DTYPES,
+    ArrayType,
+    Type,
+    as_value,
+    dtype_name,
+    flatten,
+    leaves_of,
+    type_of,
+    unflatten,
+)
 
 _METER_TICKS = 2048
 
@@ -48,6 +58,7 @@ def play(
     progress: Meter | None,
 ) -> Result:
     """Lower a graph and play it; the result has the graph's own signal types."""
+    check_start(init, state, path=graph.name)
     pipeline = lower(graph)
     if state is None:
         slots, last = initial_registers(graph, init), dict.fromkeys(graph.sources, NEVER)
@@ -61,7 +72,7 @@ def play(
 
 def run_pipeline(
     pipeline: Pipeline,
-    inputs: Mapping[str, Any],
+    inputs: Inputs,
     *,
     engine: str = "reference",
     dtype: str = "float64",
@@ -75,80 +86,148 @@ def run_pipeline(
         raise UnknownNameError("engine of a pipeline", engine, ("reference", "xla"))
     if dtype not in ("float64", "float32"):
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
+    check_start(init, state, path=pipeline.name)
+    sources = _sources(pipeline)
     names = [p.name for p in pipeline.inputs]
-    for name in inputs:
+    if state is None:
+        cells, last = _initial_cells(pipeline, init), dict.fromkeys(names, NEVER)
+    else:
+        held = {r.path: type_of_leaves(r.path, r.cells) for r in pipeline.registers}
+        found, last, seed = read_tree(state, held, names, name=pipeline.name, of="pipeline")
+        cells = [leaf for r in pipeline.registers for leaf in found[r.path]]
+    events = tape(prepare(sources, _inputs(pipeline, inputs), last), sources)
+    types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
+    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress)
+
+
+def _sources(pipeline: Pipeline) -> Graph:
+    """A graph of the inputs alone, with their types and timing, so that events are checked as for a graph."""
+    nodes = tuple(
+        SourceNode(p.name, type_of_leaves(p.type, p.leaves), Source(p.name, p.timing or Timing()))
+        for p in pipeline.inputs
+    )
+    return Graph(pipeline.name, "", nodes, tuple(range(len(nodes))), (), ())
+
+
+def _inputs(pipeline: Pipeline, inputs: Any) -> dict[str, Any]:
+    """Events of each input, with values as the pipeline knows them: arrays by the names of their leaves."""
+    if not isinstance(inputs, Flight | Mapping):
+        raise DataError(
+            "these inputs have no names",
+            path=pipeline.name,
+            expected="a Flight, or a mapping from input to events",
+            got=type(inputs).__name__,
+            fix=f"pass {{{', '.join(repr(p.name) + ': ...' for p in pipeline.inputs)}}}",
+        )
+    given = inputs.streams if isinstance(inputs, Flight) else inputs
+    names = [p.name for p in pipeline.inputs]
+    for name in given if inputs is given else ():
         if name not in names:
             raise UnknownNameError("input", name, names, path=pipeline.name)
-    series = tuple(_input(pipeline, port, inputs) for port in pipeline.inputs)
-    cells = _initial_cells(pipeline, init, state)
-    seed = seed if state is None else int(state["seed"])
-    last = dict.fromkeys(names, NEVER) if state is None else {n: int(state["sources"][n]) for n in names}
-    types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
-    return _result(pipeline, Tape.of(series), cells, last, types, engine, dtype, seed, progress)
+    found: dict[str, Any] = {}
+    for port in pipeline.inputs:
+        if port.name not in given:
+            raise DataError(
+                f"input {port.name!r} has no data",
+                path=pipeline.name,
+                expected=f"events of {port.type}",
+                got=", ".join(given) or "no inputs",
+                fix=f"pass {{{port.name!r}: Series(time, values)}}",
+            )
+        value = given[port.name]
+        if isinstance(value, Series) or (isinstance(value, tuple) and len(value) == 2):
+            found[port.name] = _recorded(pipeline, port, value)
+        else:
+            found[port.name] = _events(pipeline, port, value) if isinstance(value, Iterable) else value
+    return found
 
 
-def _input(pipeline: Pipeline, port: Any, inputs: Mapping[str, Any]) -> Series:
-    if port.name not in inputs:
-        raise DataError(
-            f"input {port.name!r} has no data",
-            path=pipeline.name,
-            expected=f"events of {port.type}",
-            got=", ".join(inputs) or "no inputs",
-            fix=f"pass {{{port.name!r}: Series(time, values)}}",
-        )
-    value = inputs[port.name]
-    type_ = type_of_leaves(port.type, port.leaves)
+def _recorded(pipeline: Pipeline, port: Port, value: Any) -> Series:
+    """A series whose type is a plain struct of the port's leaves."""
+    where = f"{pipeline.name}, input {port.name}"
+    gaps = False
+    if isinstance(value, tuple) and not isinstance(value[1], Mapping):
+        value = Series(value[0], value[1], name=port.name)
     if isinstance(value, Series):
-        arrays: Mapping[str, Any] = value.leaves
-        time = value.time
+        time, arrays, gaps = value.time, value.leaves, value.gaps
+        kinds = dict(leaves_of(value.type))
     else:
-        time, values = value
-        arrays = values if isinstance(values, Mapping) else {"value": values}
-    if list(arrays) != [leaf.name for leaf in port.leaves]:
-        raise DataError(
-            f"input {port.name!r} has other fields",
-            path=pipeline.name,
-            expected=", ".join(leaf.name for leaf in port.leaves),
-            got=", ".join(arrays),
-            fix="give these fields, in this order",
+        time, arrays = value[0], {n: np.asarray(a) for n, a in _flat(value[1]).items()}
+        kinds = {n: ArrayType(a.shape[1:], dtype_name(a)) for n, a in arrays.items()}
+    _check_fields(arrays, [leaf.name for leaf in port.leaves], f"input {port.name!r}", where)
+    leaves = []
+    for leaf in port.leaves:
+        given = kinds[leaf.name]
+        kind = "real" if leaf.dtype == "real" and given.dtype != "bool" else given.dtype
+        leaves.append(Leaf(leaf.name, 0, _sizes(given), kind, given.unit, given.frame))
+    type_ = type_of_leaves(port.type, tuple(leaves))
+    values = unflatten(type_, iter([arrays[leaf.name] for leaf in port.leaves]))
+    return Series(time, values, type=type_, name=port.name, gaps=gaps)
+
+
+def _sizes(type_: ArrayType) -> tuple[int, ...]:
+    return tuple(n for n in type_.shape if isinstance(n, int))
+
+
+def _events(pipeline: Pipeline, port: Port, events: Iterable[Any]) -> Iterator[Any]:
+    """Events one by one; what is no pair is passed on, to be refused with all else that is wrong."""
+    for event in events:
+        if isinstance(event, tuple) and len(event) == 2:
+            where = f"{pipeline.name}, input {port.name}"
+            yield event[0], _value(event[1], port.type, port.leaves, f"input {port.name!r}", where)
+        else:
+            yield event
+
+
+def _value(value: Any, name: str, leaves: tuple[Leaf, ...] | tuple[Cell, ...], what: str, where: str) -> Any:
+    """One value, from a signal, a tuple, a mapping or an array with these leaves."""
+    if isinstance(value, Mapping):
+        parts = _flat(value)
+    else:
+        type_ = type_of(value)
+        parts = dict(zip((n for n, _ in leaves_of(type_)), flatten(value, type_), strict=True))
+    _check_fields(parts, [leaf.name for leaf in leaves], what, where)
+    made = []
+    for leaf in leaves:
+        array = np.asarray(parts[leaf.name])
+        made.append(array.astype(np.float64) if leaf.dtype == "real" and array.dtype.kind in "iu" else array)
+    return unflatten(type_of_leaves(name, leaves), iter(made))
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves of nested mappings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, part in value.items():
+        found.update(
+            _flat(part, f"{prefix}{name}.") if isinstance(part, Mapping) else {f"{prefix}{name}": part}
         )
-    series = Series(
-        time, unflatten(type_, iter([np.asarray(a) for a in arrays.values()])), type=type_, name=port.name
-    )
-    check_finite(port.name, series)
-    check_times(port.name, series.time, Timing())
-    return series
+    return found
 
 
-def _initial_cells(
-    pipeline: Pipeline, init: Mapping[str, Any] | None, state: Mapping[str, Any] | None
-) -> list[Any]:
-    paths = {r.path: r for r in pipeline.registers}
-    given: dict[str, Any] = dict(init or {}) if state is None else dict(state["registers"])
+def _check_fields(given: Mapping[str, Any], wanted: list[str], what: str, where: str) -> None:
+    if set(given) != set(wanted):
+        raise DataError(
+            f"{what} has other fields",
+            path=where,
+            expected=", ".join(wanted),
+            got=", ".join(map(str, given)),
+            fix="give these fields",
+        )
+
+
+def _initial_cells(pipeline: Pipeline, init: Mapping[str, Any] | None) -> list[Any]:
+    roles = {r.path: r.role for r in pipeline.registers}
+    given = init or {}
     for path in given:
-        if path not in paths:
-            raise UnknownNameError("register", path, paths, path=pipeline.name)
-    absent = sorted(set(paths) - set(given)) if state is not None else []
-    if absent:
-        raise DataError(
-            "this state is of another pipeline",
-            path=pipeline.name,
-            expected=f"registers {sorted(paths)}",
-            got=f"none called {absent[0]!r}",
-            fix="resume a run with the pipeline that it was saved from",
-        )
+        check_settable(path, roles, graph=pipeline.name)
     cells: list[Any] = []
     for register in pipeline.registers:
-        type_ = type_of_leaves(register.path, register.cells)
         if register.path in given:
-            value = given[register.path]
-            if not isinstance(value, Mapping):
-                value = dict(zip((c.name for c in register.cells), [value], strict=True))
-            missing = [c.name for c in register.cells if c.name not in value]
-            if missing:
-                raise UnknownNameError("field", missing[0], value, path=register.path)
-            leaves = [value[c.name] for c in register.cells]
-            cells.extend(flatten(as_value(unflatten(type_, iter(leaves)), type_, path=register.path), type_))
+            path, type_ = register.path, type_of_leaves(register.path, register.cells)
+            value = _value(
+                given[path], path, register.cells, f"the value of {path!r}", f"{pipeline.name}, {path}"
+            )
+            cells.extend(flatten(as_value(value, type_, path=path), type_))
         else:
             cells.extend(c.reset for c in register.cells)
     return cells

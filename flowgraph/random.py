@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.errors import DeclarationError
 from flowgraph.namespaces import NUMPY
 
 ROUNDS = 7

@@ -8,6 +8,7 @@ settings)`). Ours are found the same way as a user's.
 from __future__ import annotations
 
 import inspect
+import math
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -79,7 +80,8 @@ def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None 
     """Load the flight that a text such as "sim" or "euroc:PATH" names.
 
     Raises:
-        UnknownNameError: for a kind that is not installed; DataError: from the loader.
+        UnknownNameError: for a kind that is not installed, or a setting that it does not have.
+        DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
     """
     kind, _, argument = spec.partition(":")
     load: Callable[..., Flight] = _find("flowgraph.flights", "kind of flight", kind, flight_names())
@@ -121,12 +123,15 @@ def _parse(text: str, annotation: Any, path: str) -> Any:
         return None
     words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
     try:
-        return words[text.lower()] if kinds[0] is bool else kinds[0](text)
-    except (KeyError, TypeError, ValueError):
+        value = words[text.lower()] if kinds[0] is bool else kinds[0](text)
+        if kinds[0] in (int, float) and ("_" in text or not math.isfinite(value)):
+            raise ValueError
+        return value
+    except (KeyError, OverflowError, TypeError, ValueError):
         raise DeclarationError(
             "this setting cannot be read",
             path=path,
-            expected=" or ".join(k.__name__ for k in kinds),
+            expected=" or ".join(("finite " if k is float else "") + k.__name__ for k in kinds),
             got=repr(text),
             fix=f"write --set {path.rsplit('.', 1)[-1]}=VALUE",
         ) from None

@@ -12,14 +12,14 @@ from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn, Protocol
 
-from flowgraph.errors import DataError, DeclarationError, FifoOverflowError, UnknownNameError
+from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, CallNode, Graph
 from flowgraph.inputs import Inputs, batches, check_event, merged, prepare, stack
 from flowgraph.plan import Plan, bindings, bound, plan
 from flowgraph.random import NumpyDraw, seed_words
 from flowgraph.result import Result, statistics
 from flowgraph.series import Series
-from flowgraph.state import initial_registers, load_registers, state_tree
+from flowgraph.state import check_start, initial_registers, load_registers, state_tree
 
 
 class Meter(Protocol):
@@ -61,14 +61,7 @@ class Run:
         self._last = dict.fromkeys(graph.sources, NEVER)
         self._key = seed_words(seed)
         self._stopped: int | None = None
-        if init is not None and state is not None:
-            raise DeclarationError(
-                "a run starts from initial values or from a state",
-                path=graph.name,
-                expected="init or state",
-                got="both",
-                fix="leave one of them out",
-            )
+        check_start(init, state, path=graph.name)
         if state is not None:
             self.state = state
         self._recorded = True

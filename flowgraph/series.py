@@ -53,7 +53,7 @@ class Series:
         name: str = "series",
         gaps: bool = False,
     ) -> None:
-        stamps = np.asarray(time)
+        stamps = _array(time, name)
         if stamps.dtype.kind not in "iu":
             raise DataError(
                 "times must be integer nanoseconds",
@@ -62,14 +62,30 @@ class Series:
                 got=f"dtype {stamps.dtype}",
                 fix="round float seconds once, at the source: Series.from_seconds(seconds, values)",
             )
+        if stamps.ndim != 1:
+            raise DataError(
+                "times must be one array",
+                path=name,
+                expected="shape (n,)",
+                got=f"shape {stamps.shape}",
+                fix="flatten them: one time stamp a value",
+            )
+        if stamps.dtype == np.uint64 and len(stamps) and stamps.max() >= 2**63:
+            raise DataError(
+                "a time is beyond what int64 nanoseconds hold",
+                path=f"{name}, row {int(stamps.argmax())}",
+                expected="times below 2^63 ns",
+                got=str(stamps.max()),
+                fix="check the unit of the stamps: they are nanoseconds",
+            )
         self.time = stamps.astype(np.int64)
         self.name, self.gaps = name, gaps
-        self.type = type if type is not None else _one_of(values)
+        self.type = type if type is not None else _one_of(values, name)
         self._leaves: list[np.ndarray] = []
         for leaf, (leaf_name, leaf_type) in zip(
             flatten(values, self.type), leaves_of(self.type), strict=True
         ):
-            array: np.ndarray = np.asarray(leaf, dtype=DTYPES[leaf_type.dtype])
+            array: np.ndarray = _array(leaf, name, DTYPES[leaf_type.dtype])
             if array.shape != (len(self.time), *leaf_type.shape):
                 raise DataError(
                     f"field {leaf_name!r} does not have one value a time stamp",
@@ -166,27 +182,43 @@ class Series:
         return f"<Series {self.name}: {len(self)} x {self.type}, {span}>"
 
 
-def _one_of(values: Any) -> Type:
+def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:
+    """An array of what was given, if it is one."""
+    try:
+        return np.asarray(values, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            "this is no array of numbers",
+            path=name,
+            expected="numbers, the same shape in every row",
+            got=str(error),
+            fix="give rows of one length, padded where they are shorter",
+        ) from None
+
+
+def _one_of(values: Any, name: str) -> Type:
     """The type of one value, given values with a leading axis."""
     if isinstance(values, Signal):
         declared = struct_type(type(values))
         parts = tuple(
             (
                 n,
-                _one_of(getattr(values, n))
+                _one_of(getattr(values, n), f"{name}.{n}")
                 if isinstance(t, StructType)
-                else _drop_axis(t, getattr(values, n)),
+                else _drop_axis(t, getattr(values, n), f"{name}.{n}"),
             )
             for n, t in declared.fields
         )
         return StructType(declared.name, parts, declared.cls)
     if isinstance(values, tuple):
-        return StructType("tuple", tuple((str(i), _one_of(v)) for i, v in enumerate(values)), tuple)
-    return _drop_axis(None, values)
+        return StructType(
+            "tuple", tuple((str(i), _one_of(v, f"{name}.{i}")) for i, v in enumerate(values)), tuple
+        )
+    return _drop_axis(None, values, name)
 
 
-def _drop_axis(declared: ArrayType | None, values: Any) -> ArrayType:
-    array = np.asarray(values)
+def _drop_axis(declared: ArrayType | None, values: Any, name: str) -> ArrayType:
+    array = _array(values, name)
     if array.dtype.kind in "iu" and declared is not None and declared.dtype == "real":
         array = array.astype(np.float64)
     batch = type_of(array)

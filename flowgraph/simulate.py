@@ -8,7 +8,7 @@ from typing import Any
 
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
-from flowgraph.inputs import Inputs
+from flowgraph.inputs import Inputs, need_inputs
 from flowgraph.many import Batch, simulate_many
 from flowgraph.result import Result
 from flowgraph.run import Meter, Run
@@ -88,6 +88,7 @@ def simulate(
                 fix="leave one of them out",
             )
         return simulate_many(graph, inputs, seeds, engine=engine, dtype=dtype, init=init, progress=progress)
+    need_inputs(graph, inputs)
     if engine == "python":
         if dtype != "float64":
             raise DeclarationError(

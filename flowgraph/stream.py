@@ -15,6 +15,7 @@ from flowgraph.block import Block
 from flowgraph.clock import Clock, clock_of
 from flowgraph.errors import DeclarationError
 from flowgraph.graph import OutputPort, Wire
+from flowgraph.symbolic import Symbolic
 from flowgraph.types import Type, annotation_type
 
 if TYPE_CHECKING:
@@ -184,11 +185,11 @@ def _refuse_as_value(thing: Stream[Any] | Held[Any]) -> typing.NoReturn:
     """Refuse a stream where a value is meant: mostly one that a lambda has captured."""
     kind = "stream" if isinstance(thing, Stream) else "held value"
     raise DeclarationError(
-        f"{thing.label} is a {kind}, not a value: a step sees only what comes through its ports",
+        f"{thing.label} is a {kind}, not a number: a step sees only what comes through its ports",
         path=thing.label,
         expected="values of the step's own parameters",
         got=repr(thing),
-        fix="pass it as a port: apply(lambda v, w: v + w, a, b)",
+        fix="pass it as a port: apply(f, a, b), where f = lambda v, w: v + w",
     )
 
 

@@ -27,6 +27,7 @@ from flowgraph.blocks.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial import ImuNoise, predict
 from flowgraph.blocks.metrics import interpolate_pose, pose_errors
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
+from flowgraph.checks import need_numbers
 
 
 @graph
@@ -64,8 +65,8 @@ def ins_eskf(
 def for_flight(
     flight: Flight,
     *,
-    gyro_factor: float = 15.0,
-    accelerometer_factor: float = 20.0,
+    gyro_factor: float | None = None,
+    accelerometer_factor: float | None = None,
     position_noise: float | None = None,
     attitude_noise: float | None = None,
     gate: float | None = None,
@@ -78,18 +79,35 @@ def for_flight(
 
     Args:
         flight: with the streams `imu` and one of `leica` (Position) or `vicon` (Pose).
-        gyro_factor, accelerometer_factor: on the densities of a real unit's data sheet, which knows nothing
-            of vibration, aliasing and held samples; simulated noise is what it says, and is not scaled.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU. If left out, 15 and 20 for a
+            real unit, whose data sheet knows nothing of vibration, aliasing and held samples; 1 for simulated
+            noise, which is what it says.
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
         gate: a measurement with a larger normalised innovation squared changes nothing.
         settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where the flight lacks a stream.
+        DeclarationError: for a setting that is out of range.
     """
+    need_numbers(
+        "ins_eskf",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "position_noise": position_noise,
+            "attitude_noise": attitude_noise,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
     aids = _aids(flight)
     inputs = {"imu": flight.streams["imu"], **aids}
     real = "position_noise" not in flight.info
-    noise = flight.info["imu_noise"]
-    if real:
-        noise = noise.scaled(gyro=gyro_factor, accelerometer=accelerometer_factor)
+    noise = flight.info["imu_noise"].scaled(
+        gyro=_given(gyro_factor, 15.0 if real else 1.0),
+        accelerometer=_given(accelerometer_factor, 20.0 if real else 1.0),
+    )
     truth = flight.truth
     imu = flight.streams["imu"]
     if truth is None:

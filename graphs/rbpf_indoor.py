@@ -15,7 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, latest, merge, timing_of
+from flowgraph import (
+    Case,
+    DataError,
+    DeclarationError,
+    Flight,
+    Result,
+    Series,
+    Stream,
+    delay,
+    graph,
+    latest,
+    merge,
+    timing_of,
+)
 from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.calibration import subtract_rest_bias
 from flowgraph.blocks.geometry import level, to_matrix
@@ -35,6 +48,9 @@ from flowgraph.blocks.particles import (
 from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.resampling import draw_ancestors, take_ancestors
 from flowgraph.blocks.signals import Cloud, Imu, Pose
+from flowgraph.checks import need_numbers
+
+MOST_PARTICLES = 2**20
 
 
 @graph
@@ -153,7 +169,30 @@ def for_flight(
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
         still: seconds at the start in which the body does not move; the flight's own, or 1 for `sim`, else 0.
         settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where the flight lacks a stream.
+        DeclarationError: for a setting that is out of range.
+        UnknownNameError: for a scheme that is not there.
     """
+    need_numbers(
+        "rbpf_indoor",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "position_noise": position_noise,
+            "attitude_noise": attitude_noise,
+        },
+        not_negative={"still": still, "settle": settle, "resample_below": resample_below},
+    )
+    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
+        raise DeclarationError(
+            "setting 'particles' is out of range",
+            path="rbpf_indoor.particles",
+            expected=f"a whole number from 1 to {MOST_PARTICLES}",
+            got=repr(particles),
+            fix="write particles=1000",
+        )
     for stream in ("imu", "vicon"):
         if stream not in flight.streams:
             raise DataError(

@@ -24,7 +24,6 @@ from flowgraph import (
     simulate,
     timing_of,
 )
-from flowgraph.inputs import event_count
 from tests.support import pairs, scalars
 
 
@@ -222,11 +221,6 @@ def test_a_flight_may_hold_more_than_a_graph_reads():
     assert simulate(copy.build(), flight).ticks == 1
     with pytest.raises(DataError, match="source 'x' has no data"):
         simulate(copy.build(), Flight("f", {}))
-
-
-def test_events_are_counted_where_that_is_known():
-    assert event_count({"x": scalars([0, 1]), "y": scalars([0])}) == 3
-    assert event_count({"x": iter([])}) is None
 
 
 def test_the_users_arrays_are_not_changed_by_a_run():

@@ -523,3 +523,63 @@ def test_disjoint_clocks_of_every_are_known():
 
     g.build()
     assert seen == [True]
+
+
+# -- what a declaration refuses ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        lambda x, y: every(2, x, phase=0.5),  # type: ignore[arg-type]
+        lambda x, y: every(True, x),
+        lambda x, y: every(2, x, phase=True),
+        lambda x, y: every(2**31, x),
+        lambda x, y: x.every(1.0),
+        lambda x, y: match(x, y, tolerance=-5, size=2),
+        lambda x, y: match(x, y, tolerance=2**62, size=2),
+        lambda x, y: match(x, y, tolerance=2**62 + 1, size=2),
+        lambda x, y: match(x, y, tolerance=2**63, size=2),
+        lambda x, y: match(x, y, tolerance="99999999999999999999s", size=2),
+        lambda x, y: match(x, y, tolerance=1, size=True),
+        lambda x, y: match(x, y, tolerance=1, size=2**40),
+        lambda x, y: zip_latest(x, y, init=0.0),
+        lambda x, y: {1: x},
+        lambda x, y: {"": x},
+    ],
+)
+def test_a_count_duration_or_name_that_is_none_is_refused(body):
+    with pytest.raises(DeclarationError) as caught:
+        build(body)
+    assert all((caught.value.path, caught.value.expected, caught.value.got, caught.value.fix))
+
+
+def test_the_longest_tolerance_still_tells_empty_slots_from_values():
+    def body(x, y):
+        return match(x, y, tolerance=2**62 - 1, size=3)
+
+    assert both(run(body, scalars([0, 10], [1.0, 2.0]), scalars([15], [3.0]))) == [(15, 2.0, 3.0)]
+
+
+@pytest.mark.parametrize("rate", ["x", float("nan"), float("inf"), True, 0, -1.0])
+def test_a_highest_rate_is_a_positive_number(rate):
+    with pytest.raises(DeclarationError, match="a highest rate must be positive"):
+        aperiodic(max_rate=rate)
+
+
+CAPTURES = {
+    "value + stream": lambda x, y: x.map(lambda v: v + y),
+    "stream + value": lambda x, y: x.map(lambda v: y + v),
+    "comparison": lambda x, y: x.filter(lambda v: y > v),
+    "in a function of xp": lambda x, y: x.map(lambda v, *, xp: xp.maximum(v, y)),
+    "returned": lambda x, y: x.map(lambda v: y),
+}
+
+
+@pytest.mark.parametrize("body", CAPTURES.values(), ids=CAPTURES)
+@pytest.mark.parametrize("held", [False, True])
+def test_a_captured_stream_is_to_be_passed_as_a_port(body, held):
+    with pytest.raises(DeclarationError, match=r"a step sees only what comes through its ports") as caught:
+        build(lambda x, y: body(x, latest(y, init=0.0, name="y_held") if held else y))
+    assert "pass it as a port: apply(f, a, b)" in str(caught.value)
+    assert "y" in str(caught.value.path)

@@ -17,7 +17,10 @@ from hypothesis import strategies as st
 
 from flowgraph import (
     Array,
+    ClockError,
     DataError,
+    DeclarationError,
+    Flight,
     FlowgraphError,
     Pipeline,
     PipelineError,
@@ -25,7 +28,9 @@ from flowgraph import (
     Series,
     Signal,
     Stream,
+    TypeMismatchError,
     UnknownNameError,
+    aperiodic,
     block,
     delay,
     every,
@@ -33,11 +38,13 @@ from flowgraph import (
     latest,
     lower,
     match,
+    periodic,
     real,
     simulate,
 )
+from flowgraph.ops import OPS, Spec
 from flowgraph.pipeline import FORMAT, VERSION, schema
-from tests.support import flat_state, isolated, scalars
+from tests.support import flat_state, isolated, pairs, same, scalars
 
 
 class Fix(Signal):
@@ -132,6 +139,31 @@ def instruction(op: str, /, **fields: Any) -> Callable[[Any], None]:
     return lambda data: stage_with(data, op).update(fields)
 
 
+def timing(**parts: Any) -> Any:
+    return {"period": None, "phase": None, "jitter": None, "max_rate": None, **parts}
+
+
+def use(data: Any, op: str, dtype: str) -> None:
+    """Give an instruction a first argument of another kind and the same shape, as one of its own values."""
+    i = stage_with(data, op)
+    shape = next(v["shape"] for v in values(data) if v["value"] == i["args"][0])
+    size = int(np.prod(shape))
+    number = [0.0] * size if dtype == "real" else [0] * size
+    data["constants"].append({"value": 10**6, "shape": shape, "dtype": dtype, "data": number})
+    i["args"][0] = 10**6
+
+
+def values(data: Any) -> list[Any]:
+    found = [*data["constants"], *(leaf for p in data["inputs"] for leaf in p["leaves"])]
+    found += [{**c, "value": c["read"]} for r in data["registers"] for c in r["cells"]]
+    found += [{"value": p["present"], "shape": []} for p in data["inputs"]]
+    return found + [i for s in data["stages"] for i in s["instructions"]]
+
+
+def swap_condition(data: Any) -> None:
+    use(data, "where", "int32")
+
+
 TAMPERED = [
     ("version", change("version", to=VERSION + 1), ["known version", f"version {VERSION}"]),
     ("format", change("format", to="other"), ["known version"]),
@@ -154,6 +186,64 @@ TAMPERED = [
     ("write of nowhere", change("registers", 0, "cells", 0, "write", to=10**6), ["never assigned"]),
     ("constant of another size", change("constants", 0, "shape", to=[77]), ["pipeline"]),
     ("no object at all", lambda data: data.clear(), ["known version"]),
+    ("input without timing", change("inputs", 0, "timing", to=None), ["schema", "inputs/0/timing"]),
+    (
+        "output with timing",
+        change("outputs", 0, "timing", to=timing(period=3, jitter=0)),
+        ["outputs/0/timing"],
+    ),
+    ("period of nothing", change("inputs", 0, "timing", "period", to=0), ["inputs/0/timing/period"]),
+    (
+        "phase alone",
+        change("inputs", 0, "timing", to=timing(phase=3)),
+        ["input fix", "timing", "below the period"],
+    ),
+    ("late phase", change("inputs", 0, "timing", to=timing(period=3, phase=3, jitter=0)), ["input fix"]),
+    ("periodic, no jitter", change("inputs", 0, "timing", to=timing(period=3)), ["input fix", "a jitter"]),
+    ("tiny rate", change("inputs", 0, "timing", to=timing(max_rate=1e-320)), ["input fix", "finite rate"]),
+    (
+        "more arguments",
+        lambda d: stage_with(d, "isfinite")["args"].append(0),
+        ["too few or too many", "isfinite of 1"],
+    ),
+    ("fewer arguments", lambda d: stage_with(d, "add")["args"].pop(), ["too few or too many", "add of 2"]),
+    (
+        "nothing to stack",
+        instruction("isfinite", op="concat", args=[], attrs={"axis": 0}),
+        ["too few or too many", "concat of one or more"],
+    ),
+    ("attribute that only runs read", instruction("add", attrs={"axis": 9}), ["cannot be run", "stage"]),
+    ("condition that is none", swap_condition, ["arguments are of another kind", "where of a bool"]),
+    (
+        "real as truth",
+        lambda d: use(d, "logical_and", "real"),
+        ["arguments are of another kind", "kind: bool"],
+    ),
+    ("mixed numbers", lambda d: use(d, "matmul", "int32"), ["arguments are of another kind", "kind: same"]),
+    ("read of nowhere", change("stages", 0, "reads", to=["memory"]), ["names a register", "belief"]),
+    (
+        "write to nowhere",
+        change("stages", 0, "writes", to=["memory"]),
+        ["names a register", "memory"],
+    ),
+    ("inputs of one name", change("inputs", 1, "name", to="fix"), ["used twice", "inputs", "fix"]),
+    ("outputs of one name", change("outputs", 1, "name", to="belief"), ["used twice", "outputs"]),
+    ("registers of one name", change("registers", 1, "path", to="belief"), ["used twice", "registers"]),
+    ("leaves of one name", change("inputs", 0, "leaves", 1, "name", to="place"), ["used twice", "input fix"]),
+    ("leaf inside a leaf", change("inputs", 0, "leaves", 1, "name", to="place.x"), ["make no value"]),
+    (
+        "constants of one number",
+        lambda d: d["constants"].append(d["constants"][0]),
+        ["used twice", "constants"],
+    ),
+    (
+        "number that is a text",
+        change("registers", 0, "cells", 0, "reset", to=["x", 1.0]),
+        ["cell value", "real of"],
+    ),
+    ("fault in a real", change("faults", 0, "cell", to="a.items.1.place"), ["kept nowhere", "one int64"]),
+    ("totals", change("totals", "operations", to=1), ["the totals are not those", "at totals"]),
+    ("latency", change("latency", "fix", to=10**6), ["the latency are not those", "at latency"]),
 ]
 
 
@@ -167,6 +257,36 @@ def test_tampered_descriptions_are_refused_with_their_place(edit, words):
         assert word in str(error.value)
 
 
+def test_each_operation_takes_as_many_arguments_as_its_rule():
+    counts = {name: op.count for name, op in OPS.items()}
+    assert [n for n, k in counts.items() if k is None] == ["concat", "stack"]
+    assert {n for n, k in counts.items() if k == 3} == {"where"}
+    one, two = Spec((), "real"), Spec((), "real")
+    for name in ("sqrt", "abs", "floor", "isnan", "reshape", "astype", "sum"):
+        assert counts[name] == 1, name
+    for name in ("add", "hypot", "matmul", "searchsorted", "take", "logical_or", "bitwise_left_shift"):
+        assert counts[name] == 2, name
+    assert OPS["add"].rule(one, two) == one
+
+
+def test_the_timing_of_inputs_is_in_the_description():
+    declared = periodic("10ms", phase="1ms", jitter="20us")
+    data = lower(tracker.build(fix=declared, beat=aperiodic(max_rate=50.0))).to_json()
+    assert [p["timing"] for p in data["inputs"]] == [
+        timing(period=10_000_000, phase=1_000_000, jitter=20_000),
+        timing(max_rate=50.0),
+    ]
+    assert all(p["timing"] is None for p in data["outputs"])
+    again = Pipeline.from_json(json.loads(json.dumps(data)))
+    assert again.inputs[0].timing == declared
+    assert again.to_json() == data
+
+
+def test_the_state_of_a_join_has_a_role_of_its_own():
+    roles = {r.path: r.role for r in PIPELINE.registers}
+    assert {p for p, role in roles.items() if role == "join"} == {"match.state", "every.state"}
+
+
 def nodes(data: Any) -> list[tuple[Any, Any]]:
     keys = list(data) if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else []
     return [(data, k) for k in keys] + [n for k in keys for n in nodes(data[k])]
@@ -177,16 +297,18 @@ JUNK = st.sampled_from(
 )
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_any_change_of_a_description_is_refused_in_order_or_harmless(data):
-    """No change of a file makes reading it fail with anything but an error of this package."""
+    """No change of a file makes reading or playing it fail with anything but an error of this package."""
     description = fresh()
     places = nodes(description)
     holder, key = places[data.draw(st.integers(0, len(places) - 1))]
     holder[key] = data.draw(JUNK)
     with contextlib.suppress(FlowgraphError):
-        Pipeline.from_json(description)
+        changed = Pipeline.from_json(description)
+        changed.run(flight())
+        changed.listing()
 
 
 @pytest.mark.parametrize("data", [None, [], 3, "text", {"format": FORMAT}])
@@ -264,11 +386,73 @@ def test_a_run_resumes_from_its_state():
         ({**flight(), "beat": (np.array([0]), np.array([np.nan]))}, {}, DataError, "beat, row 0.*not finite"),
         (flight(), {"state": {"registers": {}, "sources": {}, "seed": 0}}, DataError, "of another pipeline"),
         ({**flight(), "beat": (np.array([0.5]), np.zeros(1))}, {}, DataError, "integer nanoseconds"),
+        ([flight()], {}, DataError, "these inputs have no names"),
+        ({**flight(), "beat": 3}, {}, DataError, "holds no events"),
+        ({**flight(), "beat": "text"}, {}, DataError, "an event is not a pair"),
+        ({**flight(), "beat": [(0, {"x": 1.0})]}, {}, DataError, "input 'beat' has other fields"),
+        ({**flight(), "beat": [(0, np.zeros(2))]}, {}, TypeMismatchError, "the shape"),
+        ({**flight(), "beat": (np.array([0]), np.array([True]))}, {}, TypeMismatchError, "the dtype"),
+        ({**flight(), "beat": (np.array([0]), np.zeros((1, 2)))}, {}, TypeMismatchError, "the shape"),
+        (flight(), {"state": {}}, DataError, "tracker: state: this is no state"),
+        (flight(), {"state": None, "init": {"match.state": 0}}, DeclarationError, "cannot be set"),
+        (flight(), {"init": {"belief": {"mean": 0.0}}}, DataError, "the value of 'belief' has other fields"),
+        (flight(), {"init": {}, "state": {}}, DeclarationError, "from initial values or from a state"),
     ],
 )
 def test_runs_of_a_pipeline_refuse(inputs, options, error, words):
     with pytest.raises(error, match=words):
         PIPELINE.run(inputs, **options)
+
+
+TIMED = tracker.build(fix=periodic(10, phase=0), beat=aperiodic(max_rate=1e8))
+TIMED_PIPELINE = Pipeline.from_json(json.loads(json.dumps(lower(TIMED).to_json())))
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        ({"fix": [0, 10, 21]}, "declared period"),
+        ({"fix": [3, 13]}, "declared phase"),
+        ({"beat": [0, 5]}, "highest rate"),
+        ({"fix": [10, 10]}, "two events at one time"),
+        ({"fix": [10, 0]}, "time goes backwards"),
+    ],
+)
+def test_stamps_are_checked_as_in_simulate(times, words):
+    data = flight()
+    for name, stamps in times.items():
+        data[name] = Series(stamps, data[name][: len(stamps)].values, name=name)
+    errors = []
+    for run in (TIMED_PIPELINE.run, lambda inputs: simulate(TIMED, inputs)):
+        with pytest.raises((ClockError, DataError), match=words) as error:
+            run(data)
+        errors.append(str(error.value))
+    assert errors[0] == errors[1]
+
+
+def test_stamps_after_a_state_are_checked_from_its_last_times():
+    data = flight()
+    state = TIMED_PIPELINE.run({n: s[s.time < 45] for n, s in data.items()}).state
+    late = {n: s[s.time >= 45] for n, s in data.items()}
+    assert TIMED_PIPELINE.run(late, state=state).ticks > 0
+    for wrong, words in ((late["fix"][1:], "declared period"), (data["fix"], "after 43 ns|after 40 ns")):
+        with pytest.raises((ClockError, DataError), match=words):
+            TIMED_PIPELINE.run({**late, "fix": wrong}, state=state)
+
+
+def test_inputs_come_in_all_the_forms_that_simulate_takes():
+    data = flight()
+    fix, beat = data["fix"], data["beat"]
+    expected = PIPELINE.run(data)
+    events = list(zip(fix.time.tolist(), fix, strict=True))
+    for inputs in (
+        Flight("one", {**data, "gps": beat}),
+        {"fix": iter(events), "beat": iter(pairs(beat))},
+        {"fix": [(t, {"weight": v.weight, "place": v.place}) for t, v in events], "beat": pairs(beat)},
+        {"fix": (fix.time, fix.values), "beat": (beat.time, beat.values)},
+        {"fix": (fix.time, {"weight": fix.weight, "place": fix.place}), "beat": beat},
+    ):
+        same(expected, PIPELINE.run(inputs))
 
 
 RUNNER = """

@@ -584,7 +584,8 @@ def test_a_failed_push_leaves_no_trace_and_may_be_repeated():
     assert int(run.state["sources"]["a"]) == int(run.state["sources"]["b"]) == run.time
     run.push(10, a=0.5, b=3.0)
     assert run.result()["b"].value.tolist() == [3.0]
-    for time, values in ((1.5, {"a": 1.0}), ("x", {"a": 1.0}), (20, {})):
+    refused: list[tuple[Any, dict[str, float]]] = [(1.5, {"a": 1.0}), ("x", {"a": 1.0}), (20, {})]
+    for time, values in refused:
         with pytest.raises(DataError):
             run.push(time, **values)
     with pytest.raises(TypeMismatchError):

@@ -25,7 +25,7 @@ from flowgraph import Flight, Series
 from flowgraph.blocks.flights.tables import POLICIES, nanoseconds, read_table
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
 __all__ = ["LEICA_LEVER", "SETTINGS", "load"]
 
@@ -40,6 +40,11 @@ SETTINGS: Mapping[str, str] = {
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
 }
 """The settings of `load` and what they mean. An offset is rounded to nanoseconds once."""
+
+MOST_OFFSET = 1_000_000
+"""The largest time offset in s, 11 days: clocks of one recording are not farther apart."""
+
+_RATES = (1e-3, 1e6)  # Hz
 
 _NOISE = {
     "gyro": "gyroscope_noise_density",
@@ -64,8 +69,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         `vicon_lever` (m, body) and `vicon_mount` (quaternion, sensor to body).
 
     Raises:
-        DataError: a folder or file is missing, or a row is malformed (file, line), or out of order, or a
-            setting is not usable.
+        DataError: a folder or file is missing, a row is malformed (file, line) or out of order, or no aiding
+            sample is left within the IMU's span.
+        DeclarationError: for a setting that is not usable.
         UnknownNameError: for a setting or policy that is not there; lists the valid ones.
     """
     offsets, policy = _settings(settings or {})
@@ -77,17 +83,35 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         notes.extend(said)
         if offsets[name]:
             notes.append(f"{name}: stamps shifted by {offsets[name]} ns")
+            reach = 2**63 - 1 - MOST_OFFSET * 10**9
+            if not -reach <= time[0] <= time[-1] <= reach:
+                raise DataError(
+                    "shifted stamps do not fit 64 bits",
+                    path=str(file),
+                    expected=f"stamps between {-reach} and {reach} ns",
+                    got=f"{time[0]} to {time[-1]} ns, shifted by {offsets[name]} ns",
+                    fix=f"leave {name}.time_offset out, and mend the stamps",
+                )
         return time + offsets[name], numbers
 
     info: dict[str, Any] = {}
     time, u = table("imu", _need(mav / "imu0" / "data.csv", "the IMU's data"), 6)
     streams = {"imu": Series(time, Imu(gyro=u[:, :3], specific_force=u[:, 3:]), name="imu")}
     info["imu_noise"], info["imu_period_ns"] = _imu_info(mav / "imu0" / "sensor.yaml")
-    first = time[0]
+    first, last = time[0], time[-1]
 
     def aid(name: str, stamps: np.ndarray, values: Any) -> None:
         series = Series(stamps, values, name=name)
         kept = series[stamps >= first]
+        if not len(kept) or kept.time[0] > last:
+            raise DataError(
+                f"no sample of {name} lies within the span of the imu",
+                path=f"{mav}: {name}",
+                expected=f"stamps from {first} to {last} ns",
+                got=f"{stamps[0]} to {stamps[-1]} ns, with {name}.time_offset={offsets[name] / 1e9:g}"
+                f" and imu.time_offset={offsets['imu'] / 1e9:g}",
+                fix=f"check {name}.time_offset and imu.time_offset, which are in seconds",
+            )
         early = len(series) - len(kept)
         if early:
             notes.append(f"{name}: {early} samples from before the first imu sample left out")
@@ -139,11 +163,13 @@ def _settings(given: Mapping[str, str | float]) -> tuple[dict[str, int], str]:
             continue
         try:
             offsets[name.split(".")[0]] = nanoseconds(str(value))
+            if abs(offsets[name.split(".")[0]]) > MOST_OFFSET * 10**9:
+                raise ValueError
         except ValueError:
-            raise DataError(
+            raise DeclarationError(
                 f"setting {name!r} is not usable",
                 path="euroc",
-                expected="a number of seconds",
+                expected=f"a number of seconds, at most {MOST_OFFSET} either way",
                 got=repr(value),
                 fix=f"for example {name}=-0.135",
             ) from None
@@ -181,9 +207,23 @@ def _need(file: Path, what: str) -> Path:
     return file
 
 
+class _Loader(yaml.SafeLoader):
+    """The safe loader, which takes OpenCV's matrices for the mappings that they are."""
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
 def _yaml(file: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        text = file.read_text(encoding="utf-8-sig")
+        if text.startswith("%YAML:"):  # as OpenCV writes it; YAML itself has a space there
+            text = text.partition("\n")[2]
+        content = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DataError(
             "this is not readable as YAML",
@@ -206,7 +246,7 @@ def _yaml(file: Path) -> dict[str, Any]:
 def _number(content: Mapping[str, Any], name: str, file: Path) -> float:
     value = content.get(name)
     try:
-        number = float(value)  # type: ignore[arg-type]  # YAML 1.1 reads 1e-4 as a string
+        number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]  # YAML 1.1 reads 1e-4 as a string
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number) or number <= 0.0:
@@ -223,7 +263,16 @@ def _number(content: Mapping[str, Any], name: str, file: Path) -> float:
 def _imu_info(file: Path) -> tuple[ImuNoise, int]:
     content = _yaml(_need(file, "the IMU's noise densities"))
     noise = ImuNoise(**{ours: _number(content, theirs, file) for ours, theirs in _NOISE.items()})
-    return noise, round(1e9 / _number(content, "rate_hz", file))
+    rate = _number(content, "rate_hz", file)
+    if not _RATES[0] <= rate <= _RATES[1]:
+        raise DataError(
+            "'rate_hz' is no rate of an IMU",
+            path=str(file),
+            expected=f"from {_RATES[0]:g} to {_RATES[1]:g} Hz",
+            got=f"{rate:g}",
+            fix="restore the file of the sequence",
+        )
+    return noise, round(1e9 / rate)
 
 
 def _extrinsics(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]] | None:

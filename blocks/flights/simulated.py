@@ -23,7 +23,7 @@ from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
 from flowgraph.blocks.world import generator
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 
 __all__ = ["DEFAULTS", "SETTINGS", "load", "trajectory"]
 
@@ -65,7 +65,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
 
     Raises:
         UnknownNameError: for another shape or an unknown setting.
-        DataError: for a setting that is not a number in its range.
+        DeclarationError: for a setting that is not a number in its range.
     """
     if argument in worlds.WORLDS:
         return worlds.load_world(argument, seed=seed, settings=settings)
@@ -221,7 +221,7 @@ def _settings(given: Mapping[str, str | float]) -> dict[str, float]:
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number) or number < 0.0 or (positive and number == 0.0):
-            raise DataError(
+            raise DeclarationError(
                 f"setting {name!r} is not usable",
                 path="sim",
                 expected="a positive number" if positive else "a number that is not negative",
@@ -229,4 +229,5 @@ def _settings(given: Mapping[str, str | float]) -> dict[str, float]:
                 fix=f"for example {name}={DEFAULTS[name]:g}",
             )
         known[name] = number
+    worlds.check_samples(known, ("imu.rate", "vicon.rate"), "sim")
     return known

@@ -25,12 +25,15 @@ def nanoseconds(seconds: str) -> int:
     """Decimal seconds as an integer of nanoseconds, rounded once and never through a float.
 
     Raises:
-        ValueError: when the text is not a finite number.
+        ValueError: when the text is not a finite number, or beyond 64 bits.
     """
     try:
-        return int((Decimal(seconds) * 1_000_000_000).to_integral_value())
+        number = Decimal(seconds)
+        if "_" in seconds or not -9_223_372_036 < number < 9_223_372_036:
+            raise ValueError
+        return int((number * 1_000_000_000).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"not a finite number: {seconds!r}") from error
+        raise ValueError(f"not a finite number below 9.2e9: {seconds!r}") from error
 
 
 def read_table(
@@ -59,7 +62,7 @@ def read_table(
     Raises:
         DataError: the file has no rows, or a row is malformed or out of order; names the file and the line.
     """
-    text = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()  # some editors write a mark
     lines = [i for i, line in enumerate(text) if line and not line.isspace() and line[0] != "#"]
     rows = [text[i] for i in lines]
     if not rows:
@@ -80,7 +83,13 @@ def read_table(
         x = np.ascontiguousarray(table["x"])
     except (ValueError, OverflowError, Warning) as error:
         _blame(file, text, lines, columns, delimiter, seconds)
-        raise DataError("this is not a table of numbers", path=str(file), got=str(error)) from error
+        raise DataError(
+            "this is not a table of numbers",
+            path=f"{file}, lines {lines[0] + 1} to {lines[-1] + 1}",
+            expected=f"rows of a stamp and {columns} numbers",
+            got=str(error),
+            fix="mend or delete the row",
+        ) from error
     if not np.isfinite(x).all():
         _blame(file, text, lines, columns, delimiter, seconds)
     if quaternion is not None:
@@ -141,7 +150,8 @@ def _blame(
                 fix="mend or delete the row",
             )
         try:
-            if not -(2**63) <= (nanoseconds(cells[0]) if seconds else int(cells[0])) < 2**63:
+            stamp = nanoseconds(cells[0]) if seconds else int(cells[0])
+            if "_" in cells[0] or not -(2**63) <= stamp < 2**63:
                 raise ValueError
         except ValueError:
             raise DataError(
@@ -153,7 +163,7 @@ def _blame(
             ) from None
         for column, cell in enumerate(cells[1:], start=2):
             try:
-                finite = bool(np.isfinite(float(cell)))
+                finite = "_" not in cell and bool(np.isfinite(float(cell)))
             except ValueError:
                 finite = False
             if not finite:

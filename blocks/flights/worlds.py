@@ -10,7 +10,7 @@ motion capture at 4 Hz; no biases, no latency.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,12 @@ from flowgraph import Flight, Series
 from flowgraph.blocks import sensors as s
 from flowgraph.blocks.signals import NavigationState
 from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["SENSORS", "SETTINGS", "WORLDS", "load_world"]
+__all__ = ["MOST_SAMPLES", "SENSORS", "SETTINGS", "WORLDS", "check_samples", "load_world"]
+
+MOST_SAMPLES = 10_000_000
+"""The most samples of one simulated sensor: 14 hours at 200 Hz."""
 
 _CLOCK = {"phase": 0.0, "latency": 0.0, "jitter": 0.0}
 _DRIFT = {"bias": 0.0, "walk": 0.0}
@@ -93,7 +96,7 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
 
     Raises:
         UnknownNameError: for a setting, sensor or world that is not there.
-        DataError: for a setting out of its range, or of a sensor that the flight does not have.
+        DeclarationError: for a setting out of its range, or of a sensor that the flight does not have.
     """
     if kind not in WORLDS:
         raise UnknownNameError("simulated world", kind, WORLDS, path="sim")
@@ -101,6 +104,7 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
     given = dict(settings or {})
     chosen = _chosen(str(given.pop("sensors", SETTINGS["sensors"])), path)
     numbers = _numbers(kind, chosen, given, path)
+    check_samples(numbers, [f"{name}.rate" for name in chosen], path)
     world, still = _world(kind, numbers, seed, path)
     end = round(numbers["duration"] * 1e9)
 
@@ -133,6 +137,19 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
     return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, (note,))
 
 
+def check_samples(numbers: Numbers, rates: Iterable[str], path: str) -> None:
+    """Refuse a flight with more samples of a sensor than memory holds, or faster than nanoseconds tell."""
+    for rate in rates:
+        if numbers[rate] > 1e9 or numbers["duration"] * max(numbers[rate], 1e-3) > MOST_SAMPLES:
+            raise DeclarationError(
+                "this simulated flight is too large",
+                path=path,
+                expected=f"{rate} at most 1e9 Hz, and at most {MOST_SAMPLES:,} samples in the whole duration",
+                got=f"duration={numbers['duration']:g}, {rate}={numbers[rate]:g}",
+                fix="choose a shorter duration or a lower rate",
+            )
+
+
 def _world(kind: str, n: Numbers, seed: int, path: str) -> tuple[World, float]:
     """The world, and for how many seconds the body is at rest at first."""
     if kind == "roundtrip":
@@ -143,7 +160,7 @@ def _world(kind: str, n: Numbers, seed: int, path: str) -> tuple[World, float]:
         return Hover(n["duration"], drift=n["drift"], seed=seed), n["duration"] if at_rest else 0.0
     flight = thesis_flight(seed, limits=Limits(n["least_thrust"], n["most_thrust"], n["most_rate"]))
     if n["duration"] > flight.duration:
-        raise DataError(
+        raise DeclarationError(
             "the thesis's flights are shorter",
             path=path,
             expected=f"duration at most {flight.duration:g} s",
@@ -228,7 +245,7 @@ def _chosen(text: str, path: str) -> list[str]:
         if name not in SENSORS:
             raise UnknownNameError("sensor", name, [*SENSORS, "all"], path=path)
     if not names:
-        raise DataError(
+        raise DeclarationError(
             "a flight needs a sensor",
             path=path,
             expected="sensors: names with commas between, of " + ", ".join(SENSORS),
@@ -247,7 +264,7 @@ def _numbers(kind: str, chosen: list[str], given: Mapping[str, str | float], pat
             raise UnknownNameError("setting", name, ["sensors", *known], path=path)
         sensor, dot, part = name.rpartition(".")
         if dot and sensor not in used:
-            raise DataError(
+            raise DeclarationError(
                 f"setting {name!r} is of a sensor that this flight does not have",
                 path=path,
                 expected="settings of " + ", ".join(used),
@@ -266,7 +283,7 @@ def _number(name: str, part: str, text: str | float, otherwise: float, path: str
     least = -math.inf if part in _SIGNED else 0.0
     if not math.isfinite(number) or number < least or (part in _POSITIVE and number == 0.0):
         kind = "a positive number" if part in _POSITIVE else "a number that is not negative"
-        raise DataError(
+        raise DeclarationError(
             f"setting {name!r} is not usable",
             path=path,
             expected="a number" if part in _SIGNED else kind,

@@ -10,7 +10,7 @@ import pytest
 from flowgraph import Flight, Series
 from flowgraph.blocks.flights import euroc
 from flowgraph.blocks.flights.tables import nanoseconds
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
 START = 1403636579758560001  # odd in its last digit: a float64 would lose it
 IMU_ROWS = [f"{START + 5_000_000 * k},0.1,0.2,0.3,9.81,{k},0" for k in range(5)]
@@ -123,8 +123,8 @@ def test_time_offsets_are_rounded_once_and_exact(folder, value):
 
 
 def test_offsets_of_each_sensor_move_only_that_sensor(folder):
-    flight = euroc.load(str(folder), settings={"imu.time_offset": "-1", "truth.time_offset": "2"})
-    assert flight.streams["imu"].time[0] == START - 1_000_000_000
+    flight = euroc.load(str(folder), settings={"imu.time_offset": "-0.015", "truth.time_offset": "2"})
+    assert flight.streams["imu"].time[0] == START - 15_000_000
     assert len(flight.streams["leica"]) == 3
     assert truth_of(flight).time[0] == START + 2_000_000_000
 
@@ -143,7 +143,8 @@ def test_unknown_settings_list_the_valid_ones(folder):
         euroc.load(str(folder), settings={"leica.offset": 1})
     with pytest.raises(UnknownNameError, match="drop, raise, sort"):
         euroc.load(str(folder), settings={"bad_time": "ignore"})
-    refused(folder, "'imu.time_offset' is not usable", "number of seconds", **{"imu.time_offset": "late"})
+    with pytest.raises(DeclarationError, match=r"'imu.time_offset' is not usable[\s\S]*number of seconds"):
+        euroc.load(str(folder), settings={"imu.time_offset": "late"})
 
 
 def test_missing_folders_and_files_are_named(folder, tmp_path):
@@ -233,3 +234,77 @@ def test_bad_times_can_be_sorted(folder):
     assert (flight.streams["imu"].time - START).tolist() == [0, 5, 10, 20]
     assert flight.streams["imu"].gyro[:, 0].tolist() == [0, 2, 1, 4]
     assert "imu0/data.csv: sorted, 2 rows were out of order, 1 of equal time left out" in flight.notes
+
+
+# -- offsets, rates and what real files hold -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["1e7", "-1000001", "1e30", "1e999999999", "inf", "nan", "1_0", "abc", ""])
+def test_an_absurd_offset_is_refused(folder, value):
+    with pytest.raises(DeclarationError, match=r"'leica.time_offset' is not usable") as caught:
+        euroc.load(str(folder), settings={"leica.time_offset": value})
+    assert "at most 1000000" in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("leica", "1000"), ("leica", "-1000"), ("imu", "500000")])
+def test_an_offset_that_leaves_no_sample_is_named(folder, name, value):
+    error = refused(folder, f"{name}.time_offset={float(value):g}", **{f"{name}.time_offset": value})
+    assert "no sample of leica lies within the span of the imu" in str(error)
+    assert error.fix == "check leica.time_offset and imu.time_offset, which are in seconds"
+
+
+def test_a_shift_stays_within_64_bits(folder):
+    late = 2**63 - 10
+    (folder / "mav0" / "imu0" / "data.csv").write_text(f"{late - 5},0,0,0,0,0,9\n{late},0,0,0,0,0,9\n")
+    refused(folder, "do not fit 64 bits", "data.csv", **{"imu.time_offset": "1"})
+
+
+@pytest.mark.parametrize("rate", ["1e12", "1e-300", "1e300", "true", "0"])
+def test_an_absurd_rate_is_refused(folder, rate):
+    (folder / "mav0" / "imu0" / "sensor.yaml").write_text(SENSOR.replace("rate_hz: 200", f"rate_hz: {rate}"))
+    refused(folder, "sensor.yaml", "rate_hz", "expected:", "fix:")
+
+
+@pytest.mark.parametrize("file", ["imu0/data.csv", "leica0/data.csv"])
+@pytest.mark.parametrize(("old", "new"), [("14036", "1_4036"), (",2", ",2_0")])
+def test_underscores_are_refused_by_file_and_line(folder, file, old, new):
+    path = folder / "mav0" / file
+    rows = path.read_text().splitlines()
+    rows[2] = rows[2].replace(old, new, 1)
+    path.write_text("\n".join(rows))
+    if new in rows[2]:
+        refused(folder, f"{file}, line 3", "expected:", "got:", "fix:")
+
+
+def test_underscores_in_seconds_are_refused(folder):
+    (folder / "groundtruth.tum").write_text(TUM.replace("1403636579.76 ", "1_403636579.76 "))
+    refused(folder, "groundtruth.tum, line 3", "the stamp is not a time")
+
+
+def test_a_byte_order_mark_is_passed_over(folder):
+    expected = euroc.load(str(folder))
+    for file in folder.rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    flight = euroc.load(str(folder))
+    np.testing.assert_array_equal(flight.streams["imu"].time, expected.streams["imu"].time)
+    assert flight.info["imu_noise"] == expected.info["imu_noise"]
+    (folder / "mav0" / "imu0" / "data.csv").write_text(
+        "\ufeff" + IMU.split("\n", 1)[1], encoding="utf-8"
+    )  # a mark before a stamp, not a comment
+    assert len(euroc.load(str(folder)).streams["imu"]) == 5
+
+
+def test_a_yaml_header_and_matrix_as_opencv_writes_them_are_read(folder):
+    numbers = "[1.0, 0, 0, 0.5, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]"
+    matrix = f"T_BS: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: {numbers}\n"
+    (folder / "mav0" / "leica0" / "sensor.yaml").write_text("%YAML:1.0\n---\n" + matrix)
+    (folder / "mav0" / "imu0" / "sensor.yaml").write_text("%YAML:1.0\n" + SENSOR)
+    flight = euroc.load(str(folder))
+    assert flight.info["leica_lever"] == (0.5, 0.0, 0.0)
+    assert flight.info["imu_period_ns"] == 5_000_000
+
+
+def test_other_yaml_tags_make_nothing(folder):
+    (folder / "mav0" / "imu0" / "sensor.yaml").write_text("!!python/object/apply:os.getcwd []\n")
+    refused(folder, "sensor.yaml", "not readable as YAML")

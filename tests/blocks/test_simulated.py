@@ -10,7 +10,7 @@ from flowgraph.blocks import geometry as g
 from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
 from flowgraph.blocks.flights.worlds import SENSORS
 from flowgraph.blocks.metrics import pose_errors
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -81,7 +81,7 @@ def test_unknown_names_list_the_valid_ones():
 
 @pytest.mark.parametrize("value", ["fast", "nan", "-1", "0", float("inf")])
 def test_bad_settings_are_refused(value):
-    with pytest.raises(DataError, match=r"setting 'imu\.rate' is not usable") as caught:
+    with pytest.raises(DeclarationError, match=r"setting 'imu\.rate' is not usable") as caught:
         load(settings={"imu.rate": value})
     assert "positive number" in str(caught.value)
     assert "imu.rate=200" in str(caught.value)
@@ -174,13 +174,13 @@ def test_worlds_refuse_what_they_do_not_know():
     with pytest.raises(UnknownNameError, match="no setting is called 'drift'"):
         load("thesis", settings={"drift": 1})
     with pytest.raises(
-        DataError, match=r"setting 'gps\.rate' is of a sensor that this flight does not"
+        DeclarationError, match=r"setting 'gps\.rate' is of a sensor that this flight does not"
     ) as bad:
         load("thesis", settings={"gps.rate": 1})
     assert "sensors=imu,vicon,gps" in str(bad.value)
-    with pytest.raises(DataError, match="a flight needs a sensor"):
+    with pytest.raises(DeclarationError, match="a flight needs a sensor"):
         load("thesis", settings={"sensors": " , "})
-    with pytest.raises(DataError, match="the thesis's flights are shorter"):
+    with pytest.raises(DeclarationError, match="the thesis's flights are shorter"):
         load("thesis", settings={"duration": 30})
 
 
@@ -188,6 +188,6 @@ def test_worlds_refuse_what_they_do_not_know():
     ("name", "value"), [("vicon.rate", "0"), ("vicon.noise", "-1"), ("imu.latency", "x")]
 )
 def test_worlds_refuse_bad_numbers(name, value):
-    with pytest.raises(DataError, match=f"setting '{name}' is not usable") as caught:
+    with pytest.raises(DeclarationError, match=f"setting '{name}' is not usable") as caught:
         load("hover", settings={name: value})
     assert f"{name}=" in str(caught.value)
