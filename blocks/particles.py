@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 _SQUARINGS = 5
+_ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
 _SPREAD = StartSpread()
 
 
@@ -117,13 +118,16 @@ def dominant_eigenvector(M: Array, start: Array, *, xp: Any) -> Array:
     """The unit eigenvector (4) of the largest eigenvalue of M (4, 4), symmetric positive, of trace 1.
 
     M^32 start, by five squarings: of the other eigenvectors remains a share of (l_2 / l_1)^32, 1e-20 for
-    attitudes that spread by 0.7 rad. The largest eigenvalue is at least 1/4, so M^32 does not vanish even in
-    float32. Where all directions are alike, as for a heading of which nothing is known, the result is near
-    `start`.
+    attitudes that spread by 0.7 rad. Where all directions are alike, as for a heading of which nothing is
+    known, the result is near `start`; where `start` is orthogonal to the answer, the largest column of M^32
+    stands in for it.
     """
     for _ in range(_SQUARINGS):
         M = M @ M
+    parts = xp.sum(M * xp.eye(4, dtype=M.dtype), axis=0)
+    M = M / xp.sum(parts)  # the largest eigenvalue is at least 1/4, so this is no division by zero
     q = M @ start
+    q = xp.where(q @ q > _ALONG, q, xp.take(M, xp.argmax(parts), axis=1))
     return q / xp.sqrt(q @ q)
 
 

@@ -46,6 +46,7 @@ class Builder:
         self._taken: set[str] = set()
         self._stamps: dict[Clock, int] = {}
         self._draws: dict[str, str] = {}
+        self._sites: dict[int, str] = {}
 
     def path(self, name: str, *, given: bool = False) -> str:
         """A unique path in the current scope; a name that the user gave must be free."""
@@ -138,6 +139,18 @@ class Builder:
             )
         self._draws[prefix] = path
         return prefix
+
+    def random_site(self, name: str, number: int, path: str) -> None:
+        """Refuse a second name that the same 32-bit number stands for: both would draw the same."""
+        known = self._sites.setdefault(number, name)
+        if known != name:
+            raise DeclarationError(
+                f"the random stream {name!r} would draw the numbers of {known!r}",
+                path=path,
+                expected="names that differ in their hash",
+                got=f"{number:#010x} for both",
+                fix="give one of them another name",
+            )
 
     def feed(self, held: Held[Any], stream: Stream[Any]) -> None:
         node = self.nodes[held.register]

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from flowgraph.xla import Chunk
 
 _TICKS_AT_ONCE = 512
+_CHUNK_BYTES = 64 * 2**20
 RUNS_AT_ONCE = 64
 
 
@@ -143,6 +144,16 @@ def simulate_many(
         )
     for seed in seeds:
         seed_words(seed)
+    if isinstance(runs_at_once, bool) or not isinstance(runs_at_once, int) or runs_at_once < 1:
+        raise DeclarationError(
+            "runs go in chunks of a positive size",
+            path=f"{graph.name}, runs_at_once",
+            expected="a whole number from 1",
+            got=repr(runs_at_once),
+            fix=f"leave it out for {RUNS_AT_ONCE}",
+        )
+    if dtype not in ("float64", "float32"):
+        raise UnknownNameError("dtype", dtype, ("float64", "float32"))
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress)
     return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress)
@@ -174,6 +185,8 @@ def _one_by_one(
 ) -> Batch:  # fmt: skip
     from flowgraph.simulate import simulate
 
+    if not callable(inputs):  # an iterable can be read only once
+        inputs = dict(zip(graph.sources, tape(prepare(graph, inputs), graph).series, strict=True))
     parts: dict[str, list[Series]] = {name: [] for name in kept}
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
@@ -207,36 +220,42 @@ def _vectorised(
     graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
     kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None,
 ) -> Batch:  # fmt: skip
-    from flowgraph.xla import Scan, import_jax
+    from flowgraph.xla import Scan, bytes_per_tick, import_jax
 
     import_jax()
     real = np.dtype(dtype)
     pipeline = _pruned(lower(graph), kept)
     shared = not callable(inputs)
     first = tape(prepare(graph, inputs if shared else inputs(seeds[0])), graph)
+    if not len(first.time):  # nothing to compile for
+        nothing = _one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress)
+        return replace(nothing, engine="xla")
     keys = tuple(int(k) for k in np.unique(first.key))
-    scan = Scan(
-        pipeline, keys, real, min(_TICKS_AT_ONCE, max(len(first.time), 1)), runs=runs_at_once, shared=shared
-    )
+    per_tick = runs_at_once * bytes_per_tick(pipeline)
+    ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
+    scan = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared)
     dense_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []
     wall = 0.0
     for n, members in enumerate(_chunks(seeds, runs_at_once)):
         columns = dense_first if shared else _columns(_tapes(graph, inputs, members, first), False, real)
-        cells = _cells(graph, init, members)
+        last = cells = _cells(graph, init, members)
         words = np.stack([seed_words(s) for s in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
-        played = list(scan(cells, words, first.time, first.key, columns))
+        parts = []
+        for part, after in scan(cells, words, first.time, first.key, columns):
+            parts.append(_without_absent(part))
+            last = after
         wall += perf_counter() - start
-        chunks.append([part for part, _ in played])
+        chunks.append(parts)
         done = min((n + 1) * runs_at_once, len(seeds))
         for row in range(done - n * runs_at_once):
-            check_faults(pipeline, [cell[row] for cell in played[-1][1]])
+            check_faults(pipeline, [cell[row] for cell in last])
         if progress is not None:
             progress.update(done, 0)
     series = {
-        port.name: _collected(port, k, first.time, chunks, len(seeds), runs_at_once)
+        port.name: _collected(port, k, first.time, chunks, len(seeds))
         for k, port in enumerate(pipeline.outputs)
     }
     return Batch(graph.name, "xla", seeds, series, len(first.time), wall)
@@ -301,23 +320,32 @@ def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray
     return [[np.stack(leaves) for leaves in zip(*ports, strict=True)] for ports in zip(*made, strict=True)]
 
 
-def _collected(
-    port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], runs: int, runs_at_once: int
-) -> Runs:
+def _without_absent(part: Chunk) -> Chunk:
+    """The chunk without the ticks at which an output is known to be absent in all runs."""
+    outputs = [
+        (mask, leaves if mask.ndim > 1 or mask.all() else [leaf[:, mask] for leaf in leaves])
+        for mask, leaves in part.outputs
+    ]
+    return replace(part, outputs=outputs)
+
+
+def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], runs: int) -> Runs:
     """One output of all runs, at the ticks in which it is present in any."""
 
     def joined(pick: Callable[[Chunk], np.ndarray]) -> np.ndarray:
         rows = [np.concatenate([pick(part) for part in parts], axis=1) for parts in chunks]
         return np.concatenate(rows)[:runs]
 
-    def mask(part: Chunk) -> np.ndarray:
-        found = part.outputs[k][0]
-        return np.broadcast_to(found, (runs_at_once, part.ticks))
-
-    present = joined(mask)
-    some = present.any(axis=0)
+    masks = [part.outputs[k][0] for part in chunks[0]]
+    if all(mask.ndim == 1 for mask in masks):  # the same in all runs, and already left out where absent
+        some: np.ndarray = np.concatenate(masks)
+        present = np.ones((runs, int(some.sum())), dtype=bool)
+        leaves = {leaf.name: joined(lambda p, n=n: p.outputs[k][1][n]) for n, leaf in enumerate(port.leaves)}  # type: ignore[misc]
+        return Runs(port.name, time[some], present, leaves)
+    present = joined(lambda part: part.outputs[k][0])
+    some = np.asarray(present.any(axis=0))
     leaves = {
-        leaf.name: joined(lambda part, n=n: part.outputs[k][1][n])[:, some]  # type: ignore[misc]
+        leaf.name: joined(lambda p, n=n: p.outputs[k][1][n])[:, some]  # type: ignore[misc]
         for n, leaf in enumerate(port.leaves)
     }
     return Runs(port.name, time[some], present[:, some], leaves)

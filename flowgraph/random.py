@@ -148,7 +148,7 @@ def site(prefix: str, kind: str, name: str, shape: Any) -> Site:
             got=f"{prefix!r}, {name!r}",
             fix="use . or _ within a name",
         )
-    if not isinstance(shape, tuple) or not all(isinstance(n, int) for n in shape):
+    if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
         raise DeclarationError(
             "a draw needs a fixed shape",
             path=f"{prefix}/{name}",

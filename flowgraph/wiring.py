@@ -47,6 +47,10 @@ def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) 
     if "draw" in block.handed:
         draws = build.random_streams(draws or block.name, path)
     variants = _variants(block, path, clocked, given, firing, settings, state_type, draws or "")
+    for variant in variants.values():
+        if isinstance(variant, StepTrace):
+            for site, _ in variant.sites:
+                build.random_site(site.name, site.hash, path)
     outputs, dynamic = _outputs(block, path, firing, clocked, variants, types, settings)
     stamp = build.stamp(firing) if "dt" in block.handed else None
     index = build.add(

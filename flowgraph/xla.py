@@ -258,12 +258,15 @@ def _known_presence(programs: list[Program], k: int) -> np.ndarray | None:
     return np.array(facts, dtype=bool)
 
 
+def bytes_per_tick(pipeline: Pipeline) -> int:
+    """What the inputs and outputs of one tick take, at 8 bytes a number."""
+    ports = (*pipeline.outputs, *pipeline.inputs)
+    return sum(math.prod(leaf.shape) * 8 for port in ports for leaf in port.leaves)
+
+
 def chunk_size(pipeline: Pipeline, ticks: int) -> int:
     """A power of two that holds all ticks, or as many as keep the outputs of a chunk in bounds."""
-    per_tick = sum(
-        math.prod(leaf.shape) * 8 for port in (*pipeline.outputs, *pipeline.inputs) for leaf in port.leaves
-    )
-    most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(per_tick, 1)))
+    most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(bytes_per_tick(pipeline), 1)))
     return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
 
 

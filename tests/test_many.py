@@ -7,6 +7,7 @@ import pytest
 
 from flowgraph import (
     DataError,
+    DeclarationError,
     Scalar,
     Series,
     Stream,
@@ -82,3 +83,29 @@ def test_only_what_is_kept_comes_back(built):
 def test_runs_at_other_times_are_refused(built):
     with pytest.raises(DataError, match="at the same times"):
         simulate_many(built, lambda seed: inputs(seed, 100 + seed), range(2))
+
+
+@pytest.mark.parametrize("engine", ["python", "reference", "xla"])
+def test_inputs_that_can_be_read_only_once_serve_all_runs(built, engine):
+    events = [(k * 10_000_000, float(k % 3 - 1)) for k in range(20)]
+    batch = simulate(built, {"push": iter(events)}, seeds=[0, 1], engine=engine)
+    assert batch["place"].present.all()
+    assert batch["place"].value.shape == (2, 20)
+
+
+@pytest.mark.parametrize("size", [0, -1, 1.5, True])
+def test_chunks_of_no_size_are_refused(built, size):
+    with pytest.raises(DeclarationError, match="positive size"):
+        simulate_many(built, inputs(), range(2), runs_at_once=size)
+
+
+def test_outputs_at_few_ticks_are_kept_at_those_alone(built):
+    @graph
+    def rare(a: Stream[Scalar], b: Stream[Scalar]):
+        return {"b": b.map(lambda x: x + 1.0), "a": a}
+
+    time = np.arange(1000) * 1_000_000
+    data = {"a": Series(time, np.zeros(1000)), "b": Series(time[::250], np.arange(4.0))}
+    batch = simulate_many(rare.build(), data, range(3), runs_at_once=2)
+    assert batch["b"].value.tolist() == [[1.0, 2.0, 3.0, 4.0]] * 3
+    assert batch["b"].time.tolist() == time[::250].tolist()

@@ -176,3 +176,12 @@ def test_a_draw_of_unknown_size_is_refused():
 
     with pytest.raises(DeclarationError, match="fixed shape"):
         g.build()
+
+
+def test_names_of_one_hash_are_refused():
+    @graph
+    def twice(a: Stream[Scalar]):
+        return {"x": noise(a, draws="s73886"), "y": noise(a, draws="s140503")}
+
+    with pytest.raises(DeclarationError, match="would draw the numbers of"):
+        twice.build()

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.flights.tables import POLICIES, nanoseconds, read_table
+from flowgraph.blocks.geometry import conjugate, multiply
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
@@ -66,7 +67,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     Returns:
         A `Flight`. truth: `NavigationState` from state_groundtruth_estimate0, else `Pose` from
         groundtruth.tum, else None. info: `imu_noise` (`ImuNoise`), `imu_period_ns`, `leica_lever` (m, body),
-        `vicon_lever` (m, body) and `vicon_mount` (quaternion, sensor to body).
+        `vicon_lever` (m, body) and `vicon_mount` (quaternion, sensor to body), which is already
+        taken out of the attitudes: they are the body's.
 
     Raises:
         DataError: a folder or file is missing, a row is malformed (file, line) or out of order, or no aiding
@@ -124,11 +126,10 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         info["leica_lever"] = extrinsics[0] if extrinsics else LEICA_LEVER
     if (mav / "vicon0").is_dir():
         time, z = table("vicon", _need(mav / "vicon0" / "data.csv", "the motion capture"), 7, quaternion=3)
-        aid("vicon", time, Pose(position=z[:, :3], attitude=z[:, 3:]))
-        info["vicon_lever"], info["vicon_mount"] = _extrinsics(mav / "vicon0" / "sensor.yaml") or (
-            (0.0, 0.0, 0.0),
-            (1.0, 0.0, 0.0, 0.0),
-        )
+        unmounted = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        info["vicon_lever"], info["vicon_mount"] = _extrinsics(mav / "vicon0" / "sensor.yaml") or unmounted
+        to_sensor = conjugate(np.asarray(info["vicon_mount"]), xp=np)
+        aid("vicon", time, Pose(position=z[:, :3], attitude=multiply(z[:, 3:], to_sensor, xp=np)))
     truth = None
     asl = mav / "state_groundtruth_estimate0" / "data.csv"
     tum = next((f for f in (mav / "groundtruth.tum", mav.parent / "groundtruth.tum") if f.is_file()), None)

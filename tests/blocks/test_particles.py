@@ -14,6 +14,7 @@ from flowgraph.blocks.particles import (
     attitude_likelihood,
     average_attitude,
     average_pose,
+    dominant_eigenvector,
     effective_sample_size,
     propagate_attitude,
     reweight,
@@ -207,3 +208,15 @@ def test_a_bias_is_the_mean_reading_at_rest_and_then_stays():
         np.testing.assert_allclose(np.concatenate([out.gyro, out.specific_force]), reading - mean, atol=1e-13)
     assert state["count"] == 201
     assert state["bias"] == pytest.approx(bias, abs=5 * 0.01 / np.sqrt(201))
+
+
+def test_the_average_attitude_needs_no_lucky_first_particle():
+    identity, turned = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(dominant_eigenvector(np.outer(identity, identity), turned, xp=np), identity)
+    M = 0.01 * np.outer(turned, turned) + 0.99 * np.outer(identity, identity)
+    np.testing.assert_allclose(dominant_eigenvector(M, turned, xp=np), identity, atol=1e-12)
+    for kind in (np.float32, np.float64):
+        alike = dominant_eigenvector(
+            np.full(4, 0.25, dtype=kind) * np.eye(4, dtype=kind), turned.astype(kind), xp=np
+        )
+        np.testing.assert_allclose(alike, turned)
