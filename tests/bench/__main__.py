@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -64,7 +65,7 @@ def show(rows: list[Row]) -> None:
     for r in rows:
         numbers = (f"{r.ours:.3g}", _figure(r.peer, ".3g"), _figure(r.ratio, ".2f"))
         table.add_row(r.name, *numbers, r.unit, r.against, r.bound or "", marks[r.met])
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 150)
     console.print(table)
     missed = [r.name for r in rows if r.met is False]
     console.print(f"{len(missed)} missed: {', '.join(missed)}" if missed else "All bounds are met.")

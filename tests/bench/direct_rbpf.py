@@ -117,6 +117,9 @@ def run(
         for _ in range(5):
             M = M @ M
         mean = M @ cloud.q[:, 0]
+        parts = M.diagonal()
+        if mean @ mean <= 1e-6 * (parts @ parts):
+            mean = M[:, parts.argmax()]
         out.poses[tick, 6:10] = mean / math.sqrt(mean @ mean)
         if pose_index[tick] >= 0:
             out.sizes[k] = 1.0 / (weight @ weight)
