@@ -136,6 +136,9 @@ def update_pose(
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
         gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
+
+    An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
+    the attitude with it.
     """
     if pose is None:
         return prior, None
@@ -143,9 +146,12 @@ def update_pose(
     arm = xp.asarray(lever, dtype=kind)
     expected = xp.concat([prior.position + rotate(prior.attitude, arm, xp=xp), prior.attitude], axis=-1)
     residual = POSE.minus(xp.concat([pose.position, pose.attitude], axis=-1), expected, xp)
+    present = ~xp.isnan(residual)
+    residual = xp.where(present, residual, 0.0)
     H = observe_jacobian(prior.attitude, arm, xp)
     R = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
-    found = correct(prior.covariance, residual, H, xp.asarray(R, dtype=kind), gate=gate, xp=xp)
+    R = xp.asarray(R, dtype=kind)
+    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, xp=xp)
     d = found.shift
     posterior = _unit(
         prior.velocity + d[..., 0:3],

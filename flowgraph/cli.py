@@ -50,7 +50,10 @@ _out = Console(soft_wrap=True)
 _err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
-Data = Annotated[str, typer.Option("--data", metavar="SPEC", help="sim, or euroc:PATH.")]
+Data = Annotated[
+    str,
+    typer.Option("--data", metavar="SPEC", help="sim, sim:thesis, sim:hover, sim:roundtrip, euroc:PATH"),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),

@@ -41,6 +41,7 @@ from flowgraph.blocks.point import (
     told_acceleration,
 )  # fmt: skip
 from flowgraph.blocks.signals import Position, Velocity
+from flowgraph.checks import need_numbers
 
 _AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
@@ -97,6 +98,15 @@ def for_flight(
         flight: with the streams `imu` and `vicon` (Pose), at any times.
         position_noise, accelerometer_noise, gate, settle: as for `kalman`.
     """
+    need_numbers(
+        "async_kalman",
+        positive={
+            "position_noise": position_noise,
+            "accelerometer_noise": accelerometer_noise,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
     control = told_acceleration(flight)
     position = positions(flight)
     truth = flight.truth

@@ -41,6 +41,7 @@ from flowgraph.blocks.extended import (
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.checks import need_numbers
 
 
 @graph
@@ -93,6 +94,17 @@ def for_flight(
         gate: a measurement with a larger normalised innovation squared changes nothing.
         settle: seconds at the start that the errors leave out.
     """
+    need_numbers(
+        "ekf",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "position_noise": position_noise,
+            "attitude_noise": attitude_noise,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
     if not {"imu", "vicon"} <= set(flight.streams):
         raise DataError(
             "this flight lacks what ekf needs",

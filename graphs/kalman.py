@@ -43,6 +43,7 @@ from flowgraph.blocks.point import (
     start_point,
     told_acceleration,
 )  # fmt: skip
+from flowgraph.checks import need_numbers
 
 _AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
@@ -96,6 +97,15 @@ def for_flight(
         gate: a measurement with a larger normalised innovation squared changes nothing.
         settle: seconds at the start that the errors leave out.
     """
+    need_numbers(
+        "kalman",
+        positive={
+            "position_noise": position_noise,
+            "accelerometer_noise": accelerometer_noise,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
     reading = readings(flight)
     own = flight.info["imu_noise"].accelerometer
     truth = flight.truth

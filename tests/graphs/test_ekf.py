@@ -220,3 +220,19 @@ def test_the_nees_of_50_runs_lies_in_its_band(base):
 def test_the_same_test_fails_with_a_wrong_noise(base, factor):
     pytest.importorskip("jax")
     assert not is_consistent(base, factor)
+
+
+def test_an_entry_that_was_not_measured_leaves_the_others_to_correct():
+    from flowgraph import arrays
+
+    flight = load_flight("sim", seed=1)
+    case = ekf.case(flight)
+    inputs: Any = case.inputs
+    vicon = inputs["vicon"]
+    position = np.array(vicon.position)
+    position[5, 0] = np.nan
+    gappy = arrays(vicon.time, type(vicon.values)(position, vicon.attitude), not_finite="keep")
+    whole = simulate(case.graph, inputs)[case.estimate].position
+    partial = simulate(case.graph, {**inputs, "vicon": gappy})[case.estimate].position
+    assert np.isfinite(partial).all()
+    assert 0 < np.abs(partial - whole).max() < 0.1
