@@ -20,13 +20,13 @@ from flowgraph.errors import (
     UnknownNameError,
 )
 from flowgraph.graph import Graph
-from flowgraph.inputs import arrays, ticks, timing_of
+from flowgraph.inputs import arrays, clocks_of, ticks, timing_of
 from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
 from flowgraph.lowering import lower
 from flowgraph.many import Batch, simulate_many
 from flowgraph.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.pipeline import Pipeline
-from flowgraph.registry import Case, find_graph, load_flight
+from flowgraph.registry import Case, Report, find_graph, load_flight
 from flowgraph.result import Result
 from flowgraph.run import Run
 from flowgraph.series import Flight, Series
@@ -69,6 +69,7 @@ __all__ = [
     "Pipeline",
     "PipelineError",
     "ProgressBar",
+    "Report",
     "Result",
     "Run",
     "Scalar",
@@ -84,6 +85,7 @@ __all__ = [
     "batch",
     "block",
     "boolean",
+    "clocks_of",
     "collect",
     "delay",
     "delta_time",

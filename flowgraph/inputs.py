@@ -79,6 +79,11 @@ def timing_of(series: Series) -> Timing:
     return aperiodic(max_rate=math.ceil(1e9 / max(int(steps.min()), 1)))
 
 
+def clocks_of(inputs: Mapping[str, Series]) -> dict[str, Any]:
+    """`timing_of` each, as `build` takes them."""
+    return {name: timing_of(series) for name, series in inputs.items()}
+
+
 def _rule(what: str, given: str, valid: tuple[str, ...]) -> str:
     if given not in valid:
         raise UnknownNameError(f"rule for {what}", given, valid)

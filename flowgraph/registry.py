@@ -1,8 +1,9 @@
 """Finding graphs and flights by name, through entry points: the engine imports none of them itself.
 
 A package offers a graph under the entry point group `flowgraph.graphs` (a `@graph` function with
-`on_flight`), and a source of flights under `flowgraph.flights` (a function `load(argument, *, seed,
-settings)`). Ours are found the same way as a user's.
+`on_flight`), a source of flights under `flowgraph.flights` (a function `load(argument, *, seed, settings)`),
+and an experiment under `flowgraph.benches` (a function of keyword settings that returns a `Report`). Ours are
+found the same way as a user's.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from __future__ import annotations
 import inspect
 import math
 import typing
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from flowgraph.errors import DeclarationError, UnknownNameError
@@ -43,6 +45,21 @@ class Case:
     estimate: str = "belief"
 
 
+@dataclass(frozen=True)
+class Report:
+    """What an experiment found.
+
+    Args:
+        rows: the table, a mapping a row; the values are numbers, texts or None.
+        figures: by file name, what draws the picture into a path.
+        notes: what the reader should know of the figures, a sentence each.
+    """
+
+    rows: Sequence[Mapping[str, Any]]
+    figures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
 def _entries(group: str) -> list[EntryPoint]:
     from importlib.metadata import entry_points  # slow to import, and only needed to look names up
 
@@ -57,6 +74,21 @@ def graph_names() -> list[str]:
 def flight_names() -> list[str]:
     """The kinds of flight that can be loaded."""
     return sorted(e.name for e in _entries("flowgraph.flights"))
+
+
+def bench_names() -> list[str]:
+    """The names of all installed experiments."""
+    return sorted(e.name for e in _entries("flowgraph.benches"))
+
+
+def find_bench(name: str) -> Callable[..., Report]:
+    """The installed experiment of that name.
+
+    Raises:
+        UnknownNameError: listing the names that exist.
+    """
+    found: Callable[..., Report] = _find("flowgraph.benches", "bench", name, bench_names())
+    return found
 
 
 def find_graph(name: str) -> GraphFunction:
@@ -95,8 +127,13 @@ def flight_settings(spec: str) -> list[str]:
     return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
 
 
+def setting_names(function: Callable[..., Any]) -> list[str]:
+    """The keyword-only arguments of a function."""
+    return [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+
+
 def parsed_settings(
-    function: Callable[..., Any], given: Mapping[str, str], *, also: list[str], path: str
+    function: Callable[..., Any], given: Mapping[str, str], *, also: Sequence[str], path: str
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Split `--set` texts into keyword arguments of `function`, as its annotations say, and those of `also`.
 
@@ -104,7 +141,7 @@ def parsed_settings(
         UnknownNameError: for a key that is in neither; DeclarationError: for a text that is no such value.
     """
     hints = typing.get_type_hints(function)
-    own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    own = setting_names(function)
     mine: dict[str, Any] = {}
     rest: dict[str, str] = {}
     for key, text in given.items():

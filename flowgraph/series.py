@@ -245,3 +245,29 @@ class Flight:
     truth: Series | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def need(self, graph: str, *names: str) -> dict[str, Series]:
+        """The streams of these names, for a graph that cannot run without them.
+
+        Raises:
+            DataError: where one is missing, or holds no event.
+        """
+        missing = [name for name in names if name not in self.streams]
+        if missing:
+            raise DataError(
+                f"this flight lacks what {graph} needs",
+                path=self.name,
+                expected=f"streams {', '.join(names)}",
+                got=", ".join(self.streams) or "no stream",
+                fix=f"choose another flight, or build {graph} with your own sources",
+            )
+        for name in names:
+            if not len(self.streams[name]):
+                raise DataError(
+                    f"this flight's stream {name!r} is empty, and {graph} needs it",
+                    path=f"{self.name}: {name}",
+                    expected="at least one event",
+                    got="none",
+                    fix="choose a longer flight, or an earlier first measurement",
+                )
+        return {name: self.streams[name] for name in names}

@@ -20,6 +20,7 @@ from flowgraph import (
     DeclarationError,
     OutputError,
     ProgressBar,
+    Report,
     Run,
     Scalar,
     Series,
@@ -85,7 +86,7 @@ def test_what_cannot_be_written_is_a_message(arguments, taken):
 
 
 def test_the_folder_is_tried_before_the_run(taken, monkeypatch):
-    monkeypatch.setattr("flowgraph.cli.simulate", lambda *_, **__: pytest.fail("it ran"))
+    monkeypatch.setattr("flowgraph.cli.filters.simulate", lambda *_, **__: pytest.fail("it ran"))
     assert invoke(*RUN, "--out", str(taken)).exit_code == 1
 
 
@@ -232,7 +233,7 @@ def test_memory_that_does_not_suffice_is_a_failure(monkeypatch):
     def greedy(*_: object, **__: object) -> None:
         raise MemoryError("14 PiB")
 
-    monkeypatch.setattr("flowgraph.cli.load_flight", greedy)
+    monkeypatch.setattr("flowgraph.cli.options.load_flight", greedy)
     done = invoke(*RUN)
     assert done.exit_code == 1
     assert "not enough memory" in done.stderr
@@ -255,7 +256,7 @@ def test_json_is_all_there_is_on_standard_output(tmp_path):
 
 def test_other_words_on_standard_error_pass():
     program = (
-        "import os; from flowgraph.cli import _without_font_warnings as quiet\n"
+        "import os; from flowgraph.cli.terminal import without_font_warnings as quiet\n"
         "with quiet(): os.write(2, b'Fontconfig warning: x\\nother\\n')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -372,3 +373,45 @@ def test_simulate_refuses_what_it_cannot_run(options, words):
 def test_a_series_refuses_what_is_no_array(time, values, words):
     with pytest.raises(flowgraph.DataError, match=words):
         Series(time, values)
+
+
+# Experiments
+
+
+def two_rows(*, flights: int = 2, data: str | None = None) -> Report:
+    """Count flights."""
+    rows = [{"flight": k, "error_m": 0.5 * k} for k in range(flights)]
+
+    def written(path: Path) -> None:
+        path.write_text(str(rows))
+
+    return Report(rows, {"table.txt": written}, ("counted, not flown",))
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    for place in ("flowgraph.cli.bench.find_bench", "flowgraph.registry.find_bench"):
+        monkeypatch.setattr(place, lambda name: two_rows)
+
+
+def test_a_bench_prints_its_rows_and_writes_its_pictures(counted, tmp_path):
+    done = invoke("bench", "two", "--flights", "3", "--json", "--out", str(tmp_path))
+    assert done.exit_code == 0
+    assert [row["error_m"] for row in json.loads(done.stdout)["rows"]] == [0.0, 0.5, 1.0]
+    assert "counted, not flown" in done.stderr
+    assert (tmp_path / "table.txt").exists()
+    assert "error_m" in invoke("bench", "two").stdout
+
+
+def test_a_bench_refuses_an_option_that_it_does_not_have(counted):
+    done = invoke("bench", "two", "--seed", "3")
+    assert done.exit_code == 2
+    assert "--seed" in done.stderr
+    assert "flights" in done.stderr
+    assert invoke("bench", "two", "--set", "flights=many").exit_code == 2
+
+
+def test_an_unknown_bench_is_refused_by_name():
+    done = invoke("bench", "nothing")
+    assert done.exit_code == 2
+    assert "'nothing'" in done.stderr

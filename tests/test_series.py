@@ -108,3 +108,13 @@ def test_a_flight_is_only_its_parts():
     flight = Flight("x", {"points": a_series()})
     assert flight.truth is None
     assert flight.info == {}
+
+
+def test_what_a_graph_needs_of_a_flight():
+    flight = Flight("walk", {"imu": a_series(), "vicon": a_series(0)})
+    assert list(flight.need("ekf", "imu")) == ["imu"]
+    with pytest.raises(DataError, match="lacks what ekf needs") as missing:
+        flight.need("ekf", "imu", "gps")
+    assert "imu, gps" in str(missing.value)
+    with pytest.raises(DataError, match="'vicon' is empty"):
+        flight.need("ekf", "imu", "vicon")

@@ -1,0 +1,166 @@
+"""`list`, `show`, `run` and `demo`: filters on flights."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+
+from flowgraph.cli.app import app
+from flowgraph.cli.options import AsJson, Data, Name, Seed, Settings, case_of
+from flowgraph.cli.terminal import (
+    err_console,
+    first_line,
+    make_ready,
+    out_console,
+    print_json,
+    reports_errors,
+    runs_table,
+    table,
+    without_font_warnings,
+    writing,
+)
+from flowgraph.errors import DataError, FlowgraphError, writes
+from flowgraph.progress import ProgressBar
+from flowgraph.registry import Case, find_graph, flight_names, graph_names
+from flowgraph.result import Result
+from flowgraph.series import Flight
+from flowgraph.simulate import ENGINES, simulate
+
+
+@app.command("list")
+@reports_errors
+def list_(as_json: AsJson = False) -> None:
+    """List the graphs, with a line each."""
+    rows = [{"graph": n, "what": first_line(find_graph(n).__doc__ or "")} for n in graph_names()]
+    if as_json:
+        return print_json({"rows": rows, "data": flight_names()})
+    out_console.print(table(rows))
+    out_console.print(f"data: {', '.join(flight_names())}")
+
+
+@app.command()
+@reports_errors
+def show(
+    graph: Name,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
+    ] = None,
+    data: Data = "sim",
+    settings: Settings = None,
+    seed: Seed = 0,
+) -> None:
+    """Draw a graph: in the terminal, or to a file."""
+    case, _ = case_of(graph, data, settings, seed)
+    if output is None:
+        print(case.graph.text())
+        return
+    with writing(output), without_font_warnings():
+        case.graph.draw(str(output))
+
+
+@app.command()
+@reports_errors
+def run(
+    graph: Name,
+    data: Data,
+    engine: Annotated[str, typer.Option(help=", ".join(ENGINES))] = "python",
+    dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+    seed: Seed = 0,
+    settings: Settings = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a graph on a flight and compare it with the truth."""
+    if out is not None:
+        make_ready(out)
+    case, flight = case_of(graph, data, settings, seed)
+    for note in flight.notes:
+        err_console.print(f"note: {note}", markup=False)
+    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
+    report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    if out is not None:
+        _write_report(out, case, flight, result, report)
+    if as_json:
+        return print_json(report)
+    out_console.print(runs_table([row]))
+
+
+@app.command()
+@reports_errors
+def demo(
+    graphs: Annotated[list[str] | None, typer.Argument(metavar="[GRAPH]...")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="For diagrams and plots.")] = Path("out"),
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Run filters on the simulated flight in both engines, and draw them: ins_eskf and rbpf_indoor."""
+    make_ready(out)
+    rows = []
+    for name in graphs or ("ins_eskf", "rbpf_indoor"):
+        case, flight = case_of(name, "sim", None, seed)
+        for engine in ("python", "xla"):
+            try:
+                result, row = _measure(case, name, engine, "float64", seed, quiet=as_json)
+            except FlowgraphError as error:
+                if engine == "python":
+                    raise
+                err_console.print(f"note: {error}", markup=False)
+                continue
+            rows.append(row)
+            if engine == "python":
+                _write_report(out / name, case, flight, result, row)
+    if as_json:
+        return print_json({"rows": rows})
+    out_console.print(runs_table(rows))
+
+
+def _measure(
+    case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool
+) -> tuple[Result, dict[str, Any]]:
+    start = perf_counter()
+    hidden = quiet or not err_console.is_terminal
+    with (
+        nullcontext()
+        if hidden
+        else ProgressBar(f"{name} ({engine})", total=case.inputs, console=err_console) as meter
+    ):
+        result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter)
+    total = perf_counter() - start
+    row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
+    row.update({"setup_s": total - result.wall_s, **case.score(result), **result.stats})
+    for key, value in row.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise DataError(
+                "the estimate went astray",
+                path=f"{name}.{key}",
+                expected="a finite number",
+                got=str(value),
+                fix="look at the settings and at the data: the filter divides by zero, or overflows",
+            )
+    return result, row
+
+
+def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
+    from flowgraph.plot import plot_navigation, plot_result
+
+    with writes(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with writing(out / "diagram.svg") as file, without_font_warnings():
+        case.graph.draw(str(file))
+    with writing(out / "metrics.json") as file:
+        file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+    if case.estimate not in result.series:
+        return
+    if "position" in result[case.estimate].leaves:
+        with writing(out / "navigation.png") as file:
+            plot_navigation(result[case.estimate], flight.truth, file)
+    else:  # such as an attitude alone
+        with writing(out / "outputs.png") as file:
+            plot_result(result, file)

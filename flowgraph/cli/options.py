@@ -1,0 +1,66 @@
+"""What several commands take: a graph, a flight, their settings, and the case that they make together."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Annotated
+
+import typer
+
+from flowgraph.errors import DeclarationError
+from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.series import Flight
+
+Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+Data = Annotated[
+    str,
+    typer.Option("--data", metavar="SPEC", help="sim, sim:thesis, sim:hover, sim:roundtrip, euroc:PATH"),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
+]
+Seed = Annotated[
+    int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def case_of(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
+    graph = find_graph(name)
+    given = pairs(settings)
+    if graph.prepare is None:
+        return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
+    mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
+    flight = load_flight(spec, seed=seed, settings=rest)
+    if "seed" in inspect.signature(graph.prepare).parameters:
+        mine.setdefault("seed", seed)
+    return graph.case(flight, **mine), flight
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise DeclarationError(
+            "a setting is KEY=VALUE",
+            path="--set",
+            expected="KEY=VALUE",
+            got=repr(text),
+            fix=f"write --set {key}=...",
+        )
+    return key.strip(), value.strip()
+
+
+def pairs(settings: list[str] | None) -> dict[str, str]:
+    """The `--set` texts by key."""
+    given: dict[str, str] = {}
+    for key, value in map(_pair, settings or []):
+        if given.setdefault(key, value) != value:
+            raise DeclarationError(
+                "a setting is given twice",
+                path=f"--set {key}",
+                expected="one value",
+                got=f"{given[key]} and {value}",
+                fix="leave one of them out",
+            )
+    return given

@@ -1,0 +1,138 @@
+"""How commands speak: results to standard output, the rest to standard error, errors as an exit status."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError, writes
+
+out_console = Console(soft_wrap=True)
+err_console = Console(stderr=True, soft_wrap=True, highlight=False)
+
+
+def give_up(message: str) -> None:
+    """Say why, and let nothing more be written to standard output, which may be what has failed."""
+    with suppress(OSError):
+        err_console.print(f"error: {message}", markup=False)
+    with suppress(OSError, ValueError):  # ValueError: it is no file, as in tests
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def reports_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """Errors of this package become a message on standard error and an exit status."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **options: Any) -> None:
+        try:
+            command(*args, **options)
+            sys.stdout.flush()
+        except FlowgraphError as error:
+            err_console.print(f"error: {error}", markup=False)
+            raise typer.Exit(2 if isinstance(error, UnknownNameError | DeclarationError) else 1) from None
+        except BrokenPipeError:
+            raise typer.Exit(1) from None
+        except OSError as error:
+            give_up(f"{type(error).__name__}: {error}")
+            raise typer.Exit(1) from None
+        except MemoryError as error:
+            give_up(f"there is not enough memory for this: {error}")
+            raise typer.Exit(1) from None
+
+    return run
+
+
+def make_ready(folder: Path) -> None:
+    """Make a folder for results, and see that files can be made in it, before time is spent."""
+    with writes(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+
+
+@contextmanager
+def without_font_warnings() -> Iterator[None]:
+    """Keep what Fontconfig says of the system's own files, in C, out of standard error; nothing else."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(kept, 2)
+            os.close(kept)
+            said.seek(0)
+            for line in said:
+                if not line.startswith(b"Fontconfig "):
+                    os.write(2, line)
+
+
+@contextmanager
+def writing(file: Path) -> Iterator[Path]:
+    """Say what is written, and whether something was there before."""
+    before = file.exists()
+    with writes(file):
+        yield file
+    err_console.print(f"{'replaced' if before else 'wrote'} {file}", markup=False)
+
+
+def first_line(doc: str) -> str:
+    return doc.strip().partition("\n")[0].rstrip(".")
+
+
+def print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+_WORDS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "position_rmse_m": ("position RMSE [mm]", lambda v: f"{1e3 * v:.2f}"),
+    "attitude_rmse_deg": ("attitude [deg]", lambda v: f"{v:.3f}"),
+    "tilt_rmse_deg": ("tilt [deg]", lambda v: f"{v:.3f}"),
+    "heading_rmse_deg": ("heading [deg]", lambda v: f"{v:.3f}"),
+    "position_3sigma": ("position in 3 sigma", lambda v: f"{100 * v:.1f} %"),
+    "tilt_3sigma": ("tilt in 3 sigma", lambda v: f"{100 * v:.1f} %"),
+    "wall_s": ("time [s]", lambda v: f"{v:.2f}"),
+    "setup_s": ("set-up [s]", lambda v: f"{v:.2f}"),
+}
+_HIDDEN = ("graph", "engine", "compared_ticks", "heading_3sigma")
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """A column a key, for lists."""
+    table = Table(box=None, pad_edge=False)
+    for key in dict.fromkeys(k for row in rows for k in row):
+        table.add_column(key)
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    return table
+
+
+def runs_table(rows: list[dict[str, Any]]) -> Table:
+    """A column a run and a line a measure, so that it fits a terminal."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for row in rows:
+        table.add_column(f"{row['graph']}\n{row['engine']}", justify="right")
+    for key in dict.fromkeys(k for row in rows for k in row if k not in _HIDDEN):
+        label = _WORDS[key][0] if key in _WORDS else key
+        table.add_row(escape(label), *(_cell(key, row[key]) if key in row else "" for row in rows))
+    return table
+
+
+def _cell(key: str, value: Any) -> str:
+    if key in _WORDS and value is not None:
+        return _WORDS[key][1](value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
