@@ -46,6 +46,11 @@ class Part(abc.ABC):
     size: int
     tangent: int
 
+    @property
+    def curved(self) -> bool:
+        """Whether it takes more numbers than it has directions, as a quaternion does."""
+        return self.size != self.tangent
+
     @abc.abstractmethod
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         """x (..., size) moved by d (..., tangent)."""
@@ -126,7 +131,7 @@ class StateSpace:
         inside = ", ".join(f"{type(p).__name__[1:].lower()}({p.size})" for p in self.parts)
         return f"StateSpace({inside})"
 
-    def _places(self) -> list[tuple[Part, slice, slice]]:
+    def places(self) -> list[tuple[Part, slice, slice]]:
         """Each part, with its place in a state and in a tangent vector."""
         at = [0, *itertools.accumulate(p.size for p in self.parts)]
         on = [0, *itertools.accumulate(p.tangent for p in self.parts)]
@@ -136,14 +141,14 @@ class StateSpace:
         """The state (..., size): x moved by d (..., tangent)."""
         if self._flat:
             return x + d
-        moved = [p.plus(x[..., at], d[..., on], xp) for p, at, on in self._places()]
+        moved = [p.plus(x[..., at], d[..., on], xp) for p, at, on in self.places()]
         return xp.concat(moved, axis=-1)
 
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         """The vector (..., tangent) that moves b (..., size) to a."""
         if self._flat:
             return a - b
-        apart = [p.minus(a[..., at], b[..., at], xp) for p, at, _ in self._places()]
+        apart = [p.minus(a[..., at], b[..., at], xp) for p, at, _ in self.places()]
         return xp.concat(apart, axis=-1)
 
     def mean(self, points: Array, weights: Array, xp: Any, *, rounds: int = 8) -> Array:
@@ -173,7 +178,7 @@ class StateSpace:
     def _reset_table(self) -> np.ndarray:
         """(tangent, tangent^2): maps d to the matrix with -skew(d)/2 for each quaternion."""
         table = np.zeros((self.tangent, self.tangent, self.tangent))
-        for part, _, on in self._places():
+        for part, _, on in self.places():
             if isinstance(part, _Quaternion):
                 table[on, on, on] = -0.5 * np.asarray(skew(np.eye(3), xp=np))
         return table.reshape(self.tangent, -1)

@@ -8,6 +8,8 @@ annotated `X | None` is an optional input. The return annotation types the outpu
 
 A block with memory declares its initial state with `@name.init`; its step then takes the state first and
 returns `(new state, outputs)`. Everything else about it is the same.
+
+A block whose settings make it unfit for some kind of number says so with `@name.limited`; see `Limit`.
 """
 
 from __future__ import annotations
@@ -51,6 +53,26 @@ def when(present: Any, value: Any) -> Any:
     return When(present, value)
 
 
+class Limit(NamedTuple):
+    """Kinds of number in which a block, with the settings that it has, must not be computed, and why.
+
+    Args:
+        numbers: of `NUMBERS`, those that are refused.
+        message, expected, got, fix: of the error; `path` is filled in when the graph is lowered.
+    """
+
+    numbers: tuple[str, ...]
+    message: str
+    expected: str
+    got: str
+    fix: str
+    path: str = ""
+
+
+NUMBERS = ("float64", "float32", "fixed")
+"""What a `real` can be in a lowered graph; "fixed" stands for every fixed-point format."""
+
+
 class Port(NamedTuple):
     """One end of a wire: name, type (None: any) and whether it may be absent."""
 
@@ -91,6 +113,7 @@ class Block(Generic[R]):
         self.name = name or getattr(step, "__name__", type(step).__name__).strip("<>")
         self.host = host
         self._init, self._local = init, local
+        self._limits: Callable[..., Sequence[Limit]] | None = None
         self.clock_rule, self.output_rule, self.fault = clock, output, fault
 
     def init(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -98,6 +121,15 @@ class Block(Generic[R]):
         self._init = function
         self.__dict__.pop("_signature_parts", None)
         return function
+
+    def limited(self, function: Callable[..., Sequence[Limit]]) -> Callable[..., Sequence[Limit]]:
+        """Decorator: `function(**settings)` gives the `Limit`s that these settings bring; lowering asks."""
+        self._limits = function
+        return function
+
+    def limits(self, settings: Mapping[str, Any]) -> tuple[Limit, ...]:
+        """The kinds of number that these settings rule out."""
+        return () if self._limits is None else tuple(self._limits(**settings))
 
     def __call__(self, *streams: Any, **settings: Any) -> Any:
         """Wire this block into the graph under construction: streams to ports, the rest to settings."""

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from flowgraph.block import Limit
 from flowgraph.clock import Timing
 from flowgraph.errors import PipelineError
 from flowgraph.ops import OPS, Spec, bound_attrs
@@ -68,6 +69,7 @@ def to_json(pipeline: Pipeline) -> dict[str, Any]:
         "stages": [_stage(s) for s in pipeline.stages],
         "faults": [_plain(f) for f in pipeline.faults],
         "random": [_plain(r) for r in pipeline.random],
+        "limits": [{**limit._asdict(), "numbers": list(limit.numbers)} for limit in pipeline.limits],
         "totals": pipeline.totals(),
         "latency": pipeline.latency(),
     }
@@ -167,6 +169,7 @@ def from_json(data: Any, *, path: str = "pipeline") -> Pipeline:
         stages=tuple(_read_stage(s) for s in data["stages"]),
         faults=tuple(Fault(**f) for f in data["faults"]),
         random=tuple(RandomSite(**{**r, "shape": tuple(r["shape"])}) for r in data["random"]),
+        limits=tuple(Limit(**{**r, "numbers": tuple(r["numbers"])}) for r in data.get("limits", ())),
     )
     _check_ports(pipeline, path)
     _check_values(pipeline, path)

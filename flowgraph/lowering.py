@@ -26,15 +26,22 @@ from flowgraph.symbolic_namespace import namespace
 from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 
 
-def lower(graph: Graph) -> Pipeline:
+def lower(graph: Graph, *, dtype: str = "float64") -> Pipeline:
     """The fixed-size pipeline of a graph; made once and kept with it.
 
+    Args:
+        graph: a built graph.
+        dtype: what `real` is going to be: "float64", "float32" or "fixed". The pipeline is the same for all;
+            a graph that cannot be trusted in this one is refused.
+
     Raises:
-        LoweringError: for a host block, or a step that does what a pipeline cannot hold; names the line.
+        LoweringError: for a host block, or a step that does what a pipeline cannot hold; names the line. Also
+            for a block whose settings rule out `dtype`, with the reason.
     """
     if "pipeline" not in graph.plans:
         graph.plans["pipeline"] = _Lowering(graph).pipeline()
     found: Pipeline = graph.plans["pipeline"]
+    found.need_numbers(dtype)
     return found
 
 
@@ -105,6 +112,11 @@ class _Lowering:
             tuple(self.stages),
             tuple(self.faults()),
             tuple(RandomSite(s.name, s.kind, s.shape, s.hash, n) for s, n in self.sites.items()),
+            tuple(
+                limit._replace(path=call.path)
+                for _, call in graph.calls
+                for limit in call.block.limits(call.settings)
+            ),
         )
 
     # -- values --------------------------------------------------------------------------------------

@@ -224,7 +224,7 @@ def _vectorised(
 
     import_jax()
     real = np.dtype(dtype)
-    pipeline = _pruned(lower(graph), kept)
+    pipeline = _pruned(lower(graph, dtype=dtype), kept)
     shared = not callable(inputs)
     first = tape(prepare(graph, inputs if shared else inputs(seeds[0])), graph)
     if not len(first.time):  # nothing to compile for

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flowgraph.block import NUMBERS, Limit
 from flowgraph.clock import Timing
-from flowgraph.errors import PipelineError, writes
+from flowgraph.errors import LoweringError, PipelineError, UnknownNameError, writes
 from flowgraph.ops import Spec
 from flowgraph.symbolic import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
@@ -133,7 +134,7 @@ class Pipeline:
         name, doc: of the graph.
         time: number of the value that holds the tick's time (int64, ns).
         seed: number of the value that holds the run's seed (two uint32 words, low first).
-        inputs, outputs, registers, constants, stages, faults, random: see their classes.
+        inputs, outputs, registers, constants, stages, faults, random, limits: see their classes.
     """
 
     name: str
@@ -147,6 +148,21 @@ class Pipeline:
     stages: tuple[Stage, ...]
     faults: tuple[Fault, ...] = ()
     random: tuple[RandomSite, ...] = ()
+    limits: tuple[Limit, ...] = ()
+
+    def need_numbers(self, kind: str) -> None:
+        """Refuse a kind of number, "float64", "float32" or "fixed", in which a block must not be computed.
+
+        Raises:
+            LoweringError: naming the block and why; UnknownNameError: for another kind.
+        """
+        if kind not in NUMBERS:
+            raise UnknownNameError("dtype", kind, NUMBERS, path=self.name)
+        for limit in self.limits:
+            if kind in limit.numbers:
+                raise LoweringError(
+                    limit.message, path=limit.path, expected=limit.expected, got=limit.got, fix=limit.fix
+                )
 
     @cached_property
     def instructions(self) -> tuple[Instruction, ...]:

@@ -244,6 +244,7 @@ def _result(
     seed: int,
     progress: Meter | None,
 ) -> Result:
+    pipeline.need_numbers(dtype)
     real = np.dtype(dtype)
     outcome = (_reference if engine == "reference" else _xla)(
         pipeline, events, cells, real, seed_words(seed), progress

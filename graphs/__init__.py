@@ -8,6 +8,7 @@ from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.orientation_complementary import orientation_complementary
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.ukf import ukf
 
 __all__ = [
     "complementary",
@@ -18,4 +19,5 @@ __all__ = [
     "kalman",
     "ins_eskf",
     "rbpf_indoor",
+    "ukf",
 ]

@@ -21,11 +21,12 @@ def lower(
     data: Data = "sim",
     settings: Settings = None,
     seed: Seed = 0,
+    dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed")] = "float64",
     as_json: AsJson = False,
 ) -> None:
     """Lower a graph to a fixed-size pipeline description."""
     case, _ = case_of(graph, data, settings, seed)
-    pipeline = lower_graph(case.graph)
+    pipeline = lower_graph(case.graph, dtype=dtype)
     pipeline.save(output)
     totals = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if as_json:

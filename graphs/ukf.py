@@ -1,0 +1,184 @@
+"""The unscented Kalman filter of a quadrotor's pose: ten states, IMU as control, motion capture as
+measurement.
+
+State: position, velocity, quaternion; the error of the quaternion is a rotation vector, so the covariance is
+9 x 9. Every tick predicts to now with the IMU; a tick with a pose also corrects.
+
+    predict   31 sigma points, of nine errors of the state and six of the IMU, through the motion
+    correct   19 sigma points, of the state, through what the motion capture sees
+
+    x = mean(Y_i)      P = W sum (Y_i minus Y_0)(Y_i minus Y_0)^T + (beta - alpha^2) u u^T
+
+The mean of the quaternions is Markley's eigenvector, or Kraft's gradient descent.
+
+Source: R. Fiszel, thesis (2017), section on the unscented Kalman filter, whose state this is; E. Wan and R.
+van der Merwe, "The unscented Kalman filter for nonlinear estimation", 2000; E. Kraft, "A quaternion-based
+unscented Kalman filter for orientation tracking", 2003. The equations stand in `blocks/sigma_points.py`,
+`blocks/unscented.py` and `blocks/pose_model.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import (
+    Array,
+    Case,
+    Flight,
+    Result,
+    Series,
+    Stream,
+    clocks_of,
+    collect,
+    delay,
+    graph,
+    latest,
+)  # fmt: skip
+from flowgraph.blocks.extended import POSE, between_imu
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.pose_model import STATE, carry_pose, imu_density, named_pose, see_pose, start_state
+from flowgraph.blocks.sigma_points import GAUSSIAN, SigmaPoints
+from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.unscented import predict_unscented, update_unscented
+from flowgraph.checks import need_numbers
+
+_NONE = (0.0, 0.0, 0.0)
+
+
+def stacked_pose(pose: Pose, *, xp: Any) -> Array:
+    """A pose as one vector (7)."""
+    return xp.concat([pose.position, pose.attitude], axis=-1)
+
+
+@graph
+def ukf(
+    imu: Stream[Imu],
+    vicon: Stream[Pose],
+    *,
+    start: Gaussian,
+    noise: ImuNoise,
+    position_noise: float,
+    attitude_noise: float,
+    lever: tuple[float, float, float] = _NONE,
+    gravity: tuple[float, float, float] = GRAVITY,
+    points: SigmaPoints = GAUSSIAN,
+    gate: float | None = None,
+):
+    """Unscented Kalman filter of position, velocity and quaternion: IMU control, motion capture pose.
+
+    Collected: `belief` at every tick, and the `innovation` at every pose.
+    """
+    belief = delay(start, name="belief")
+    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
+    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | vicon, name="control")
+    prior = predict_unscented(
+        belief,
+        between_imu(last, control),
+        move=carry_pose(gravity),
+        noise=imu_density(noise),
+        space=STATE,
+        points=points,
+    )
+    posterior, innovation = update_unscented(
+        prior,
+        vicon.map(stacked_pose, name="pose"),
+        observe=see_pose(lever),
+        R=np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3),
+        space=STATE,
+        measured_space=POSE,
+        points=points,
+        gate=gate,
+    )
+    belief.feed(posterior)
+    last.feed(control)
+    collect(innovation, "innovation")
+    return {"belief": named_pose(posterior)}
+
+
+@ukf.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    gyro_factor: float | None = None,
+    accelerometer_factor: float | None = None,
+    position_noise: float | None = None,
+    attitude_noise: float | None = None,
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+    mean: str = "markley",
+    gate: float | None = None,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on a flight with an IMU and a motion capture, at the capture's first pose and at rest.
+
+    Args:
+        flight: with the streams `imu` and `vicon` (Pose). In place of `imu` it may have the thesis's unit:
+            `gyro` and `coordinate_acceleration`, with the same times.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
+            so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
+        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
+        alpha, beta, kappa: of the sigma points; in float32 or fixed point alpha must be at least 0.1.
+        mean: of quaternions, "markley" or "kraft".
+        gate: a measurement with a larger normalised innovation squared changes nothing.
+        settle: seconds at the start that the errors leave out.
+    """
+    need_numbers(
+        "ukf",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "position_noise": position_noise,
+            "attitude_noise": attitude_noise,
+            "alpha": alpha,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
+    imu, unit, gravity = inertial_unit(flight)
+    inputs = {"imu": imu, **flight.need("ukf", "vicon")}
+    truth, first, info = flight.truth, inputs["vicon"][0], flight.info
+    otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
+    built = ukf.build(
+        **clocks_of(inputs),
+        start=start_state(first.position, first.attitude),
+        noise=unit.scaled(
+            gyro=otherwise if gyro_factor is None else gyro_factor,
+            accelerometer=otherwise if accelerometer_factor is None else accelerometer_factor,
+        ),
+        position_noise=info.get("position_noise", 0.004) if position_noise is None else position_noise,
+        attitude_noise=info.get("attitude_noise", 0.01) if attitude_noise is None else attitude_noise,
+        lever=tuple(info.get("vicon_lever", _NONE)),
+        gravity=gravity,
+        points=SigmaPoints(alpha, beta, kappa, mean),
+        gate=gate,
+    )
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
+
+    return Case(built, inputs, score)
+
+
+def inertial_unit(flight: Flight) -> tuple[Series, ImuNoise, tuple[float, float, float]]:
+    """The flight's IMU, its noise, and the gravity that its specific force is without.
+
+    The thesis's accelerometer reads the coordinate acceleration, which is a specific force where there is no
+    gravity.
+
+    Raises:
+        DataError: without either unit.
+    """
+    thesis = ("gyro", "coordinate_acceleration")
+    if "imu" in flight.streams or not set(thesis) <= set(flight.streams):
+        return flight.need("ukf", "imu", "vicon")["imu"], flight.info["imu_noise"], GRAVITY
+    gyro, push = (flight.need("ukf", *thesis)[name] for name in thesis)
+    kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
+    values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
+    of_gyro, of_push = (flight.info["noise"][name] for name in thesis)
+    noise = ImuNoise(of_gyro["noise"], of_push["noise"], of_gyro["walk"], of_push["walk"])
+    return Series(kept, values, name="imu"), noise, _NONE

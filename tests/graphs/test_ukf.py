@@ -1,0 +1,207 @@
+"""`ukf`: beside `ekf` on the same flights, consistent over many runs, in single precision, in all engines."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import Case, DataError, DeclarationError, Flight, LoweringError, load_flight, lower, simulate
+from flowgraph import simulate_many as many
+from flowgraph.blocks.consistency import chi_square_band, inside, state_nees
+from flowgraph.blocks.flights.worlds import load_world
+from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply, to_matrix
+from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.pose_model import start_state
+from flowgraph.graphs import ekf, ukf
+from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
+
+RUNS = 50
+
+
+@cache
+def a_case(seconds: float = 3.0, **settings: Any) -> Case:
+    return ukf.case(thesis(1, seconds, vicon_phase=0.0123), **settings)
+
+
+@pytest.mark.parametrize("mean", ["markley", "kraft"])
+def test_the_engines_agree(mean):
+    pytest.importorskip("jax")
+    case = a_case(1.5, mean=mean)
+    result = engines_agree(case.graph, case.inputs)
+    assert len(result["innovation"]) == 6
+
+
+def test_it_is_lowered_and_drawn():
+    is_lowered_and_drawn(a_case(), "predict_unscented", "update_unscented", "named_pose")
+
+
+FLIGHTS: dict[str, Any] = {
+    "thesis": lambda seed: thesis(seed, 10.0),
+    "figure": lambda seed: load_flight("sim", seed=seed, settings={"duration": "10"}),
+    "smooth": smooth,
+}
+
+
+@pytest.mark.parametrize("family", FLIGHTS)
+def test_it_is_as_good_as_the_extended_filter(family):
+    """Position and attitude within 1 %, the NEES within 2 %: at these noises there is little to gain."""
+    total = {}
+    for which in (ekf, ukf):
+        scores = []
+        for seed in (1, 2):
+            flight = FLIGHTS[family](seed)
+            case = which.case(flight)
+            result = simulate(case.graph, case.inputs)
+            assert flight.truth is not None
+            nees = state_nees(result["belief"][200:], flight.truth).mean()
+            score = case.score(result)
+            assert score["position_3sigma"] > 0.97
+            scores.append([score["position_rmse_m"], score["attitude_rmse_deg"], nees])
+        total[which.name] = np.mean(scores, axis=0)
+    assert (total["ukf"] < np.array([1.01, 1.01, 1.02]) * total["ekf"]).all(), total
+
+
+def test_single_precision_follows_double():
+    """At alpha = 1, within 1 mm and 0.02 degrees over a flight of 10 s; alpha = 0.01 is refused there."""
+    case = ukf.case(thesis(1, 10.0))
+    double, single = (
+        simulate(case.graph, case.inputs, engine="reference", dtype=dtype)["belief"]
+        for dtype in ("float64", "float32")
+    )
+    assert (double.position != single.position).any()
+    assert np.abs(double.position - single.position).max() < 1e-3
+    assert geodesic_angle(double.attitude, single.attitude).max() < 0.02
+    scale = np.sqrt(np.einsum("nii->ni", double.covariance))
+    apart = np.abs(double.covariance - single.covariance) / (scale[:, :, None] * scale[:, None, :])
+    assert apart.max() < 1e-3
+    close = ukf.case(thesis(1, 10.0), alpha=0.01)
+    refused = (
+        r"predict_unscented: [\s\S]*alpha >= 0.1 in float32 or fixed point[\s\S]*central weight is -1e\+04"
+    )
+    for run in (
+        lambda: lower(close.graph, dtype="float32"),
+        lambda: lower(close.graph, dtype="fixed"),
+        lambda: simulate(close.graph, close.inputs, engine="reference", dtype="float32"),
+    ):
+        with pytest.raises(LoweringError, match=refused):
+            run()
+
+
+def test_the_spread_of_the_points_changes_little():
+    found = [case.score(simulate(case.graph, case.inputs)) for case in (a_case(), a_case(alpha=0.001))]
+    assert abs(found[0]["position_rmse_m"] - found[1]["position_rmse_m"]) < 5e-3
+
+
+# The thesis's experiment
+
+
+THESIS = {
+    "HHH": (0.0345, 0.00517),
+    "HHL": (0.0920, 0.00917),
+    "HLL": (0.0329, 0.0102),
+    "LHH": (0.290, 0.326),
+    "LHL": (0.930, 0.295),
+    "LLL": (0.327, 0.324),
+}
+"""What the thesis prints for its UKF: mean squares, of metres and of squared Frobenius distances."""
+
+
+@cache
+def experiment(setting: str, seed: int) -> Flight:
+    vicon, force, rate = (1.0 if letter == "L" else 0.1 for letter in setting)
+    return load_world(
+        "thesis",
+        seed=seed,
+        settings={
+            "sensors": "gyro,coordinate_acceleration,vicon",
+            "gyro.noise": math.sqrt(rate / 200.0),
+            "coordinate_acceleration.noise": math.sqrt(force / 200.0),
+            "vicon.noise": math.sqrt(0.1 * vicon),
+            "vicon.attitude_noise": math.sqrt(0.1 * vicon),
+        },
+    )
+
+
+@pytest.mark.parametrize(
+    "setting", [s if s in ("HLL", "LLL") else pytest.param(s, marks=pytest.mark.slow) for s in THESIS]
+)
+def test_it_is_better_than_the_thesiss_in_its_own_metric(setting):
+    squares = []
+    for seed in range(2):
+        flight = experiment(setting, seed)
+        case = ukf.case(flight)
+        belief = simulate(case.graph, case.inputs)["belief"]
+        assert flight.truth is not None
+        p, q = interpolate_pose(flight.truth, belief.time)
+        R = to_matrix(belief.attitude, xp=np) - to_matrix(q, xp=np)
+        distance = np.einsum("nij,nij->n", R, R)
+        squares.append([np.mean(np.sum((belief.position - p) ** 2, axis=-1)), np.mean(distance**2)])
+    assert (np.mean(squares, axis=0) < THESIS[setting]).all()
+
+
+# Consistency
+
+
+def start(seed: int) -> dict[str, Gaussian]:
+    """A start whose error is drawn from its spread."""
+    truth = smooth(seed).truth
+    assert truth is not None
+    error = np.random.default_rng(seed).normal(size=9) * np.repeat([0.5, 0.5, 0.1], 3)
+    q = multiply(truth["attitude"][0], from_rotation_vector(-error[6:], xp=np), xp=np)
+    return {
+        "belief": start_state(
+            truth["position"][0] + error[:3],
+            q,
+            velocity=truth["velocity"][0] + error[3:6],
+            position_deviation=0.5,
+            velocity_deviation=0.5,
+            attitude_deviation=0.1,
+        )
+    }
+
+
+@cache
+def consistent_ticks(base: int, factor: float) -> float:
+    """The fraction of ticks at which the mean NEES of 50 runs lies in its band, with R times `factor`."""
+    noise = 0.1 * factor**0.5
+    case = ukf.case(smooth(base), position_noise=noise, attitude_noise=noise)
+    seeds = range(base, base + RUNS)
+    batch = many(case.graph, lambda seed: dict(smooth(seed).streams), seeds, init=start, keep=["belief"])
+    found = mean_nees(batch["belief"], [smooth(seed) for seed in seeds])
+    return inside(found, chi_square_band(9, runs=RUNS))
+
+
+def test_the_nees_of_50_runs_lies_in_its_band():
+    pytest.importorskip("jax")
+    assert consistent_ticks(0, 1.0) >= 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_the_same_test_fails_with_a_wrong_noise(factor):
+    pytest.importorskip("jax")
+    assert consistent_ticks(0, factor) < 0.8
+
+
+# Bad input
+
+
+def test_a_flight_without_motion_capture_or_without_an_imu_is_refused():
+    whole = thesis(1, 3.0)
+    for kept in ("imu", "vicon"):
+        with pytest.raises(DataError, match=rf"lacks what ukf needs[\s\S]*imu, vicon[\s\S]*got: +{kept}"):
+            ukf.case(Flight(whole.name, {kept: whole.streams[kept]}, whole.truth, whole.info))
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(DeclarationError, match=r"ukf\.alpha: setting 'alpha' is out of range"):
+        ukf.case(thesis(1, 3.0), alpha=0.0)
+    with pytest.raises(DeclarationError, match="kappa takes all the spread away"):
+        ukf.case(thesis(1, 3.0), kappa=-15.0)
+    with pytest.raises(DeclarationError, match=r"SigmaPoints: [\s\S]*finite beta"):
+        ukf.case(thesis(1, 3.0), beta=math.inf)
