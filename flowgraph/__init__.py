@@ -19,6 +19,7 @@ from flowgraph.errors import (
     TypeMismatchError,
     UnknownNameError,
 )
+from flowgraph.export import write_tum
 from flowgraph.graph import Graph
 from flowgraph.inputs import arrays, clocks_of, ticks, timing_of
 from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
@@ -123,6 +124,7 @@ __all__ = [
     "unzip",
     "when",
     "window",
+    "write_tum",
     "zip",
     "zip_latest",
     "zip_latest_right",

@@ -66,5 +66,11 @@ class Result:
 
         return plot_result(self, file, outputs=outputs)
 
+    def to_xarray(self) -> Any:
+        """An `xarray.DataTree` with a dataset a stream; see `flowgraph.export`. Needs the extra xarray."""
+        from flowgraph.export import to_xarray
+
+        return to_xarray(self)
+
     def __repr__(self) -> str:
         return f"<Result of {self.graph} ({self.engine}): {self.ticks} ticks, {', '.join(self.series)}>"

@@ -251,7 +251,8 @@ def test_json_is_all_there_is_on_standard_output(tmp_path):
     )
     assert json.loads(done.stdout)["graph"] == "ins_eskf"
     assert "Fontconfig" not in done.stderr
-    assert {f.name for f in (tmp_path / "new").iterdir()} == {"diagram.svg", "metrics.json", "navigation.png"}
+    written = {"diagram.svg", "estimate.tum", "metrics.json", "navigation.png"}
+    assert {f.name for f in (tmp_path / "new").iterdir()} == written
 
 
 def test_other_words_on_standard_error_pass():

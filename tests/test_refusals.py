@@ -47,7 +47,7 @@ from flowgraph import (
     simulate,
     zip,
 )
-from flowgraph.blocks.flights import euroc
+from flowgraph.blocks.datasets import euroc
 from flowgraph.blocks.signals import CoordinateAcceleration, SpecificForce
 from flowgraph.cli import app
 from tests.support import isolated, scalars
@@ -134,8 +134,8 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         ["x, row 1", "not finite", "finite numbers", "t = 5 ns", 'not_finite="absent"'],
     ),
     (
-        "NaN sample in a file",
-        lambda tmp: euroc.load(str(folder(tmp, IMU.replace("9.81\n6000", "nan\n6000")))),
+        "infinite sample in a file",
+        lambda tmp: euroc.load(str(folder(tmp, IMU.replace("9.81\n6000", "inf\n6000")))),
         DataError,
         ["data.csv", "2"],
     ),
@@ -259,7 +259,7 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         "unknown kind of flight",
         lambda _: load_flight("eurok:x"),
         UnknownNameError,
-        ["no kind of flight is called 'eurok'", "euroc, sim", "did you mean 'euroc'"],
+        ["no kind of flight is called 'eurok'", "euroc", "did you mean 'euroc'"],
     ),
     (
         "latest without init",
@@ -386,8 +386,8 @@ COMMANDS: list[tuple[str, Callable[[Path], tuple[str, ...]], int, list[str]]] = 
         ["data.csv", "3", "7"],
     ),
     (
-        "NaN sample",
-        lambda tmp: (*RUN, with_leica(tmp, IMU.replace("9.81\n6000", "nan\n6000"))),
+        "infinite sample",
+        lambda tmp: (*RUN, with_leica(tmp, IMU.replace("9.81\n6000", "inf\n6000"))),
         1,
         ["data.csv", "2"],
     ),
@@ -409,7 +409,7 @@ def test_the_command_fails_with_a_message(arguments, status, words, tmp_path):
 def test_the_status_is_that_of_the_process(tmp_path):
     for arguments, status, word in (
         (("run", "ins_eksf", "--data", "sim"), 2, "did you mean 'ins_eskf'"),
-        ((*RUN, with_leica(tmp_path, IMU.replace("9.81\n6000", "nan\n6000"))), 1, "data.csv"),
+        ((*RUN, with_leica(tmp_path, IMU.replace("9.81\n6000", "inf\n6000"))), 1, "data.csv"),
     ):
         done = command(*arguments)
         assert done.returncode == status, done.stderr

@@ -1,12 +1,11 @@
-"""Flights: where recorded and simulated data come from.
+"""Simulated flights. Recorded ones are in `flowgraph.blocks.datasets`.
 
 Each module has one entry point, `load(argument, *, seed=0, settings={}) -> Flight`; `simulated` makes
-quadrotor flights (`worlds` has those through the simulated world), `euroc` reads a folder of the EuRoC MAV
-dataset.
+quadrotor flights; `worlds` has those through the simulated world.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.flights import euroc, simulated
+from flowgraph.blocks.flights import simulated
 
-__all__ = ["euroc", "simulated"]
+__all__ = ["simulated"]

@@ -27,6 +27,7 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.errors import DataError, FlowgraphError, writes
+from flowgraph.export import write_tum
 from flowgraph.progress import ProgressBar
 from flowgraph.registry import Case, find_graph, flight_names, graph_names
 from flowgraph.result import Result
@@ -158,6 +159,10 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
         file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     if case.estimate not in result.series:
         return
+    estimate = result[case.estimate]
+    if "attitude" in estimate.leaves and len(estimate):
+        with writing(out / "estimate.tum") as file:
+            write_tum(estimate, file)
     if "position" in result[case.estimate].leaves:
         with writing(out / "navigation.png") as file:
             plot_navigation(result[case.estimate], flight.truth, file)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights import euroc
-from flowgraph.blocks.flights.tables import nanoseconds
+from flowgraph.blocks.datasets import euroc
+from flowgraph.blocks.datasets.tables import nanoseconds
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
 START = 1403636579758560001  # odd in its last digit: a float64 would lose it
@@ -165,7 +165,7 @@ def test_missing_folders_and_files_are_named(folder, tmp_path):
         ("{t},1,2,3,4,5", "wrong number of columns"),
         ("{t},1,2,3,4,5,6,7", "wrong number of columns"),
         ("{t},1,2,three,4,5,6", "column 4 is not a finite number"),
-        ("{t},1,2,3,4,nan,6", "column 6 is not a finite number"),
+        ("{t},1,2,3,4,-inf,6", "column 6 is not a finite number"),
         ("{t},1,2,3,4,5,inf", "column 7 is not a finite number"),
         ("{t},1,,3,4,5,6", "column 3 is not a finite number"),
         ("1.4e18,1,2,3,4,5,6", "the stamp is not a time"),

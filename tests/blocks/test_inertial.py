@@ -11,7 +11,7 @@ import pytest
 from flowgraph.blocks import geometry as g
 from flowgraph.blocks.aiding import aid_attitude, aid_position
 from flowgraph.blocks.alignment import StartSpread, level_attitude, start_belief
-from flowgraph.blocks.flights import euroc
+from flowgraph.blocks.datasets import euroc
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.metrics import interpolate_pose
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position, SpecificForce

@@ -12,7 +12,8 @@ import pytest
 
 import flowgraph
 from flowgraph import Block, FlowgraphError, Signal, errors, find_graph
-from flowgraph.blocks.flights import euroc, simulated
+from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rosbag, tum
+from flowgraph.blocks.flights import simulated
 from flowgraph.ops import OPS
 from flowgraph.registry import graph_names
 
@@ -104,7 +105,9 @@ def test_every_field_of_the_description_is_explained() -> None:
 
 def test_every_flight_setting_is_listed() -> None:
     words = code_words(page("data"))
-    assert set(simulated.DEFAULTS) | set(euroc.SETTINGS) <= words
+    assert set(simulated.DEFAULTS) <= words
+    for module in (broad, csv_file, ese650, euroc, rosbag, tum):
+        assert set(module.SETTINGS) <= words, module.__name__
 
 
 def test_every_error_is_listed() -> None:

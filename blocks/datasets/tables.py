@@ -7,6 +7,7 @@ through line by line, to find the row to blame.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from flowgraph.errors import DataError
 
-__all__ = ["POLICIES", "nanoseconds", "read_table"]
+__all__ = ["POLICIES", "in_order", "nanoseconds", "read_table"]
 
 POLICIES = ("raise", "drop", "sort")
 """What to do with rows whose time does not increase: refuse them; leave them out; sort, and of equal times
@@ -44,6 +45,7 @@ def read_table(
     delimiter: str | None = ",",
     seconds: bool = False,
     quaternion: int | None = None,
+    gaps: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Read rows of a stamp and `columns` numbers. Empty lines and lines that start with # are passed over.
 
@@ -54,6 +56,7 @@ def read_table(
         delimiter: between columns; None for white space.
         seconds: whether a stamp is decimal seconds instead of integer nanoseconds.
         quaternion: the first of four columns that must have a norm within 1 % of 1; they are normalised.
+        gaps: whether a NaN is data, a number that was not measured; otherwise it is refused.
 
     Returns:
         Times (n,) int64 ns, increasing; numbers (n, columns) float64; and notes on what was left out or
@@ -82,7 +85,7 @@ def read_table(
         time = np.array([nanoseconds(t) for t in table["time"]] if seconds else table["time"], dtype=np.int64)
         x = np.ascontiguousarray(table["x"])
     except (ValueError, OverflowError, Warning) as error:
-        _blame(file, text, lines, columns, delimiter, seconds)
+        _blame(file, text, lines, columns, delimiter, seconds, gaps)
         raise DataError(
             "this is not a table of numbers",
             path=f"{file}, lines {lines[0] + 1} to {lines[-1] + 1}",
@@ -90,8 +93,8 @@ def read_table(
             got=str(error),
             fix="mend or delete the row",
         ) from error
-    if not np.isfinite(x).all():
-        _blame(file, text, lines, columns, delimiter, seconds)
+    if np.isinf(x).any() or (not gaps and np.isnan(x).any()):
+        _blame(file, text, lines, columns, delimiter, seconds, gaps)
     if quaternion is not None:
         part = x[:, quaternion : quaternion + 4]
         norm = np.linalg.norm(part, axis=-1, keepdims=True)
@@ -105,37 +108,52 @@ def read_table(
                 fix="mend or delete the row",
             )
         x[:, quaternion : quaternion + 4] = part / norm
-    return _ordered(file, lines, time, x, bad_time)
+    where = "/".join(file.parts[-2:])
+    return in_order(where, lambda k: f"{file}, line {lines[k] + 1}", time, x, bad_time)
 
 
-def _ordered(
-    file: Path, lines: list[int], time: np.ndarray, x: np.ndarray, bad_time: str
+def in_order(
+    name: str, row: Callable[[int], str], time: np.ndarray, x: np.ndarray, bad_time: str
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Times (n,) and rows (n, ...) with increasing time, as `bad_time` (of `POLICIES`) says, and notes.
+
+    Args:
+        name: what the notes are about.
+        row: what to call row k in a message.
+
+    Raises:
+        DataError: with bad_time="raise", for the first row that is not later than all before it.
+    """
     before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(time)[:-1]])
-    bad = np.flatnonzero(time <= before)
+    bad = np.flatnonzero(time <= before) if len(time) else time[:0]
     if not len(bad):
         return time, x, []
     if bad_time == "raise":
-        k = bad[0]
+        k = int(bad[0])
         raise DataError(
             "time does not increase",
-            path=f"{file}, line {lines[k] + 1}",
+            path=row(k),
             expected=f"a stamp after {before[k]} ns",
             got=f"{time[k]} ns",
             fix="bad_time=drop leaves such rows out, bad_time=sort sorts them in",
         )
-    where = "/".join(file.parts[-2:])
     if bad_time == "drop":
         kept = time > before
-        return time[kept], x[kept], [f"{where}: {len(bad)} rows out of order left out"]
+        return time[kept], x[kept], [f"{name}: {len(bad)} rows out of order left out"]
     times, first = np.unique(time, return_index=True)
     twice = len(time) - len(times)
-    note = f"{where}: sorted, {len(bad)} rows were out of order"
+    note = f"{name}: sorted, {len(bad)} rows were out of order"
     return times, x[first], [note + (f", {twice} of equal time left out" if twice else "")]
 
 
 def _blame(
-    file: Path, text: list[str], lines: list[int], columns: int, delimiter: str | None, seconds: bool
+    file: Path,
+    text: list[str],
+    lines: list[int],
+    columns: int,
+    delimiter: str | None,
+    seconds: bool,
+    gaps: bool,
 ) -> None:
     """Raise a DataError for the first malformed row."""
     for i in lines:
@@ -163,7 +181,8 @@ def _blame(
             ) from None
         for column, cell in enumerate(cells[1:], start=2):
             try:
-                finite = "_" not in cell and bool(np.isfinite(float(cell)))
+                number = float(cell)
+                finite = "_" not in cell and bool(np.isfinite(number) or (gaps and np.isnan(number)))
             except ValueError:
                 finite = False
             if not finite:

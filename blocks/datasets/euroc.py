@@ -22,11 +22,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights.tables import POLICIES, nanoseconds, read_table
+from flowgraph.blocks.datasets.shape import MOST_OFFSET, known, offset, policy, present
+from flowgraph.blocks.datasets.tables import POLICIES, read_table
 from flowgraph.blocks.geometry import conjugate, multiply
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.errors import DataError
 
 __all__ = ["LEICA_LEVER", "SETTINGS", "load"]
 
@@ -41,9 +42,6 @@ SETTINGS: Mapping[str, str] = {
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
 }
 """The settings of `load` and what they mean. An offset is rounded to nanoseconds once."""
-
-MOST_OFFSET = 1_000_000
-"""The largest time offset in s, 11 days: clocks of one recording are not farther apart."""
 
 _RATES = (1e-3, 1e6)  # Hz
 
@@ -68,7 +66,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         A `Flight`. truth: `NavigationState` from state_groundtruth_estimate0, else `Pose` from
         groundtruth.tum, else None. info: `imu_noise` (`ImuNoise`), `imu_period_ns`, `leica_lever` (m, body),
         `vicon_lever` (m, body) and `vicon_mount` (quaternion, sensor to body), which is already
-        taken out of the attitudes: they are the body's.
+        taken out of the attitudes: they are the body's. `absent`: by stream, how many rows held NaN.
 
     Raises:
         DataError: a folder or file is missing, a row is malformed (file, line) or out of order, or no aiding
@@ -76,13 +74,17 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         DeclarationError: for a setting that is not usable.
         UnknownNameError: for a setting or policy that is not there; lists the valid ones.
     """
-    offsets, policy = _settings(settings or {})
+    given = settings or {}
+    known(given, SETTINGS, "euroc")
+    bad_time = policy(given, "euroc")
+    offsets = {n.split(".")[0]: offset(given, n, "euroc") for n in SETTINGS if n.endswith(".time_offset")}
     mav = _find(Path(argument).expanduser())
     notes: list[str] = []
 
     def table(name: str, file: Path, columns: int, **more: Any) -> tuple[np.ndarray, np.ndarray]:
-        time, numbers, said = read_table(file, columns=columns, bad_time=policy, **more)
+        time, numbers, said = read_table(file, columns=columns, bad_time=bad_time, gaps=True, **more)
         notes.extend(said)
+        time, numbers = present(name, str(file), time, numbers, notes, absent)
         if offsets[name]:
             notes.append(f"{name}: stamps shifted by {offsets[name]} ns")
             reach = 2**63 - 1 - MOST_OFFSET * 10**9
@@ -96,7 +98,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
                 )
         return time + offsets[name], numbers
 
-    info: dict[str, Any] = {}
+    absent: dict[str, int] = {}
+    info: dict[str, Any] = {"absent": absent}
     time, u = table("imu", _need(mav / "imu0" / "data.csv", "the IMU's data"), 6)
     streams = {"imu": Series(time, Imu(gyro=u[:, :3], specific_force=u[:, 3:]), name="imu")}
     info["imu_noise"], info["imu_period_ns"] = _imu_info(mav / "imu0" / "sensor.yaml")
@@ -150,31 +153,6 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         notes.append("no ground truth: no state_groundtruth_estimate0/data.csv and no groundtruth.tum")
     name = mav.parent.name if mav.name == "mav0" else mav.name
     return Flight(name=name, streams=streams, truth=truth, info=info, notes=tuple(notes))
-
-
-def _settings(given: Mapping[str, str | float]) -> tuple[dict[str, int], str]:
-    offsets, policy = {name.split(".")[0]: 0 for name in SETTINGS if "." in name}, POLICIES[0]
-    for name, value in given.items():
-        if name not in SETTINGS:
-            raise UnknownNameError("setting", name, SETTINGS, path="euroc")
-        if name == "bad_time":
-            if value not in POLICIES:
-                raise UnknownNameError("bad_time policy", value, POLICIES, path="euroc")
-            policy = str(value)
-            continue
-        try:
-            offsets[name.split(".")[0]] = nanoseconds(str(value))
-            if abs(offsets[name.split(".")[0]]) > MOST_OFFSET * 10**9:
-                raise ValueError
-        except ValueError:
-            raise DeclarationError(
-                f"setting {name!r} is not usable",
-                path="euroc",
-                expected=f"a number of seconds, at most {MOST_OFFSET} either way",
-                got=repr(value),
-                fix=f"for example {name}=-0.135",
-            ) from None
-    return offsets, policy
 
 
 def _find(folder: Path) -> Path:

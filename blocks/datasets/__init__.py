@@ -1,0 +1,20 @@
+"""Recorded data as flights: one module a format, one shape for all of them.
+
+Each module has one entry point, `load(argument, *, seed=0, settings={}) -> Flight`, and a mapping `SETTINGS`
+of what it understands. Nothing is opened, and no library of a format imported, before `load` is called; what
+it returns is whole:
+
+    streams   `Series` of SI signals by name: imu, vicon, magnetometer, gps, ...
+    truth     `Series` of what is known to be right, where it is known; rows of NaN are masked out
+    info      calibration and noise by name, and `absent`: by stream, how many samples were NaN
+    notes     what was dropped, masked, shifted or assumed, a sentence each
+
+Rows out of order follow the setting `bad_time` (`tables.POLICIES`); values that cannot be of the unit that a
+stream declares are refused.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rosbag, tum
+
+__all__ = ["broad", "csv_file", "ese650", "euroc", "rosbag", "tum"]
