@@ -7,7 +7,7 @@ not depend on how many others are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
+from flowgraph.optimise import for_engine, without
 from flowgraph.pipeline import Pipeline, Port
 from flowgraph.playback import check_faults, dense, real_leaves
 from flowgraph.random import seed_words
@@ -112,6 +113,7 @@ def simulate_many(
     keep: Sequence[str] | None = None,
     runs_at_once: int = RUNS_AT_ONCE,
     progress: Meter | None = None,
+    passes: Collection[str] | None = None,
 ) -> Batch:
     """Run a graph once for each seed.
 
@@ -124,6 +126,7 @@ def simulate_many(
         keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out.
         runs_at_once: size of a chunk of runs in XLA.
         progress: told the number of finished runs.
+        passes: of the optimiser, as for `simulate`.
 
     Raises:
         DeclarationError: without a seed, or where one is none.
@@ -155,8 +158,8 @@ def simulate_many(
     if dtype not in ("float64", "float32"):
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
     if engine == "xla":
-        return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress)
-    return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress)
+        return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
+    return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
 
 
 def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
@@ -181,7 +184,7 @@ def _for_seed(given: Any, seed: int) -> Any:
 
 def _one_by_one(
     graph: Graph, inputs: Any, seeds: tuple[int, ...], engine: str, dtype: str, init: Any,
-    kept: dict[str, list[str]], progress: Meter | None,
+    kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
 ) -> Batch:  # fmt: skip
     from flowgraph.simulate import simulate
 
@@ -191,8 +194,9 @@ def _one_by_one(
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
         result = simulate(
-            graph, _for_seed(inputs, seed), engine=engine, dtype=dtype, init=_for_seed(init, seed), seed=seed
-        )
+            graph, _for_seed(inputs, seed), engine=engine, dtype=dtype, init=_for_seed(init, seed), seed=seed,
+            passes=passes,
+        )  # fmt: skip
         wall, ticks = wall + result.wall_s, result.ticks
         for name in kept:
             parts[name].append(result[name])
@@ -218,7 +222,7 @@ def _joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
 
 def _vectorised(
     graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
-    kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None,
+    kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None, passes: Collection[str] | None,
 ) -> Batch:  # fmt: skip
     from flowgraph.xla import Scan, bytes_per_tick, import_jax
 
@@ -228,12 +232,15 @@ def _vectorised(
     shared = not callable(inputs)
     first = tape(prepare(graph, inputs if shared else inputs(seeds[0])), graph)
     if not len(first.time):  # nothing to compile for
-        nothing = _one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress)
+        nothing = _one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress, None)
         return replace(nothing, engine="xla")
     keys = tuple(int(k) for k in np.unique(first.key))
     per_tick = runs_at_once * bytes_per_tick(pipeline)
     ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
-    scan = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared)
+    chosen = for_engine("xla", passes)
+    if init is not None:
+        chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
+    scan = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen)
     dense_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []
     wall = 0.0

@@ -5,7 +5,7 @@ Works from the description alone: a pipeline read from disk needs no graph and n
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -17,6 +17,7 @@ from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, Graph, SourceNode
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
+from flowgraph.optimise import for_engine, usable
 from flowgraph.pipeline import Cell, Leaf, Pipeline, Port, type_of_leaves
 from flowgraph.random import seed_words
 from flowgraph.reference import Player
@@ -56,6 +57,7 @@ def play(
     state: Any,
     seed: int,
     progress: Meter | None,
+    passes: Collection[str] | None = None,
 ) -> Result:
     """Lower a graph and play it; the result has the graph's own signal types."""
     check_start(init, state, path=graph.name)
@@ -67,7 +69,7 @@ def play(
     cells = [leaf for index, node in graph.registers for leaf in flatten(slots[index], node.type)]
     events = tape(prepare(graph, inputs, last), graph)
     types = [graph.port(c.wire).type for c in graph.collected]
-    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress)
+    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress, passes)
 
 
 def run_pipeline(
@@ -80,6 +82,7 @@ def run_pipeline(
     state: Mapping[str, Any] | None = None,
     seed: int = 0,
     progress: Meter | None = None,
+    passes: Collection[str] | None = None,
 ) -> Result:
     """Play a pipeline without its graph; see `Pipeline.run`."""
     if engine not in ("reference", "xla"):
@@ -97,7 +100,7 @@ def run_pipeline(
         cells = [leaf for r in pipeline.registers for leaf in found[r.path]]
     events = tape(prepare(sources, _inputs(pipeline, inputs), last), sources)
     types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
-    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress)
+    return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress, passes)
 
 
 def _sources(pipeline: Pipeline) -> Graph:
@@ -243,11 +246,18 @@ def _result(
     dtype: str,
     seed: int,
     progress: Meter | None,
+    passes: Collection[str] | None,
 ) -> Result:
     pipeline.need_numbers(dtype)
     real = np.dtype(dtype)
     outcome = (_reference if engine == "reference" else _xla)(
-        pipeline, events, cells, real, seed_words(seed), progress
+        pipeline,
+        events,
+        cells,
+        real,
+        seed_words(seed),
+        progress,
+        usable(pipeline, for_engine(engine, passes), cells),
     )
     check_faults(pipeline, outcome.cells)
     series = {}
@@ -300,10 +310,15 @@ def real_leaves(series: Series, real: Any) -> list[np.ndarray]:
 
 
 def _reference(
-    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None
-) -> _Outcome:
+    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None,
+    passes: tuple[str, ...],
+) -> _Outcome:  # fmt: skip
     player = Player(
-        pipeline, [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells], real, seed
+        pipeline,
+        [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells],
+        real,
+        seed,
+        passes,
     )
     rows = [_rows(real_leaves(s, real)) for s in events.series]
     outputs: list[tuple[list[int], list[tuple[Any, ...]]]] = [([], []) for _ in pipeline.outputs]
@@ -334,17 +349,18 @@ def _rows(leaves: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
 
 
 def _xla(
-    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None
-) -> _Outcome:
+    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None,
+    passes: tuple[str, ...],
+) -> _Outcome:  # fmt: skip
     from flowgraph.xla import Scan, chunk_size, import_jax
 
     import_jax()
     keys = events.patterns
     chunk = chunk_size(pipeline, len(events.time))
-    which = (keys, real.name, chunk)
+    which = (keys, real.name, chunk, passes)
     compiled: dict[Any, Scan] = _compiled(pipeline)
     if which not in compiled:
-        compiled[which] = Scan(pipeline, keys, real, chunk)
+        compiled[which] = Scan(pipeline, keys, real, chunk, passes=passes)
     columns = []
     for k, series in enumerate(events.series):
         leaves = real_leaves(series, real)

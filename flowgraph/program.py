@@ -7,7 +7,8 @@ instructions that only the other side needed disappear. Without one, presence st
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,10 @@ class Program:
         instructions: only those that an output or a register needs.
         outputs: for each output port, (presence, leaves) as value numbers; presence None: known absent.
         writes: for each register cell in order, the value number written back.
+        reads: for each register cell in order, the number of its value in a tick.
+        symmetric: of those, the square matrices that are symmetric at reset.
+        lanes: sizes of axes along which the same is done many times, such as particles.
+        origin: for a value that an optimisation has added, the value of the pipeline that it serves.
     """
 
     constants: Mapping[int, np.ndarray]
@@ -32,6 +37,10 @@ class Program:
     outputs: tuple[tuple[int | None, tuple[int, ...]], ...]
     writes: tuple[int, ...]
     specs: Mapping[int, Spec]
+    reads: tuple[int, ...] = ()
+    symmetric: frozenset[int] = frozenset()
+    lanes: frozenset[int] = frozenset()
+    origin: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def work(self) -> int:
@@ -72,9 +81,34 @@ def specialise(pipeline: Pipeline, key: int | None) -> Program:
     live, needed = _live(
         kept, [*writes, *(n for p, leaves in outputs for n in (*leaves, *([] if p is None else [p])))]
     )
+    cells = [c for r in pipeline.registers for c in r.cells]
     return Program(
-        {n: a for n, a in constants.items() if n in needed}, live, tuple(outputs), writes, pipeline.specs
+        {n: a for n, a in constants.items() if n in needed},
+        live,
+        tuple(outputs),
+        writes,
+        pipeline.specs,
+        tuple(c.read for c in cells),
+        frozenset(c.read for c in cells if is_symmetric(c.reset)),
+        _lanes(pipeline),
     )
+
+
+_WIDE = 32
+
+
+def _lanes(pipeline: Pipeline) -> frozenset[int]:
+    """Sizes of named axes that are wider than any matrix of a filter."""
+    parts = [c for r in pipeline.registers for c in r.cells]
+    parts += [x for port in (*pipeline.inputs, *pipeline.outputs) for x in port.leaves]  # type: ignore[misc]
+    named = (n for part in parts for n, axis in zip(part.shape, part.axes, strict=False) if axis)
+    return frozenset(n for n in named if n > _WIDE)
+
+
+def is_symmetric(value: Any) -> bool:
+    """Whether this is a square matrix that equals its transpose to the bit."""
+    array = np.asarray(value)
+    return array.ndim == 2 and array.shape[0] == array.shape[1] and bool((array == array.T).all())
 
 
 def _fold(

@@ -6,7 +6,7 @@ compiled backend, and never an exception.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -49,10 +49,19 @@ class Player:
         cells: the value of each register cell, in order.
         dtype: what `real` is.
         seed: (2,) uint32.
+        passes: of the optimiser; without them the list is played as it was lowered, which is the definition.
     """
 
-    def __init__(self, pipeline: Pipeline, cells: list[Any], dtype: Any, seed: np.ndarray) -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        cells: list[Any],
+        dtype: Any,
+        seed: np.ndarray,
+        passes: Collection[str] = (),
+    ) -> None:
         self.pipeline, self.cells, self.dtype, self.seed = pipeline, cells, dtype, seed
+        self._passes = passes
         self._reads = [c.read for r in pipeline.registers for c in r.cells]
         self._leaves = [[leaf.value for leaf in port.leaves] for port in pipeline.inputs]
         self._programs: dict[int, tuple[Program, list[Any], dict[int, Any]]] = {}
@@ -61,6 +70,10 @@ class Player:
         """One tick: `values` are the leaves of the present inputs; returns those of each output, or None."""
         if key not in self._programs:
             program = specialise(self.pipeline, key)
+            if self._passes:
+                from flowgraph.optimise import optimise  # folds constants with this interpreter
+
+                program = optimise(program, self._passes)
             known = {n: _as(a, self.dtype) for n, a in program.constants.items()} | self._blanks(key)
             self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions], known
         program, steps, known = self._programs[key]

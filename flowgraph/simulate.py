@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from flowgraph.errors import DeclarationError, UnknownNameError
@@ -28,6 +28,7 @@ def simulate(
     seed: int = ...,
     seeds: None = ...,
     progress: Meter | None = ...,
+    passes: Collection[str] | None = ...,
 ) -> Result: ...
 @typing.overload
 def simulate(
@@ -41,6 +42,7 @@ def simulate(
     seed: int = ...,
     seeds: Sequence[int],
     progress: Meter | None = ...,
+    passes: Collection[str] | None = ...,
 ) -> Batch: ...
 def simulate(
     graph: Graph,
@@ -53,6 +55,7 @@ def simulate(
     seed: int = 0,
     seeds: Sequence[int] | None = None,
     progress: Meter | None = None,
+    passes: Collection[str] | None = None,
 ) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
@@ -68,6 +71,8 @@ def simulate(
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
         seeds: run once for each of them, and return a `Batch`; `simulate_many` has more to choose.
         progress: an object that is told how far the run is.
+        passes: of the optimiser, from `flowgraph.optimise.PASSES`; None: those that suit the engine. The
+            Python engine has no list to optimise.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
@@ -87,7 +92,9 @@ def simulate(
                 got="both",
                 fix="leave one of them out",
             )
-        return simulate_many(graph, inputs, seeds, engine=engine, dtype=dtype, init=init, progress=progress)
+        return simulate_many(
+            graph, inputs, seeds, engine=engine, dtype=dtype, init=init, progress=progress, passes=passes
+        )
     need_inputs(graph, inputs)
     if engine == "python":
         if dtype != "float64":
@@ -98,9 +105,25 @@ def simulate(
                 got=dtype,
                 fix='use engine="reference" or "xla" for float32',
             )
+        if passes is not None:
+            raise DeclarationError(
+                "the Python engine runs the blocks themselves",
+                path="passes",
+                expected="no passes, or an engine that plays the instructions",
+                got='engine="python"',
+                fix='use engine="reference" or "xla"',
+            )
         return Run(graph, inputs, init=init, state=state, seed=seed).to_end(progress).result()
     from flowgraph.playback import play
 
     return play(
-        graph, inputs, engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress
+        graph,
+        inputs,
+        engine=engine,
+        dtype=dtype,
+        init=init,
+        state=state,
+        seed=seed,
+        progress=progress,
+        passes=passes,
     )

@@ -9,7 +9,7 @@ the last chunk is filled up with ticks in which nothing is present.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 
 from flowgraph.errors import MissingDependencyError
 from flowgraph.ops import OPS, bound_attrs
+from flowgraph.optimise import ARRAYS, optimise
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import Program, specialise
 
@@ -100,16 +101,18 @@ class Scan:
         chunk: ticks a call.
         runs: how many runs go at once, under `vmap`; None for one, without a leading axis.
         shared: with `runs`, whether all runs have the same inputs.
+        passes: of the optimiser.
     """
 
     def __init__(
         self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int, *,
-        runs: int | None = None, shared: bool = True,
+        runs: int | None = None, shared: bool = True, passes: Collection[str] = ARRAYS,
     ) -> None:  # fmt: skip
         self.jax = import_jax()
         self.pipeline, self.keys, self.dtype, self.chunk = pipeline, keys, dtype, chunk
-        shared_program = specialise(pipeline, None)
-        programs = [specialise(pipeline, key) for key in keys]
+        self.passes = passes
+        shared_program = self._program(None)
+        programs = [self._program(key) for key in keys]
         saved = shared_program.work - min((p.work for p in programs), default=0)
         self.branches = None if len(keys) > _MOST_PATTERNS or saved < _SMALL_WORK else programs
         self.shared = shared_program
@@ -121,6 +124,9 @@ class Scan:
             play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
         self._compiled: Any = None
         self._play_chunk = self.jax.jit(play)
+
+    def _program(self, key: int | None) -> Program:
+        return optimise(specialise(self.pipeline, key), self.passes)
 
     def compile(self, cells: list[Any], seed: np.ndarray, inputs: list[list[np.ndarray]]) -> None:
         """Compile for these shapes, once."""
@@ -184,7 +190,7 @@ class Scan:
                 program, self._start(program, cells, seed, time, inputs)
             )
 
-        nothing = specialise(self.pipeline, 0)
+        nothing = self._program(0)
         return self.jax.lax.switch(key, [branch(p) for p in [*self.branches, nothing]], cells, time, inputs)
 
     def _flagged(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:

@@ -1,0 +1,112 @@
+"""Every graph of the library computes the same with the optimiser and with each of its passes left out."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import Case, DataError, Result, find_graph, load_flight, lower, simulate
+from flowgraph.optimise import DEFAULT, PASSES, optimise, without
+from flowgraph.pipeline import Pipeline
+from flowgraph.program import specialise
+from flowgraph.registry import graph_names
+from tests.graphs.estimation import compare
+
+FLIGHTS: dict[str, tuple[str, dict[str, str]]] = {
+    "orientation_complementary": ("sim:thesis", {"sensors": "gyro,coordinate_acceleration,thrust"}),
+}
+"""Where "sim" lacks what a graph needs."""
+
+SETTINGS: dict[str, dict[str, Any]] = {"rbpf_indoor": {"particles": 60}}
+
+
+@cache
+def case_of(name: str, duration: str = "1.5") -> Case:
+    spec, settings = FLIGHTS.get(name, ("sim", {}))
+    flight = load_flight(spec, seed=0, settings={**settings, "duration": duration})
+    try:
+        return find_graph(name).case(flight, **SETTINGS.get(name, {}))
+    except DataError as error:
+        pytest.skip(f"no flight in FLIGHTS suits {name}: {error}")
+
+
+@cache
+def plain(name: str) -> Result:
+    case = case_of(name)
+    return simulate(case.graph, case.inputs, engine="reference")
+
+
+def agrees(name: str, passes: tuple[str, ...], engine: str = "reference") -> None:
+    case = case_of(name)
+    found = simulate(case.graph, case.inputs, engine=engine, passes=passes)
+    assert list(found.series) == list(plain(name).series)
+    for output, series in plain(name).series.items():
+        compare(series, found[output])
+
+
+@pytest.mark.parametrize("name", graph_names())
+def test_optimised_it_gives_the_same(name):
+    agrees(name, DEFAULT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left_out", PASSES)
+@pytest.mark.parametrize("name", graph_names())
+def test_each_pass_can_be_left_out(name, left_out):
+    agrees(name, without(left_out))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alone", PASSES)
+@pytest.mark.parametrize("name", graph_names())
+def test_each_pass_does_alone(name, alone):
+    agrees(name, (alone,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", graph_names())
+def test_xla_plays_the_optimised_list(name):
+    agrees(name, without("unroll"), engine="xla")  # unrolled it takes minutes to compile
+
+
+def programs(name: str) -> list[Any]:
+    pipeline: Pipeline = lower(case_of(name).graph)
+    return [specialise(pipeline, key) for key in (*range(1, 2 ** len(pipeline.inputs)), None)]
+
+
+@pytest.mark.parametrize("name", graph_names())
+def test_the_list_stays_in_single_assignment_form(name):
+    for program in programs(name):
+        found = optimise(program)
+        known = set(program.specs) - {i.out for i in program.instructions} | set(found.constants)
+        for i in found.instructions:
+            assert known.issuperset(i.args)
+            assert i.out not in known
+            assert found.specs[i.out] == i.spec
+            known.add(i.out)
+        assert known.issuperset(found.writes)
+
+
+def test_less_is_left_of_the_work():
+    """Of the scalar operations of a tick, with one for a multiplication and addition of a matrix product."""
+    (kalman,) = programs("kalman")[:1]
+    assert optimise(kalman, without("unroll")).work < 0.6 * kalman.work
+    eskf = programs("ins_eskf")[6]  # all sources present
+    assert optimise(eskf, without("unroll")).work < 0.4 * eskf.work
+
+
+def test_a_run_that_sets_a_covariance_otherwise_goes_without_symmetry():
+    case = case_of("kalman")
+    belief = case.graph.registers[0][1]
+    assert belief.path == "belief"
+    start = belief.initial
+    skew = np.asarray(start.covariance) + np.triu(np.full((6, 6), 0.5), k=1)
+    init = {"belief": type(start)(mean=start.mean, covariance=skew)}
+    first = {n: s[:3] for n, s in case.inputs.items()}  # type: ignore[union-attr]
+    found = [
+        simulate(case.graph, first, engine="reference", init=init, passes=p)["belief"] for p in ((), DEFAULT)
+    ]
+    np.testing.assert_allclose(found[0]["covariance"], found[1]["covariance"], rtol=1e-9, atol=1e-12)
