@@ -104,12 +104,12 @@ PerSeed = Callable[[int], Any]
 
 def simulate_many(
     graph: Graph,
-    inputs: Inputs | PerSeed,
+    inputs: Inputs | PerSeed | Sequence[Inputs],
     seeds: Sequence[int],
     *,
     engine: str = "xla",
     dtype: str = "float64",
-    init: Mapping[str, Any] | PerSeed | None = None,
+    init: Mapping[str, Any] | PerSeed | Sequence[Mapping[str, Any]] | None = None,
     keep: Sequence[str] | None = None,
     runs_at_once: int = RUNS_AT_ONCE,
     progress: Meter | None = None,
@@ -119,17 +119,18 @@ def simulate_many(
 
     Args:
         graph: a built graph.
-        inputs: as for `simulate`, shared by all runs; or a function of the seed that gives them.
+        inputs: as for `simulate`, shared by all runs; or a function of the seed that gives them; or a list,
+            one a run.
         seeds: one a run.
         engine, dtype: as for `simulate`.
-        init: other initial values, shared or a function of the seed.
+        init: other initial values, shared or a function of the seed, or a list, one a run.
         keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out.
         runs_at_once: size of a chunk of runs in XLA.
         progress: told the number of finished runs.
         passes: of the optimiser, as for `simulate`.
 
     Raises:
-        DeclarationError: without a seed, or where one is none.
+        DeclarationError: without a seed, or where one is none; for a list that is not one a run.
         DataError: where, in XLA, two runs have events at different times.
     """
     kept = _kept(graph, keep)
@@ -147,6 +148,15 @@ def simulate_many(
         )
     for seed in seeds:
         seed_words(seed)
+    for name, given in (("inputs", inputs), ("init", init)):
+        if isinstance(given, list | tuple) and len(given) != len(seeds):
+            raise DeclarationError(
+                f"the list of {name} is not one a run",
+                path=f"{graph.name}, {name}",
+                expected=f"{len(seeds)}, as many as seeds",
+                got=str(len(given)),
+                fix="give one for each seed, or one for all, not in a list",
+            )
     if isinstance(runs_at_once, bool) or not isinstance(runs_at_once, int) or runs_at_once < 1:
         raise DeclarationError(
             "runs go in chunks of a positive size",
@@ -178,8 +188,15 @@ def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
     return found
 
 
-def _for_seed(given: Any, seed: int) -> Any:
+def _of_run(given: Any, run: int, seed: int) -> Any:
+    """Inputs or initial values of the run of that place and seed."""
+    if isinstance(given, list | tuple):
+        return given[run]
     return given(seed) if callable(given) else given
+
+
+def _shared(inputs: Any) -> bool:
+    return not (callable(inputs) or isinstance(inputs, list | tuple))
 
 
 def _one_by_one(
@@ -188,14 +205,14 @@ def _one_by_one(
 ) -> Batch:  # fmt: skip
     from flowgraph.simulate import simulate
 
-    if not callable(inputs):  # an iterable can be read only once
+    if _shared(inputs):  # an iterable can be read only once
         inputs = dict(zip(graph.sources, tape(prepare(graph, inputs), graph).series, strict=True))
     parts: dict[str, list[Series]] = {name: [] for name in kept}
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
         result = simulate(
-            graph, _for_seed(inputs, seed), engine=engine, dtype=dtype, init=_for_seed(init, seed), seed=seed,
-            passes=passes,
+            graph, _of_run(inputs, n, seed), engine=engine, dtype=dtype, init=_of_run(init, n, seed),
+            seed=seed, passes=passes,
         )  # fmt: skip
         wall, ticks = wall + result.wall_s, result.ticks
         for name in kept:
@@ -228,9 +245,10 @@ def _vectorised(
 
     import_jax()
     real = np.dtype(dtype)
-    pipeline = _pruned(lower(graph, dtype=dtype), kept)
-    shared = not callable(inputs)
-    first = tape(prepare(graph, inputs if shared else inputs(seeds[0])), graph)
+    whole = lower(graph, dtype=dtype)
+    pipeline = _pruned(whole, kept)
+    shared = _shared(inputs)
+    first = tape(prepare(graph, _of_run(inputs, 0, seeds[0])), graph)
     if not len(first.time):  # nothing to compile for
         nothing = _one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress, None)
         return replace(nothing, engine="xla")
@@ -240,14 +258,22 @@ def _vectorised(
     chosen = for_engine("xla", passes)
     if init is not None:
         chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
-    scan = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen)
+    which = (keys, real.name, ticks, runs_at_once, shared, repr(kept), tuple(chosen))
+    compiled: dict[Any, Scan] = whole.__dict__.setdefault("_batched", {})  # they live as long as it does
+    if which not in compiled:
+        compiled[which] = Scan(
+            pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen
+        )
+    scan = compiled[which]
     dense_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []
     wall = 0.0
-    for n, members in enumerate(_chunks(seeds, runs_at_once)):
-        columns = dense_first if shared else _columns(_tapes(graph, inputs, members, first), False, real)
-        last = cells = _cells(graph, init, members)
-        words = np.stack([seed_words(s) for s in members])
+    for n, members in enumerate(_chunks(len(seeds), runs_at_once)):
+        columns = (
+            dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
+        )
+        last = cells = _cells(graph, init, seeds, members)
+        words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
         parts = []
@@ -277,20 +303,22 @@ def _pruned(pipeline: Pipeline, kept: dict[str, list[str]]) -> Pipeline:
     return replace(pipeline, outputs=ports)
 
 
-def _chunks(seeds: tuple[int, ...], size: int) -> Iterator[tuple[int, ...]]:
-    """Seeds in chunks of one size; the last is filled up with its last seed."""
-    for start in range(0, len(seeds), size):
-        part = seeds[start : start + size]
+def _chunks(count: int, size: int) -> Iterator[tuple[int, ...]]:
+    """Places of runs in chunks of one size; the last is filled up with its last run."""
+    for start in range(0, count, size):
+        part = tuple(range(start, min(start + size, count)))
         yield part + (part[-1],) * (size - len(part))
 
 
-def _tapes(graph: Graph, inputs: PerSeed, members: tuple[int, ...], first: Tape) -> list[Tape]:
+def _tapes(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], members: tuple[int, ...], first: Tape
+) -> list[Tape]:
     made: dict[int, Tape] = {}
-    for seed in members:
-        if seed not in made:
-            made[seed] = tape(prepare(graph, inputs(seed)), graph)
-            _same_ticks(graph, first, made[seed], seed)
-    return [made[seed] for seed in members]
+    for run in members:
+        if run not in made:
+            made[run] = tape(prepare(graph, _of_run(inputs, run, seeds[run])), graph)
+            _same_ticks(graph, first, made[run], seeds[run])
+    return [made[run] for run in members]
 
 
 def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
@@ -305,9 +333,10 @@ def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
     )
 
 
-def _cells(graph: Graph, init: Any, members: tuple[int, ...]) -> list[np.ndarray]:
+def _cells(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
     """Register cells with a leading axis of runs."""
-    slots = [initial_registers(graph, _for_seed(init, seed)) for seed in members]
+    made = {run: initial_registers(graph, _of_run(init, run, seeds[run])) for run in set(members)}
+    slots = [made[run] for run in members]
     types: list[tuple[int, Type]] = [(index, node.type) for index, node in graph.registers]
     rows = [[leaf for index, type_ in types for leaf in flatten(slot[index], type_)] for slot in slots]
     return [np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*rows, strict=True)]

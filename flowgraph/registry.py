@@ -8,8 +8,10 @@ found the same way as a user's.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
+import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -60,10 +62,16 @@ class Report:
     notes: tuple[str, ...] = ()
 
 
-def _entries(group: str) -> list[EntryPoint]:
+@functools.lru_cache(maxsize=8)
+def _entries_along(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     from importlib.metadata import entry_points  # slow to import, and only needed to look names up
 
-    return list(entry_points(group=group))
+    return tuple(entry_points(group=group))
+
+
+def _entries(group: str) -> tuple[EntryPoint, ...]:
+    """The entry points of a group; looked up once, for that reads a file of each installed package."""
+    return _entries_along(group, tuple(sys.path))
 
 
 def graph_names() -> list[str]:

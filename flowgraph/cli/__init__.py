@@ -1,4 +1,4 @@
-"""The `flowgraph` command: list, show, run, lower and bench graphs from a terminal.
+"""The `flowgraph` command: list, show, run, lower, bench and study graphs from a terminal.
 
 Results go to standard output, as a table or with `--json` as one object; everything else goes to standard
 error. Exit status 2 means that the command was used wrongly, 1 that it failed. One module holds the commands
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from flowgraph.cli import bench, filters, lower  # noqa: F401  each adds its commands
+from flowgraph.cli import bench, filters, lower, study  # noqa: F401  each adds its commands
 from flowgraph.cli.app import app
 from flowgraph.cli.terminal import give_up
 

@@ -1,0 +1,124 @@
+"""`batch`: studies over flights, seeds and parameters."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flowgraph.cli.app import app
+from flowgraph.cli.options import AsJson
+from flowgraph.cli.terminal import err_console, make_ready, out_console, print_json, reports_errors, table
+from flowgraph.errors import DeclarationError, UnknownNameError
+
+Folder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="For results; the study's own if left out.")
+]
+EXECUTORS = ("auto", "inprocess", "pool", "dask")
+
+
+@app.command()
+@reports_errors
+def batch(
+    file: Annotated[Path, typer.Argument(metavar="STUDY", help="A study in TOML, or a study.json.")],
+    out: Folder = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; with 1 all runs in this one.")] = 1,
+    executor: Annotated[str, typer.Option(help=", ".join(EXECUTORS))] = "auto",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster, such as tcp://host:8786.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Run everything anew.")] = False,
+    retry: Annotated[bool, typer.Option("--retry-failed", help="Run anew what ended in an error.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep whole trajectories.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it runs.")] = False,
+    json_lines: Annotated[
+        bool, typer.Option("--json-lines", help="Print an object a line: start, each run, end.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run a study, or what is missing of it, to a table with a row a run.
+
+    Exit status: 0, or 1 where a run failed (its row says why), 2 for a wrong study, 130 after Ctrl-C.
+    """
+    from dataclasses import replace
+
+    from flowgraph.study import Study, run_study
+
+    study = Study.load(file)
+    if keep:
+        study = replace(study, keep=True)
+    folder = out or (Path(study.out) if study.out else None)
+    if folder is None:
+        raise DeclarationError(
+            "a study needs a folder for its results",
+            path="--out",
+            expected="a folder",
+            got="none",
+            fix="write --out DIR, or out = ... in the study",
+        )
+    make_ready(folder)
+    watcher = _watcher(study, quiet=quiet or as_json, json_lines=json_lines)
+    try:
+        with _executor(executor, scheduler, workers) or nullcontext() as chosen:
+            outcome = run_study(
+                study, folder, workers=workers, executor=chosen, force=force, retry=retry, watcher=watcher
+            )
+    finally:
+        getattr(watcher, "stop", lambda: None)()
+    if as_json:
+        from flowgraph.study.progress import summary
+
+        print_json(summary(outcome))
+    elif not json_lines:
+        _show(outcome, study, quiet)
+    if outcome.interrupted:
+        err_console.print(f"stopped; to continue: {_again(sys.argv)}", markup=False)
+        raise typer.Exit(130)
+    if outcome.failed:
+        first = outcome.failed[0]
+        where = f"{first['graph']} on {first['data']}, seed {first['seed']}"
+        err_console.print(
+            f"{len(outcome.failed)} of {len(outcome.rows)} runs failed; {where}: {first['error']}", markup=False
+        )
+        raise typer.Exit(1)
+
+
+def _executor(name: str, scheduler: str | None, workers: int) -> Any:
+    """The executor asked for; None leaves the choice to the number of workers."""
+    from flowgraph.study import InProcess, OnDask, ProcessPool
+
+    if name not in EXECUTORS:
+        raise UnknownNameError("executor", name, EXECUTORS)
+    if name == "dask" or scheduler is not None:
+        return OnDask(scheduler, workers=workers)
+    return {"inprocess": InProcess, "pool": lambda: ProcessPool(workers)}.get(name, lambda: None)()
+
+
+def _watcher(study: Any, *, quiet: bool, json_lines: bool) -> Any:
+    from flowgraph.study.progress import JsonLines, Lines, LiveTable, Tally
+
+    if json_lines:
+        return JsonLines(study, sys.stdout)
+    if quiet:
+        return Tally(study)
+    return LiveTable(study, err_console) if err_console.is_terminal else Lines(study, err_console)
+
+
+def _show(outcome: Any, study: Any, quiet: bool) -> None:
+    from flowgraph.study.statistics import summarised
+
+    if not quiet and outcome.rows:
+        out_console.print(table(summarised(outcome.rows, study.names(), study.metrics, most=4)))
+    err_console.print(
+        f"{outcome.done} runs in {outcome.seconds:.1f} s, {outcome.kept} were there already;"
+        f" the table is {outcome.folder / 'results.parquet'}",
+        markup=False,
+    )
+
+
+def _again(arguments: list[str]) -> str:
+    return shlex.join(["flowgraph", *(a for a in arguments[1:] if a != "--force")])

@@ -1,0 +1,335 @@
+"""Where tasks run: here, in a pool of processes that outlives its workers, or on a Dask cluster.
+
+The protocol is small. `submit(task, function, *arguments)` takes a task's name and what to call;
+`as_completed()` yields a `Finished` for each submitted task, in the order in which they end, and more may be
+submitted while it does. A task whose worker dies is given to another; one that has killed its cap of workers
+ends with `lost`, and the rest go on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+from typing import Any, Protocol
+
+from flowgraph.errors import DeclarationError, MissingDependencyError
+
+DEATHS = 3
+"""So many workers may one task take with it before it is given up."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The end of a task.
+
+    Args:
+        task: its name.
+        value: what the function returned; None where it did not.
+        error: what it raised.
+        lost: why it could not be run to its end: its workers died.
+    """
+
+    task: str
+    value: Any = None
+    error: Exception | None = None
+    lost: str | None = None
+
+
+class Executor(Protocol):
+    """What a study needs of a place to run."""
+
+    workers: int
+
+    def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
+        """Take a task; its name must be new. Function and arguments must be picklable."""
+
+    def as_completed(self) -> Iterator[Finished]:
+        """Each task that ends, until none is left."""
+
+    def close(self) -> None:
+        """Stop, without waiting for what still runs."""
+
+    def __enter__(self) -> Executor: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+class _Closing:
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class InProcess(_Closing):
+    """One task after the other in this process."""
+
+    workers = 1
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[str, Callable[..., Any], tuple[Any, ...]]] = deque()
+
+    def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
+        self._waiting.append((task, function, arguments))
+
+    def as_completed(self) -> Iterator[Finished]:
+        while self._waiting:
+            task, function, arguments = self._waiting.popleft()
+            try:
+                done = Finished(task, function(*arguments))
+            except Exception as error:
+                done = Finished(task, error=error)
+            yield done
+
+    def close(self) -> None:
+        self._waiting.clear()
+
+
+class _Worker:
+    """A process that runs what it is sent, one task at a time."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            program = (
+                f"import json, sys; sys.path[:] = json.loads({json.dumps(json.dumps(sys.path))});"
+                f" from flowgraph.study.executors import serve; serve({theirs.fileno()})"
+            )
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", program],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=_one_thread(os.environ),
+            )
+        self.connection = Connection(ours.detach())
+        self.task: str | None = None
+
+    def stop(self) -> None:
+        self.connection.close()
+        self.process.kill()
+        self.process.wait()
+
+
+class ProcessPool(_Closing):
+    """Processes of our own, each with one task at a time, so that it is known which task a death is due to.
+
+    Not `concurrent.futures`: its pool breaks as a whole when one process dies, and cannot tell which task
+    was to blame. The processes are started anew, not forked (JAX has threads), and do not import the main
+    program.
+
+    Args:
+        workers: how many processes.
+        deaths: how many workers a task may take with it.
+    """
+
+    def __init__(self, workers: int, *, deaths: int = DEATHS) -> None:
+        _need_workers(workers)
+        self.workers, self._deaths = workers, deaths
+        self._waiting: deque[str] = deque()
+        self._work: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
+        self._died: dict[str, int] = {}
+        self._crew: list[_Worker] = []
+
+    def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
+        self._work[task] = (function, arguments)
+        self._waiting.append(task)
+
+    def pids(self) -> list[int]:
+        """The processes at work now."""
+        return [w.process.pid for w in self._crew]
+
+    def as_completed(self) -> Iterator[Finished]:
+        while self._work:
+            self._assign()
+            ready = wait([w.connection for w in self._crew])
+            for worker in [w for w in self._crew if w.connection in ready]:
+                done = self._heard(worker)
+                if done is not None:
+                    del self._work[done.task]
+                    self._assign()  # before what follows from it is worked on
+                    yield done
+
+    def _assign(self) -> None:
+        """Give each idle worker a task, and start workers while there are tasks for them."""
+        while self._waiting:
+            idle = next((w for w in self._crew if w.task is None), None)
+            if idle is None and len(self._crew) >= self.workers:
+                return
+            if idle is None:
+                idle = _Worker()
+                self._crew.append(idle)
+            idle.task = self._waiting.popleft()
+            try:
+                idle.connection.send((idle.task, *self._work[idle.task]))
+            except OSError:  # it died while it had nothing to do, which is not the task's fault
+                self._waiting.appendleft(idle.task)
+                self._dismiss(idle)
+
+    def _heard(self, worker: _Worker) -> Finished | None:
+        """What a worker has to say; where it has died, its task waits again or is lost."""
+        try:
+            task, value, error = worker.connection.recv()
+            worker.task = None
+            return Finished(task, value, error)
+        except (EOFError, OSError):
+            dead, code = worker.task, self._dismiss(worker)
+        if dead is None:
+            return None
+        self._died[dead] = self._died.get(dead, 0) + 1
+        if self._died[dead] < self._deaths:
+            self._waiting.appendleft(dead)
+            return None
+        return Finished(dead, lost=f"{self._died[dead]} workers died of it, the last with {_cause(code)}")
+
+    def _dismiss(self, worker: _Worker) -> int:
+        self._crew.remove(worker)
+        worker.connection.close()
+        try:
+            return worker.process.wait(timeout=10)
+        except subprocess.TimeoutExpired:  # it closed its end and lives on
+            worker.process.kill()
+            return worker.process.wait()
+
+    def close(self) -> None:
+        for worker in self._crew:
+            worker.stop()
+        self._crew, self._work = [], {}
+        self._waiting.clear()
+
+
+def serve(descriptor: int) -> None:
+    """What a worker process does: run tasks from its connection until that is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a key pressed is for the process that leads
+    with Connection(descriptor) as connection:
+        while True:
+            try:
+                task, function, arguments = connection.recv()
+            except (EOFError, OSError):
+                return
+            try:
+                answer = (task, function(*arguments), None)
+            except Exception as error:
+                answer = (task, None, RuntimeError(f"{type(error).__name__}: {error}"))
+            try:
+                connection.send(answer)
+            except OSError:
+                return
+
+
+class OnDask(_Closing):
+    """A Dask cluster: one that is there, or a local one of processes.
+
+    Args:
+        scheduler: its address, such as "tcp://host:8786"; None starts a local cluster.
+        workers: of the local cluster.
+        deaths: how many workers a task may take with it.
+
+    Raises:
+        MissingDependencyError: without `distributed`.
+    """
+
+    def __init__(self, scheduler: str | None = None, *, workers: int = 2, deaths: int = DEATHS) -> None:
+        _need_workers(workers)
+        try:
+            import dask
+            import distributed
+        except ImportError as error:
+            raise MissingDependencyError(
+                "a cluster needs dask.distributed",
+                path="executor dask",
+                expected="an installed distributed",
+                got=str(error),
+                fix='pip install "flowgraph-filters[distributed]"',
+            ) from None
+        self._distributed = distributed
+        self._cluster: Any = None
+        with dask.config.set({"distributed.scheduler.allowed-failures": deaths - 1}):
+            if scheduler is None:
+                self._cluster = distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+                    env=dict(_THREADS),
+                )  # fmt: skip
+            try:
+                self._client = distributed.Client(self._cluster or scheduler, set_as_default=False)
+            except (OSError, ValueError) as error:
+                raise DeclarationError(
+                    "no scheduler answers here",
+                    path="--scheduler",
+                    expected="the address of a running scheduler, such as tcp://host:8786",
+                    got=f"{scheduler}: {error}",
+                    fix="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
+                ) from None
+        self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        self._futures: dict[str, str] = {}
+        self._done = distributed.as_completed(with_results=False)
+
+    def pids(self) -> list[int]:
+        """The worker processes of the cluster."""
+        return list(self._client.run(os.getpid).values())
+
+    def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
+        future = self._client.submit(function, *arguments, pure=False)
+        self._futures[future.key] = task
+        self._done.add(future)
+
+    def as_completed(self) -> Iterator[Finished]:
+        for future in self._done:
+            task = self._futures.pop(future.key)
+            error = future.exception()
+            if isinstance(error, self._distributed.KilledWorker):
+                yield Finished(task, lost=str(error).partition("\n")[0])
+            elif future.status == "cancelled":
+                yield Finished(task, lost="the cluster has gone away")
+            elif error is not None:
+                yield Finished(task, error=error)
+            else:
+                yield Finished(task, future.result())
+            future.release()
+
+    def close(self) -> None:
+        self._client.close(timeout=5)
+        if self._cluster is not None:
+            self._cluster.close(timeout=10)
+
+
+_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def _one_thread(environment: Any) -> dict[str, str]:
+    """Processes share the cores, so each computes in one thread unless the user says otherwise."""
+    return {**_THREADS, **environment}
+
+
+def _cause(code: int) -> str:
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit status {code}"
+    except ValueError:
+        return f"signal {-code}"
+
+
+def _need_workers(workers: object) -> None:
+    if type(workers) is not int or not 1 <= workers <= 4096:
+        raise DeclarationError(
+            "so many workers there cannot be",
+            path="workers",
+            expected="a whole number from 1 to 4096",
+            got=repr(workers),
+            fix="write --workers 2",
+        )

@@ -1,0 +1,159 @@
+"""What a run is, as a digest: the same digest, the same result.
+
+A key is taken of everything that a result follows from: the lowered graph, the code that prepares and scores
+it, what the flight holds, seed, parameters, engine and version. Taking it for each seed would cost as much as
+the run, so graph and flight are described by those of seed 0 at the run's own parameters; what another seed
+then changes follows from that seed, which is in the key as well.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowgraph.errors import FlowgraphError
+from flowgraph.pipeline import Pipeline
+from flowgraph.series import Flight, Series
+
+FORMAT = 1
+"""Goes into each key; a change of the rules in this module needs another number."""
+
+
+@lru_cache(maxsize=1)
+def package_version() -> str:
+    """The version of the installed distribution."""
+    try:
+        return version("flowgraph-filters")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def digest(value: Any) -> str:
+    """A hexadecimal digest of nested plain values, arrays, dataclasses, signals and series."""
+    found = hashlib.sha256()
+    _feed(found, value)
+    return found.hexdigest()[:40]
+
+
+def _feed(into: Any, value: Any) -> None:
+    """Each part goes in with its kind and length before it, so that no two values read alike."""
+    if value is None or isinstance(value, bool | int | float | str):
+        word = repr(value).encode()
+        into.update(f"{type(value).__name__}:{len(word)}:".encode() + word)
+    elif isinstance(value, np.ndarray | np.generic):
+        array = np.ascontiguousarray(value)
+        into.update(f"array:{array.dtype.str}:{array.shape}:".encode())
+        into.update(array.tobytes() if array.dtype != object else repr(array.tolist()).encode())
+    elif isinstance(value, Mapping):
+        into.update(f"mapping:{len(value)}:".encode())
+        for key in sorted(value, key=repr):
+            _feed(into, key)
+            _feed(into, value[key])
+    elif isinstance(value, list | tuple):
+        into.update(f"list:{len(value)}:".encode())
+        for part in value:
+            _feed(into, part)
+    elif isinstance(value, Series):
+        _feed(into, ("series", value.time, value.gaps, dict(value.leaves)))
+    elif isinstance(value, Flight):
+        _feed(into, ("flight", dict(value.streams), value.truth, dict(value.info)))
+    elif is_dataclass(value) and not isinstance(value, type):
+        _feed(into, (type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}))
+    elif callable(value):
+        _feed(into, ("callable", getattr(value, "__module__", ""), getattr(value, "__qualname__", "")))
+    else:
+        held = getattr(value, "__dict__", None)
+        _feed(into, (type(value).__qualname__, dict(held) if held else str(value)))
+
+
+def code_digest(function: Callable[..., Any]) -> str:
+    """Of the module that a function is in, but for its comments, its layout and its docstrings."""
+    try:
+        file = inspect.getsourcefile(inspect.unwrap(function))
+        source = Path(str(file)).read_text(encoding="utf-8")
+    except (OSError, TypeError):
+        return digest(("no source", getattr(function, "__qualname__", "")))
+    return _source_digest(source)
+
+
+@lru_cache(maxsize=256)
+def _source_digest(source: str) -> str:
+    try:
+        tree = ast.parse(source)
+    except SyntaxError:  # a shell or a notebook, whose file is no module
+        return digest(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            first = body[0].value
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                node.body = body[1:]  # type: ignore[attr-defined]
+    return digest(ast.dump(tree))
+
+
+def structure(pipeline: Pipeline) -> tuple[Any, ...]:
+    """Everything of a pipeline but the values of its real constants and of its registers at the start.
+
+    Two pipelines of one structure are one program on different numbers.
+    """
+    ports = lambda these: tuple(
+        (p.name, p.present, tuple((x.name, x.value, x.shape, x.dtype) for x in p.leaves)) for p in these
+    )
+    cells = lambda r: tuple((c.name, c.read, c.write, c.shape, c.dtype) for c in r.cells)
+    fixed = lambda r: tuple(
+        np.asarray(c.reset).tobytes() if r.role in ("join", "stamp") else None for c in r.cells
+    )
+    return (
+        pipeline.name,
+        pipeline.time,
+        pipeline.seed,
+        ports(pipeline.inputs),
+        ports(pipeline.outputs),
+        tuple((r.path, r.role, cells(r), fixed(r)) for r in pipeline.registers),
+        tuple(
+            (n, a.shape, a.dtype.str, None if a.dtype.kind == "f" else a.tobytes())
+            for n, a in pipeline.constants.items()
+        ),
+        tuple((i.op, i.args, _plain(i.attrs), i.out) for i in pipeline.instructions),
+        tuple((f.register, f.cell) for f in pipeline.faults),
+    )
+
+
+def _plain(attrs: Mapping[str, Any]) -> str:
+    return repr(sorted(attrs.items())) if attrs else ""
+
+
+def graph_digest(pipeline: Pipeline) -> str:
+    """Of a lowered graph with all its numbers; its documentation and source lines aside."""
+    resets = [[c.reset for c in r.cells] for r in pipeline.registers]
+    return digest((structure_digest(pipeline), list(pipeline.constants.values()), resets))
+
+
+def structure_digest(pipeline: Pipeline) -> str:
+    return digest(structure(pipeline))
+
+
+def failure_digest(error: BaseException) -> str:
+    """Of what cannot be described because it raises: other data or other code raise something else."""
+    said = str(error) if isinstance(error, FlowgraphError) else repr(error)
+    return digest(("failed", type(error).__name__, said))
+
+
+def run_key(parts: Mapping[str, Any]) -> str:
+    """The name of a run's result, from all that it follows from."""
+    return digest({"format": FORMAT, "version": package_version(), **parts})
+
+
+def content_digest(row: Any) -> str:
+    """Of a JSON value as it is written, by which a file is known to be whole."""
+    return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()

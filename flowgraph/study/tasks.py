@@ -1,0 +1,301 @@
+"""What a worker does: runs of a study, one by one or many in one vectorised call, each to a row.
+
+Nothing that a run raises ends the others: it becomes the row's `error`. In an engine that takes many runs at
+once, those of one program and one set of ticks go together, filled up to the chunk's fixed size; where such a
+call raises, each of its runs is tried alone, in the same program, to find the one that is to blame.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from flowgraph.errors import DataError, FlowgraphError
+from flowgraph.graph import Graph
+from flowgraph.lowering import lower
+from flowgraph.many import Batch, simulate_many
+from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.result import Result
+from flowgraph.series import Flight, Series
+from flowgraph.simulate import simulate
+from flowgraph.study.keys import structure
+from flowgraph.study.lifting import lifted, start_of
+from flowgraph.study.spec import Value, text
+from flowgraph.study.store import pack_trajectory
+from flowgraph.types import unflatten
+
+MANY = ("xla", "c")
+"""Engines that take many runs in one call."""
+
+_FLIGHTS_KEPT = 2
+_PROGRAMS_KEPT = 4
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run: what is run, and the key of its result. `seeded` is false where the flight is the same for
+    all seeds."""
+
+    graph: str
+    data: str
+    seed: int
+    parameters: Mapping[str, Value]
+    key: str
+    seeded: bool = True
+
+
+@dataclass(frozen=True)
+class Task:
+    """Runs that one worker does together, and how.
+
+    Args:
+        name: of the task.
+        runs: in order; more than one only where the engine takes many.
+        engine, dtype, chunk, metrics, keep: of the study.
+    """
+
+    name: str
+    runs: tuple[RunSpec, ...]
+    engine: str
+    dtype: str
+    chunk: int
+    metrics: tuple[str, ...] | None
+    keep: bool
+
+
+@dataclass(frozen=True)
+class Done:
+    """The outcome of one run: its row, and its trajectory where it is to be kept."""
+
+    key: str
+    row: dict[str, Any]
+    trajectory: bytes | None = None
+
+
+@dataclass
+class _Lane:
+    """A run made ready."""
+
+    run: RunSpec
+    case: Case
+    times: dict[str, float] = field(default_factory=dict)
+
+
+def prepared(
+    graph: str, data: str, seed: int, parameters: Mapping[str, Value], flight: Flight | None = None
+) -> tuple[Case, Flight]:
+    """A graph made ready for a flight with these settings, as `flowgraph run --set` does.
+
+    Raises:
+        FlowgraphError: as the loader and the graph do.
+    """
+    function = find_graph(graph)
+    if function.prepare is None:
+        return function.case(Flight(data, {})), Flight(data, {})  # raises, saying what is missing
+    given = {name: text(value) for name, value in parameters.items()}
+    mine, rest = parsed_settings(function.prepare, given, also=flight_settings(data), path=graph)
+    if flight is None:
+        flight = load_flight(data, seed=seed, settings=rest)
+    if "seed" in inspect.signature(function.prepare).parameters:
+        mine.setdefault("seed", seed)
+    return function.case(flight, **mine), flight
+
+
+def flight_part(data: str, parameters: Mapping[str, Value]) -> dict[str, Value]:
+    """Those parameters that are settings of the flight."""
+    names = flight_settings(data)
+    return {n: v for n, v in parameters.items() if n in names}
+
+
+_flights: OrderedDict[Any, Flight] = OrderedDict()
+
+
+def _flight(run: RunSpec) -> Flight:
+    """The flight of a run; the last few of those that serve many runs are kept."""
+    settings = {n: text(v) for n, v in flight_part(run.data, run.parameters).items()}
+    if run.seeded:
+        return load_flight(run.data, seed=run.seed, settings=settings)
+    which = (run.data, tuple(sorted(settings.items())))
+    if which not in _flights:
+        _flights[which] = load_flight(run.data, settings=settings)
+        while len(_flights) > _FLIGHTS_KEPT:
+            _flights.popitem(last=False)
+    _flights.move_to_end(which)
+    return _flights[which]
+
+
+def run_task(task: Task) -> list[Done]:
+    """Do the runs of a task; the rows come in their order."""
+    found: dict[str, Done] = {}
+    groups: list[tuple[Any, list[_Lane]]] = []
+    for run in task.runs:
+        try:
+            lane = _ready(run)
+            if task.engine not in MANY:
+                found[run.key] = _alone(task, lane)
+                continue
+            program, ticks = structure(lower(lane.case.graph)), _ticks(lane.case)
+            for (other, when), lanes in groups:
+                if other == program and _same(when, ticks):
+                    lanes.append(lane)
+                    break
+            else:
+                groups.append(((program, ticks), [lane]))
+        except Exception as error:
+            found[run.key] = _failed(run, error)
+    for (program, _), lanes in groups:
+        found.update({d.key: d for d in _together(task, program, lanes)})
+    return [found[run.key] for run in task.runs]
+
+
+def _ready(run: RunSpec) -> _Lane:
+    start = perf_counter()
+    flight = _flight(run)
+    loaded = perf_counter()
+    case, _ = prepared(run.graph, run.data, run.seed, run.parameters, flight)
+    return _Lane(run, case, {"load_s": loaded - start, "setup_s": perf_counter() - loaded})
+
+
+def _alone(task: Task, lane: _Lane) -> Done:
+    start = perf_counter()
+    result = simulate(
+        lane.case.graph, lane.case.inputs, engine=task.engine, dtype=task.dtype, seed=lane.run.seed
+    )
+    lane.times["run_s"] = perf_counter() - start
+    return _scored(task, lane, result)
+
+
+_programs: OrderedDict[str, list[tuple[Any, Graph]]] = OrderedDict()
+
+
+def _program(name: str, program: Any, graph: Graph) -> Graph:
+    """The lifted graph of this structure that this process has compiled before; else this one's."""
+    kept = _programs.setdefault(name, [])
+    _programs.move_to_end(name)
+    for other, made in kept:
+        if other == program:
+            return made
+    kept.append((program, lifted(graph)))
+    del kept[:-_PROGRAMS_KEPT]
+    while len(_programs) > _PROGRAMS_KEPT:
+        _programs.popitem(last=False)
+    return kept[-1][1]
+
+
+def _together(task: Task, program: Any, lanes: list[_Lane]) -> list[Done]:
+    try:
+        start = perf_counter()
+        graph = _program(task.runs[0].graph, program, lanes[0].case.graph)
+        batch = simulate_many(
+            graph,
+            [_streams(lane.case, graph) for lane in lanes],
+            [lane.run.seed for lane in lanes],
+            engine=task.engine,
+            dtype=task.dtype,
+            init=[start_of(lane.case.graph) for lane in lanes],
+            runs_at_once=task.chunk,
+        )
+        share = (perf_counter() - start) / len(lanes)
+    except Exception as error:
+        if len(lanes) == 1:
+            return [_failed(lanes[0].run, error)]
+        return [done for lane in lanes for done in _together(task, program, [lane])]
+    found = []
+    for k, lane in enumerate(lanes):
+        lane.times["run_s"] = share
+        try:
+            found.append(_scored(task, lane, _result(lane.case.graph, batch, k)))
+        except Exception as error:
+            found.append(_failed(lane.run, error))
+    return found
+
+
+def _streams(case: Case, graph: Graph) -> dict[str, Any]:
+    given = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
+    return {name: given[name] for name in graph.sources}
+
+
+def _ticks(case: Case) -> list[np.ndarray]:
+    """The times of each source, which runs must share to go together."""
+    given = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
+    return [given[n].time for n in case.graph.sources if isinstance(given[n], Series)]
+
+
+def _same(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> bool:
+    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def _result(graph: Graph, batch: Batch, k: int) -> Result:
+    """One run of a batch, with the graph's own signal types; without a last state, which a batch has not."""
+    series = {}
+    for collected in graph.collected:
+        runs = batch[collected.name]
+        here, type_ = runs.present[k], graph.port(collected.wire).type
+        whole = bool(here.all())
+        leaves = iter([leaf[k] if whole else leaf[k][here] for leaf in runs.leaves.values()])
+        time = runs.time if whole else runs.time[here]
+        series[collected.name] = Series(time, unflatten(type_, leaves), type=type_, name=collected.name)
+    return Result(batch.graph, batch.engine, series, {}, {}, batch.ticks, 0.0)
+
+
+def _scored(task: Task, lane: _Lane, result: Result) -> Done:
+    start = perf_counter()
+    run, score = lane.run, lane.case.score(result)
+    values = {n: _plain(v) for n, v in {**score, **result.stats}.items()}
+    lane.times["score_s"] = perf_counter() - start
+    row = {**_named(run), **_chosen(values, task.metrics, run), "ticks": result.ticks, "error": None}
+    astray = [n for n, v in values.items() if isinstance(v, float) and not math.isfinite(v)]
+    if astray:
+        row["error"] = f"the estimate went astray: {astray[0]} is {values[astray[0]]}"
+    row.update(lane.times, wall_s=sum(lane.times.values()))
+    kept = pack_trajectory(result.series) if task.keep else None
+    return Done(run.key, row, kept)
+
+
+def _chosen(values: dict[str, Any], metrics: tuple[str, ...] | None, run: RunSpec) -> dict[str, Any]:
+    if metrics is None:
+        return values
+    missing = [n for n in metrics if n not in values]
+    if missing:
+        raise DataError(
+            "this run has no such measure",
+            path=f"{run.graph} on {run.data}, metrics",
+            expected="some of " + (", ".join(values) or "none: the flight has no truth"),
+            got=missing[0],
+            fix="name others in the study's metrics, or leave them out",
+        )
+    return {n: values[n] for n in metrics}
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _named(run: RunSpec) -> dict[str, Any]:
+    return {"key": run.key, "graph": run.graph, "data": run.data, "seed": run.seed, **run.parameters}
+
+
+def _failed(run: RunSpec, error: Exception) -> Done:
+    return Done(run.key, {**_named(run), "error": said(error)})
+
+
+def lost(run: RunSpec, why: str) -> dict[str, Any]:
+    """The row of a run that could not be done because workers died of it."""
+    return {**_named(run), "error": f"lost: {why}"}
+
+
+def said(error: BaseException) -> str:
+    """An error in one line."""
+    parts = [p.strip() for p in str(error).splitlines() if p.strip()] or [repr(error)]
+    kind = type(error).__name__
+    return f"{kind}: {'; '.join(parts)}" if isinstance(error, FlowgraphError) else f"{kind}: {parts[0]}"
+
+
+Runner = Callable[[Task], list[Done]]
