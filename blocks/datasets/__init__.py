@@ -15,6 +15,6 @@ stream declares are refused.
 
 from __future__ import annotations
 
-from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rosbag, tum
+from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rob6213, rosbag, studentdata, tum, umd
 
-__all__ = ["broad", "csv_file", "ese650", "euroc", "rosbag", "tum"]
+__all__ = ["broad", "csv_file", "ese650", "euroc", "rob6213", "rosbag", "studentdata", "tum", "umd"]

@@ -1,0 +1,199 @@
+"""Flights of a small quadrotor with on-board vision: AprilTag poses and optical-flow velocities.
+
+    rob6213:FILE[:CSV]     proj2_dataset1.mat; vicon_dataset1.csv beside it if left out
+
+    time, position (m), angle (Z-Y-X Euler: roll, pitch, yaw): the body in the world, from AprilTags
+    linearVel, angVel: of the camera relative to the world, in camera coordinates, from optical flow
+    csv: t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz by motion capture; Z-X-Y Euler angles, rates in the body
+
+The files hold no IMU. The one given here is derived from the motion capture: local parabolas through its
+positions and attitudes, differentiated. It has no bias and knows the future a little; a filter fed with it
+shows what its measurement model is worth, not what a flight would have been. The flight's notes say so.
+
+The camera velocity is late, by about 0.07 s, and its stamps are shifted back. The world of the tags and that of
+the motion capture differ by a fixed shift, which no filter could find: `SHIFT` and `TURN` take one into the
+other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw leaves the
+poses as they were recorded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation, Slerp
+
+from flowgraph import Array, Flight, Series, Signal, real
+from flowgraph.blocks.datasets.matlab import array, choice, known_settings, number, read_mat, split_argument
+from flowgraph.blocks.datasets.matlab import strictly_later as later
+from flowgraph.blocks.euler import quaternion_from_angles
+from flowgraph.blocks.geometry import multiply
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.vision.camera import COURSE_MOUNT
+from flowgraph.blocks.vision.motion import CameraMotion, find_delay, velocity_error
+from flowgraph.blocks.vision.pnp import as_measurements
+from flowgraph.errors import DataError
+
+__all__ = ["NOISE", "SETTINGS", "MotionTruth", "derived_imu", "load"]
+
+SETTINGS: Mapping[str, str] = {
+    "frame": "registered: poses taken into the motion capture's world; raw: as recorded",
+    "delay": "s by which the camera velocity is late; found from the motion capture if left out",
+    "imu.window": "s, of the local parabolas behind the derived IMU",
+}
+"""The settings of `load` and what they mean."""
+
+SHIFT, TURN = (-0.0087, -0.0135, 0.0015), -0.0067
+"""What takes the on-board poses into the motion capture's: a shift of the world, m, and a turn of the body's
+axes about its z, rad."""
+
+USUAL_DELAY = 0.067
+"""s, where no motion capture tells."""
+
+NOISE = ImuNoise(gyro=0.02, accelerometer=0.05, gyro_bias=1e-4, accelerometer_bias=1e-3)
+"""Densities of the derived IMU."""
+
+_COLUMNS = "t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz"
+
+
+class MotionTruth(Signal):
+    """What a motion capture knows: pose, velocity (world) and angular rate (body)."""
+
+    position: Array = real(3, unit="m", frame="world")
+    velocity: Array = real(3, unit="m/s", frame="world")
+    attitude: Array = real(4, unit="1", frame="world<-body")
+    rate: Array = real(3, unit="rad/s", frame="body")
+
+
+def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
+    """Read a flight: the streams `pose` (`PoseMeasurement`), `motion` (`CameraMotion`), and, with the motion
+    capture, `imu` (`Imu`, derived).
+
+    Args:
+        argument: FILE[:CSV].
+        seed: not used; every loader has one.
+        settings: any of `SETTINGS`.
+
+    Returns:
+        A `Flight`; truth: `MotionTruth`, or None. info: `mount`, `imu_noise`, `delay` (s).
+
+    Raises:
+        DataError: a file, variable or column is missing or of another form; names it.
+        DeclarationError, UnknownNameError: for settings.
+    """
+    given = settings or {}
+    known_settings(given, SETTINGS, "rob6213")
+    frame = choice(given, "frame", ("registered", "raw"), "rob6213")
+    file, csv = split_argument(argument, "rob6213:FILE[:CSV]")
+    content = read_mat(file, "time", "position", "angle", "linearVel", "angVel")
+    seconds = array(content, "time", file)
+    table = {n: array(content, n, file, columns=3) for n in ("position", "angle", "linearVel", "angVel")}
+    for name, values in table.items():
+        if len(values) != len(seconds):
+            raise DataError(
+                f"variable {name!r} does not have one row a stamp",
+                path=str(file),
+                expected=f"{len(seconds)} rows",
+                got=str(len(values)),
+                fix="restore the file",
+            )
+    keep, notes = later(seconds, "time", file)
+    position = table["position"][keep]
+    attitude = np.asarray(quaternion_from_angles(table["angle"][keep], order="zyx", xp=np))
+    if frame == "registered":
+        position, attitude = _registered(position, attitude)
+        notes.append(f"poses taken into the motion capture's frames: shift {SHIFT} m, turn {TURN:g} rad")
+    pose = Series.from_seconds(seconds[keep], as_measurements(position, attitude), name="pose")
+    motion = Series(
+        pose.time, CameraMotion(velocity=table["linearVel"][keep], rate=table["angVel"][keep]), name="motion"
+    )
+    streams = {"pose": pose}
+    info: dict[str, Any] = {"mount": COURSE_MOUNT, "imu_noise": NOISE}
+    truth = None
+    csv = csv or _beside(file)
+    delay = USUAL_DELAY
+    if csv is None:
+        notes.append("no motion capture beside the file: no truth and no IMU")
+    else:
+        truth = _truth(csv)
+        window = number(given, "imu.window", 0.11, "rob6213", positive=True)
+        streams["imu"] = derived_imu(truth, window)
+        notes.append("imu: derived from the motion capture, not recorded")
+        delay = find_delay(motion, truth, COURSE_MOUNT)
+    delay = number(given, "delay", delay, "rob6213")
+    if truth is not None:
+        error = velocity_error(motion, truth, COURSE_MOUNT, delay)
+        notes.append(f"motion: {delay:.3f} s late; then {error:.4f} m/s RMS from the motion capture")
+    late = motion.time - round(delay * 1e9)
+    streams["motion"] = Series(late, motion.values, name="motion")
+    info["delay"] = delay
+    return Flight(name=file.stem, streams=streams, truth=truth, info=info, notes=tuple(notes))
+
+
+def _registered(position: np.ndarray, attitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    turn = np.array([np.cos(0.5 * TURN), 0.0, 0.0, np.sin(0.5 * TURN)])
+    return position + np.asarray(SHIFT), np.asarray(multiply(attitude, turn, xp=np))
+
+
+def _beside(file: Path) -> Path | None:
+    """The motion capture with the same number."""
+    number = re.search(r"(\d+)$", file.stem)
+    csv = file.parent / f"vicon_dataset{number.group(1)}.csv" if number else None
+    return csv if csv is not None and csv.is_file() else None
+
+
+def _truth(file: Path) -> Series:
+    if not file.is_file():
+        raise DataError(
+            "the motion capture is missing",
+            path=str(file),
+            expected=f"a csv with the columns {_COLUMNS}",
+            got="no such file",
+            fix="give FILE:CSV, or leave the csv out",
+        )
+    lines = file.read_text(encoding="utf-8-sig").splitlines()
+    try:
+        if "".join(lines[:1]).replace(" ", "") != _COLUMNS:
+            raise ValueError("another heading: " + "".join(lines[:1])[:60])
+        x = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+        if x.ndim != 2 or x.shape[1] != 13 or not np.isfinite(x).all() or len(x) < 20:
+            raise ValueError(f"shape {x.shape}, or numbers that are not finite")
+        if not (np.diff(x[:, 0]) > 0.0).all():
+            row = int(np.flatnonzero(~(np.diff(x[:, 0]) > 0.0))[0])
+            raise ValueError(f"line {row + 3}: time does not increase")
+    except ValueError as error:
+        raise DataError(
+            "this is no motion capture of the family",
+            path=str(file),
+            expected=f"at least 20 rows of {_COLUMNS}, times increasing",
+            got=str(error),
+            fix="restore the file",
+        ) from error
+    q = np.asarray(quaternion_from_angles(x[:, 4:7], order="zxy", xp=np))
+    truth = MotionTruth(position=x[:, 1:4], velocity=x[:, 7:10], attitude=q, rate=x[:, 10:13])
+    return Series.from_seconds(x[:, 0], truth, name="truth")
+
+
+def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
+    """The IMU (no bias, no noise of its own) that a motion capture implies, at `rate` Hz.
+
+    specific force = R^T (d^2 p / dt^2 - g), and the rate is what turns R. Both come from parabolas fitted to
+    `window` seconds around each time (Savitzky and Golay, Analytical Chemistry 36, 1964).
+    """
+    step = round(1e9 / rate)
+    time = np.arange(truth.time[0], truth.time[-1] + 1, step)
+    size = max(int(round(window * rate)) | 1, 5)
+    position = np.stack([np.interp(time, truth.time, truth["position"][:, k]) for k in range(3)], axis=1)
+    acceleration = savgol_filter(position, size, 2, deriv=2, delta=1.0 / rate, axis=0)
+    measured = Rotation.from_quat(truth["attitude"][:, [1, 2, 3, 0]])
+    turns = Slerp(truth.time - truth.time[0], measured)(time - truth.time[0])
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
+    between = savgol_filter(steps, size, 2, axis=0)
+    gyro = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+    force = turns.inv().apply(acceleration - np.asarray(GRAVITY))
+    return Series(time, Imu(gyro=gyro, specific_force=force), name="imu")
