@@ -90,7 +90,13 @@ def between_imu(before: Imu, now: Imu) -> Imu:
 
 @block
 def predict_pose(
-    belief: QuaternionBelief, imu: Imu, *, noise: ImuNoise, dt: float, xp: Any
+    belief: QuaternionBelief,
+    imu: Imu,
+    *,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float] = GRAVITY,
+    dt: float,
+    xp: Any,
 ) -> QuaternionBelief:
     """Predict over `dt` seconds with one IMU reading, held over the step.
 
@@ -101,7 +107,7 @@ def predict_pose(
     F is `move_jacobian`. Q: white noise of the force, s_a^2 [dt, dt^2/2; dt^2/2, dt^3/3] on (v, p), and
     `quaternion_noise` on q. With dt = 0, as at the first firing, this is the identity.
     """
-    v, p, q = move(belief.velocity, belief.position, belief.attitude, imu, dt, xp)
+    v, p, q = move(belief.velocity, belief.position, belief.attitude, imu, dt, xp, gravity=gravity)
     F = move_jacobian(belief.attitude, imu, dt, xp)
     push, kind = noise.accelerometer**2 * dt, q.dtype
     Q_vp = xp.asarray(_VV, dtype=kind) * push + xp.asarray(_VP, dtype=kind) * (push * dt)
@@ -177,10 +183,12 @@ def pose_belief(belief: QuaternionBelief, *, xp: Any) -> PoseBelief:
     )
 
 
-def move(v: Array, p: Array, q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
+def move(
+    v: Array, p: Array, q: Array, imu: Imu, dt: Any, xp: Any, *, gravity: tuple[float, ...] = GRAVITY
+) -> tuple[Array, Array, Array]:
     """(v', p', q') after dt seconds, q' not yet scaled; as in `predict_pose`."""
     half = multiply(q, from_rotation_vector(imu.gyro * (0.5 * dt), xp=xp), xp=xp)
-    a = rotate(half, imu.specific_force, xp=xp) + xp.asarray(GRAVITY, dtype=q.dtype)
+    a = rotate(half, imu.specific_force, xp=xp) + xp.asarray(gravity, dtype=q.dtype)
     turned = multiply(q, from_rotation_vector(imu.gyro * dt, xp=xp), xp=xp)
     return v + a * dt, p + (v + a * (0.5 * dt)) * dt, turned
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from flowgraph import Case, Flight, Result, Stream, delay, graph, latest, merge, timing_of
 from flowgraph.blocks.complementary import check_alpha, correct_by_pose, dead_reckon, needed
+from flowgraph.blocks.inertial import GRAVITY
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
@@ -38,6 +39,7 @@ def augmented_complementary(
     alpha: float = 0.4,
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
+    gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
@@ -46,7 +48,7 @@ def augmented_complementary(
     """
     previous = delay(start, name="previous")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = dead_reckon(previous, control, at=imu | vicon)
+    prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
     corrected = correct_by_pose(
         latest(prior, at=vicon),
         vicon,

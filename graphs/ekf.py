@@ -38,7 +38,7 @@ from flowgraph.blocks.extended import (
     start_pose,
     update_pose,
 )  # fmt: skip
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.checks import need_numbers
@@ -55,6 +55,7 @@ def ekf(
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Extended Kalman filter of velocity, position and quaternion: IMU control, motion capture pose.
 
@@ -63,7 +64,7 @@ def ekf(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | vicon, name="control")
-    prior = predict_pose(belief, between_imu(last, control), noise=noise)
+    prior = predict_pose(belief, between_imu(last, control), noise=noise, gravity=gravity)
     posterior, innovation = update_pose(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )

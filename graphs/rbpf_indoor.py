@@ -32,7 +32,7 @@ from flowgraph import (
 from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.calibration import subtract_rest_bias
 from flowgraph.blocks.geometry import level, to_matrix
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.particles import (
     attitude_likelihood,
@@ -54,10 +54,20 @@ MOST_PARTICLES = 2**20
 
 
 @graph
-def predict(cloud: Stream[Cloud], imu: Stream[Imu], *, noise: ImuNoise, draws: str, at: Any):
+def predict(
+    cloud: Stream[Cloud],
+    imu: Stream[Imu],
+    *,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float] = GRAVITY,
+    draws: str,
+    at: Any,
+):
     """Carry the cloud to now: attitudes drawn through the gyroscope, motion by a Kalman prediction each."""
     turned = propagate_attitude(cloud, imu, gyro_noise=noise.gyro, draws=draws, at=at, name="attitude")
-    return predict_motion(turned, imu, accelerometer_noise=noise.accelerometer, name="kalman")
+    return predict_motion(
+        turned, imu, accelerometer_noise=noise.accelerometer, gravity=gravity, name="kalman"
+    )
 
 
 @graph
@@ -108,6 +118,7 @@ def rbpf_indoor(
     resample_below: float = 0.1,
     scheme: str = "systematic",
     draws: str = "rbpf_indoor",
+    gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Rao-Blackwellized particle filter: attitude by particles, motion by a Kalman filter each.
 
@@ -121,7 +132,7 @@ def rbpf_indoor(
         imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
     cloud = delay(start, name="cloud")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = predict(cloud, control, noise=noise, draws=f"{draws}.attitude", at=imu | vicon)
+    prior = predict(cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
     posterior = update(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
     )

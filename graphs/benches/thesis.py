@@ -1,0 +1,369 @@
+"""The experiment of the thesis: five filters, six settings of noise, flights of its random family.
+
+Every filter starts on the truth and is told the noise. IMU 200 Hz, motion capture 4 Hz. A setting is three
+letters, for motion capture, accelerometer and gyroscope: H for the precise one, L for the other. The thesis's
+accelerometer reads the coordinate acceleration in the body, zero at rest: for a filter that is an inertial
+unit in a world without gravity.
+
+The thesis prints as RMSE what its code computes without a root: the mean of |p - p_true|^2, and the mean of
+the square of |R - R_true|_F^2. These, the "thesis metric", stand beside its figures; the errors in metres and
+degrees are root mean squares. The bound is a Kalman filter that is told the exact attitude.
+
+Source: R. Fiszel, thesis (2017), the tables of its results.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Flight, Graph, Report, Series, clocks_of, simulate_many
+from flowgraph.blocks.alignment import StartSpread, start_belief
+from flowgraph.blocks.extended import start_pose
+from flowgraph.blocks.flights.worlds import load_world
+from flowgraph.blocks.geometry import geodesic_angle, to_matrix
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.particles import start_cloud
+from flowgraph.blocks.point import start_point
+from flowgraph.blocks.pose_model import start_state
+from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate, Position
+from flowgraph.checks import need_count
+from flowgraph.errors import UnknownNameError
+from flowgraph.graphs.augmented_complementary import augmented_complementary
+from flowgraph.graphs.ekf import ekf
+from flowgraph.graphs.ins_eskf import ins_eskf
+from flowgraph.graphs.kalman import kalman, readings
+from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.ukf import ukf
+
+__all__ = ["FILTERS", "PUBLISHED", "SETTINGS", "thesis"]
+
+RATE = 200.0
+WEIGHTLESS = (0.0, 0.0, 0.0)
+NEAR = StartSpread(1e-3, 1e-3, 1e-3, 1e-3, 0.0, 0.0)
+"""The start is the truth; a covariance of zero has no square root."""
+
+VARIANCES = {"H": 0.1, "L": 1.0}
+"""Of a sample of accelerometer or gyroscope, (m/s^2)^2 and (rad/s)^2; the motion capture's are a tenth."""
+
+SETTINGS = ("HHH", "HHL", "HLL", "LHH", "LHL", "LLL")
+"""Motion capture, accelerometer, gyroscope."""
+
+_POSITION = {
+    "acf": (0.0688, 0.0610, 0.0405, 0.505, 0.616, 0.357),
+    "ekf": (0.0326, 0.113, 0.0524, 0.505, 1.09, 0.266),
+    "ukf": (0.0345, 0.0920, 0.0329, 0.290, 0.930, 0.327),
+    "rbpf": (0.0145, 0.0217, 0.0161, 0.127, 0.122, 0.119),
+}
+_ATTITUDE = {
+    "acf": (0.00736, 0.00637, 0.00625, 0.530, 0.518, 0.590),
+    "ekf": (0.00586, 0.0137, 0.0169, 0.328, 0.299, 0.328),
+    "ukf": (0.00517, 0.00917, 0.0102, 0.326, 0.295, 0.324),
+    "rbpf": (0.000101, 0.00065, 0.000834, 0.00582, 0.00578, 0.00397),
+}
+PUBLISHED: Mapping[tuple[str, str], tuple[float, float]] = {
+    (name, setting): (position, attitude)
+    for name in _POSITION
+    for setting, position, attitude in zip(SETTINGS, _POSITION[name], _ATTITUDE[name], strict=True)
+}
+"""The thesis's figures for position and attitude, by filter and setting, in its metric."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The standard deviation of the motion capture, m and rad, and the densities of the inertial unit."""
+
+    pose: float
+    imu: ImuNoise
+
+    @classmethod
+    def of(cls, setting: str) -> Noise:
+        """That of a setting such as "HLL"."""
+        capture, force, turn = (VARIANCES[letter] for letter in setting)
+        return cls(float(np.sqrt(0.1 * capture)), ImuNoise.per_sample(RATE, gyro=turn, accelerometer=force))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A filter on one flight: what it is fed, and the register that holds its start."""
+
+    graph: Callable[[], Graph]
+    inputs: Mapping[str, Series]
+    start: Mapping[str, Any]
+
+
+def fly(seed: int, noise: Noise, *, duration: float = 20.0) -> Flight:
+    """A flight of the thesis with its sensors: the stream `imu` is of a world without gravity."""
+    settings: dict[str, str | float] = {
+        "sensors": "gyro,coordinate_acceleration,vicon",
+        "duration": duration,
+        "gyro.noise": noise.imu.gyro,
+        "coordinate_acceleration.noise": noise.imu.accelerometer,
+        "vicon.noise": noise.pose,
+        "vicon.attitude_noise": noise.pose,
+    }
+    flight = load_world("thesis", seed=seed, settings=settings)
+    gyro, push = flight.streams["gyro"], flight.streams["coordinate_acceleration"]
+    imu = Series(gyro.time, Imu(gyro=gyro["rate"], specific_force=push["acceleration"]), name="imu")
+    info = {**flight.info, "imu_noise": noise.imu}
+    return Flight(flight.name, {"imu": imu, "vicon": flight.streams["vicon"]}, flight.truth, info)
+
+
+def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
+    p, v, q = _at_first(flight)
+    start = PoseEstimate(position=p, velocity=v, attitude=q)
+    build = lambda: augmented_complementary.build(**_clocks(flight), start=start, gravity=WEIGHTLESS)
+    return Trial(build, flight.streams, {"previous": start})
+
+
+def _ekf(flight: Flight, noise: Noise, _: int) -> Trial:
+    return _pose_filter(ekf, start_pose, flight, noise)
+
+
+def _ukf(flight: Flight, noise: Noise, _: int) -> Trial:
+    return _pose_filter(ukf, start_state, flight, noise)
+
+
+def _pose_filter(graph: Any, begin: Callable[..., Any], flight: Flight, noise: Noise) -> Trial:
+    p, v, q = _at_first(flight)
+    start = begin(
+        p,
+        q,
+        velocity=v,
+        position_deviation=NEAR.position,
+        velocity_deviation=NEAR.velocity,
+        attitude_deviation=NEAR.tilt,
+    )
+    build = lambda: graph.build(
+        **_clocks(flight),
+        start=start,
+        noise=noise.imu,
+        position_noise=noise.pose,
+        attitude_noise=noise.pose,
+        gravity=WEIGHTLESS,
+    )
+    return Trial(build, flight.streams, {"belief": start})
+
+
+def _eskf(flight: Flight, noise: Noise, _: int) -> Trial:
+    p, v, q = _at_first(flight)
+    start = start_belief(p, q, velocity=v, spread=NEAR)  # biases known: nine states are left
+    vicon = flight.streams["vicon"]
+    inputs = {
+        "imu": flight.streams["imu"],
+        "position": Series(vicon.time, Position(position=vicon["position"]), name="position"),
+        "attitude": Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude"),
+    }
+    build = lambda: ins_eskf.build(
+        **clocks_of(inputs),
+        start=start,
+        noise=noise.imu,
+        position_noise=noise.pose,
+        attitude_noise=noise.pose,
+        gravity=WEIGHTLESS,
+    )
+    return Trial(build, inputs, {"belief": start})
+
+
+def _rbpf(flight: Flight, noise: Noise, particles: int) -> Trial:
+    p, v, q = _at_first(flight)
+    start = start_cloud(particles, position=p, velocity=v, attitude=q, spread=NEAR)
+    build = lambda: rbpf_indoor.build(
+        **_clocks(flight),
+        start=start,
+        noise=noise.imu,
+        position_noise=noise.pose,
+        attitude_noise=noise.pose,
+        gravity=WEIGHTLESS,
+    )
+    return Trial(build, flight.streams, {"cloud": start})
+
+
+def _bound(flight: Flight, noise: Noise, _: int) -> Trial:
+    """Told the exact attitude, the filter may as well be told the gravity that it then takes off."""
+    imu, truth = flight.streams["imu"], flight.truth
+    assert truth is not None
+    up = to_matrix(truth["attitude"], xp=np)[:, 2, :] * 9.81
+    real = Imu(gyro=imu["gyro"], specific_force=imu["specific_force"] + up)
+    streams = {**flight.streams, "imu": Series(imu.time, real, name="imu")}
+    reading = readings(Flight(flight.name, streams, truth, flight.info))
+    p, v, _q = _at_first(flight)
+    start = start_point(p, v, position_deviation=NEAR.position, velocity_deviation=NEAR.velocity)
+    build = lambda: kalman.build(
+        **clocks_of({"reading": reading}),
+        start=start,
+        noise=noise.imu.accelerometer,
+        position_noise=noise.pose,
+    )
+    return Trial(build, {"reading": reading}, {"belief": start})
+
+
+FILTERS: Mapping[str, Callable[[Flight, Noise, int], Trial]] = {
+    "acf": _acf,
+    "ekf": _ekf,
+    "ukf": _ukf,
+    "rbpf": _rbpf,
+    "eskf": _eskf,
+}
+"""By name: what runs the filter on a flight, told the noise, with a number of particles."""
+
+
+def thesis(
+    *,
+    flights: int = 5,
+    particles: int = 1000,
+    duration: float = 20.0,
+    seed: int = 0,
+    settings: str = ",".join(SETTINGS),
+    filters: str = ",".join(FILTERS),
+    engine: str | None = None,
+) -> Report:
+    """The thesis's table: ACF, EKF, UKF, RBPF and an error-state filter in six settings of noise.
+
+    Args:
+        flights: how many of the random family; the same for all filters. The thesis flew 5.
+        particles: of rbpf.
+        duration: of a flight, s, at most 20.
+        seed: of the first flight; the others follow.
+        settings, filters: those to run, with commas between.
+        engine: as for `simulate_many`; xla where JAX is installed, else python.
+
+    Returns:
+        A row a setting and filter: the errors, the 95 % interval of the position RMSE (bootstrap over
+        flights), the thesis's metric and figure, and the bound on the same flights.
+    """
+    need_count("thesis", "flights", flights, least=1)
+    need_count("thesis", "particles", particles, least=1)
+    engine = engine or ("xla" if importlib.util.find_spec("jax") else "python")
+    names, codes = _listed("filter", filters, FILTERS), _listed("setting", settings, SETTINGS)
+    rows = []
+    for code in codes:
+        noise = Noise.of(code)
+        flown = [fly(seed + k, noise, duration=duration) for k in range(flights)]
+        bound = _errors(_bound, flown, noise, particles, engine)
+        for name in names:
+            errors = _errors(FILTERS[name], flown, noise, particles, engine)
+            rows.append(_row(code, name, errors, bound))
+    figures = {"thesis.png": lambda path: _draw(rows, path)}
+    return Report(rows, figures, (f"{flights} flights of {duration:g} s, {particles} particles, {engine}",))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The squared errors of a filter, a mean a flight: m^2, rad^2, and the thesis's of the attitude."""
+
+    position: np.ndarray
+    attitude: np.ndarray
+    frobenius: np.ndarray
+
+
+def _errors(make: Any, flown: list[Flight], noise: Noise, particles: int, engine: str) -> Errors:
+    trials = [make(flight, noise, particles) for flight in flown]
+    graph = trials[0].graph()
+    output = "pose" if "pose" in {c.name for c in graph.collected} else "belief"
+    batch = simulate_many(
+        graph,
+        lambda k: trials[k].inputs,
+        range(len(trials)),
+        engine=engine,
+        init=lambda k: trials[k].start,
+        keep=[output],
+        runs_at_once=min(len(trials), 10),
+    )
+    found = batch[output]
+    position, attitude, frobenius = [], [], []
+    for k, flight in enumerate(flown):
+        assert flight.truth is not None
+        np.testing.assert_array_equal(found.time, flight.truth.time)
+        position.append(np.mean(np.sum((found.position[k] - flight.truth["position"]) ** 2, axis=-1)))
+        if "attitude" in found.leaves:
+            angle = np.radians(geodesic_angle(found.attitude[k], flight.truth["attitude"]))
+            attitude.append(np.mean(angle**2))
+            frobenius.append(np.mean((8.0 * np.sin(0.5 * angle) ** 2) ** 2))
+    return Errors(np.array(position), np.array(attitude), np.array(frobenius))
+
+
+def _row(code: str, name: str, errors: Errors, bound: Errors) -> dict[str, Any]:
+    published = PUBLISHED.get((name, code), (None, None))
+    drawn = np.random.default_rng(0).integers(len(errors.position), size=(2000, len(errors.position)))
+    low, high = np.percentile(np.sqrt(errors.position[drawn].mean(axis=1)), [2.5, 97.5])
+    return {
+        "setting": code,
+        "filter": name,
+        "position_rmse_m": _root(errors.position),
+        "position_rmse_low_m": float(low),
+        "position_rmse_high_m": float(high),
+        "attitude_rmse_deg": float(np.degrees(_root(errors.attitude))),
+        "thesis_metric_position": float(errors.position.mean()),
+        "thesis_position": published[0],
+        "thesis_metric_attitude": float(errors.frobenius.mean()),
+        "thesis_attitude": published[1],
+        "bound_position_rmse_m": _root(bound.position),
+    }
+
+
+def _root(squares: np.ndarray) -> float:
+    return float(np.sqrt(squares.mean()))
+
+
+def _at_first(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    assert flight.truth is not None
+    return flight.truth["position"][0], flight.truth["velocity"][0], flight.truth["attitude"][0]
+
+
+def _clocks(flight: Flight) -> dict[str, Any]:
+    return clocks_of(flight.streams)
+
+
+def _listed(kind: str, text: str, valid: Any) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in valid:
+            raise UnknownNameError(kind, name, list(valid), path="thesis")
+    return names
+
+
+def _draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Bars of the errors with their intervals and the bound, and the thesis's metric beside its figures."""
+    from matplotlib.figure import Figure
+
+    codes, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("setting", "filter"))
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    axes = figure.subplots(2, 2)
+    panels = (
+        ("position_rmse_m", None, "position RMSE [m]"),
+        ("attitude_rmse_deg", None, "attitude RMSE [deg]"),
+        ("thesis_metric_position", "thesis_position", "mean squared position error [m²]"),
+        ("thesis_metric_attitude", "thesis_attitude", "mean of |R − R_true|⁴ (Frobenius)"),
+    )
+    width = 0.8 / len(names)
+    for ax, (key, published, label) in zip(axes.flat, panels, strict=True):
+        for n, name in enumerate(names):
+            mine = [row for row in rows if row["filter"] == name]
+            at = (
+                np.array([codes.index(row["setting"]) for row in mine]) + (n - 0.5 * (len(names) - 1)) * width
+            )
+            values = np.array([row[key] for row in mine])
+            ax.bar(at, values, width * 0.95, label=name)
+            if key == "position_rmse_m":
+                ends = [[row["position_rmse_low_m"], row["position_rmse_high_m"]] for row in mine]
+                ax.errorbar(at, values, np.abs(np.array(ends).T - values), fmt="none", ecolor="0.2", lw=1)
+            if published:
+                seen = [np.nan if row[published] is None else row[published] for row in mine]
+                ax.plot(at, seen, "k_", ms=9, mew=2, label="thesis's figure" if n == 0 else None)
+                ax.set_yscale("log")
+        if key == "position_rmse_m":
+            for n, code in enumerate(codes):
+                least = next(row["bound_position_rmse_m"] for row in rows if row["setting"] == code)
+                ax.hlines(least, n - 0.45, n + 0.45, "k", "--", lw=1, label="bound" if n == 0 else None)
+        ax.set_xticks(range(len(codes)), codes)
+        ax.set_ylabel(label)
+        ax.grid(axis="y", alpha=0.3)
+        ax.legend(fontsize=8, ncols=2)
+    figure.suptitle("Five filters on the thesis's flights (motion capture, accelerometer, gyroscope)")
+    figure.savefig(path, dpi=110)

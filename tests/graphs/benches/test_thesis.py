@@ -1,0 +1,93 @@
+"""`bench thesis`: the thesis's table, our figures below its own, and nobody below the bound."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowgraph import Report
+from flowgraph.cli import app
+from flowgraph.graphs.benches.thesis import FILTERS, PUBLISHED, SETTINGS, Noise, fly, thesis
+
+KEYS = {
+    *("setting", "filter", "position_rmse_m", "attitude_rmse_deg", "thesis_metric_position"),
+    *("thesis_metric_attitude", "thesis_position", "thesis_attitude", "bound_position_rmse_m"),
+}
+
+
+def test_the_flight_is_that_of_a_world_without_gravity():
+    flight = fly(3, Noise.of("HLH"), duration=2.0)
+    assert flight.truth is not None
+    assert list(flight.streams) == ["imu", "vicon"]
+    exact = fly(3, Noise.of("HLH"), duration=2.0).info["world"].at(flight.streams["imu"].time / 1e9)
+    error = flight.streams["imu"]["specific_force"] - exact.coordinate_acceleration
+    assert 0.9 < np.std(error) < 1.1  # a variance of 1 per sample
+    assert 0.28 < np.std(flight.streams["imu"]["gyro"] - exact.rate) < 0.36  # and one of 0.1
+
+
+def test_a_row_a_setting_and_filter(tmp_path):
+    arguments = [
+        "--flights",
+        "1",
+        "--set",
+        "duration=2",
+        "--set",
+        "settings=HHH,LLL",
+        "--set",
+        "particles=50",
+    ]
+    done = CliRunner().invoke(app, ["bench", "thesis", *arguments, "--json", "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    rows = json.loads(done.stdout)["rows"]
+    assert [(row["setting"], row["filter"]) for row in rows] == [
+        (s, f) for s in ("HHH", "LLL") for f in FILTERS
+    ]
+    for row in rows:
+        assert set(row) >= KEYS
+        expected = PUBLISHED.get((row["filter"], row["setting"]), (None, None))
+        assert (row["thesis_position"], row["thesis_attitude"]) == expected
+        assert row["thesis_metric_position"] == pytest.approx(row["position_rmse_m"] ** 2)
+        assert row["position_rmse_low_m"] <= row["position_rmse_m"] <= row["position_rmse_high_m"]
+    assert (tmp_path / "thesis.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("setting", [("filters", "acf,pf"), ("settings", "HHX")])
+def test_an_unknown_filter_or_setting_is_refused(setting):
+    done = CliRunner().invoke(app, ["bench", "thesis", "--set", "=".join(setting)])
+    assert done.exit_code == 2
+    assert setting[1].split(",")[-1] in done.stderr
+    assert "valid" in done.stderr
+
+
+@cache
+def five_flights() -> Report:
+    return thesis(flights=5, engine="xla")
+
+
+def cell(setting: str, name: str) -> dict[str, Any]:
+    return dict(next(r for r in five_flights().rows if (r["setting"], r["filter"]) == (setting, name)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_our_filters_are_below_the_figures_of_the_thesis(setting):
+    pytest.importorskip("jax")
+    for name in ("acf", "ekf", "ukf"):
+        row = cell(setting, name)
+        assert row["thesis_metric_position"] < row["thesis_position"], name
+        assert row["thesis_metric_attitude"] < row["thesis_attitude"], name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_nobody_beats_the_bound_and_particles_come_near_the_error_state_filter(setting):
+    pytest.importorskip("jax")
+    for name in FILTERS:
+        row = cell(setting, name)
+        assert row["position_rmse_m"] >= row["bound_position_rmse_m"], name
+    assert cell(setting, "rbpf")["position_rmse_m"] <= 1.12 * cell(setting, "eskf")["position_rmse_m"]
