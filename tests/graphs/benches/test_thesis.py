@@ -37,7 +37,7 @@ def test_a_row_a_setting_and_filter(tmp_path):
         "--set",
         "duration=2",
         "--set",
-        "settings=HHH,LLL",
+        "settings=LLL",
         "--set",
         "particles=50",
     ]
@@ -45,7 +45,7 @@ def test_a_row_a_setting_and_filter(tmp_path):
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["rows"]
     assert [(row["setting"], row["filter"]) for row in rows] == [
-        (s, f) for s in ("HHH", "LLL") for f in FILTERS
+        (s, f) for s in ("LLL",) for f in FILTERS
     ]
     for row in rows:
         assert set(row) >= KEYS
@@ -61,7 +61,7 @@ def test_an_unknown_filter_or_setting_is_refused(setting):
     done = CliRunner().invoke(app, ["bench", "thesis", "--set", "=".join(setting)])
     assert done.exit_code == 2
     assert setting[1].split(",")[-1] in done.stderr
-    assert "valid" in done.stderr
+    assert "expected" in done.stderr
 
 
 @cache
