@@ -19,7 +19,9 @@ __all__ = ["chi_square", "chi_square_band", "chi_square_gate", "gate_table", "in
 
 def chi_square(probability: npt.ArrayLike, parts: npt.ArrayLike) -> np.ndarray:
     """What a chi-square variable with `parts` degrees of freedom stays below with this probability."""
-    return np.asarray(2.0 * gammaincinv(0.5 * np.asarray(parts, dtype=float), probability))
+    return np.asarray(
+        2.0 * gammaincinv(0.5 * np.asarray(parts, dtype=float), np.asarray(probability, dtype=float))
+    )
 
 
 def chi_square_band(parts: int, *, runs: int = 1, probability: float = 0.95) -> tuple[float, float]:

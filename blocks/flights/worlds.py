@@ -136,7 +136,8 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
             stamps[name] = recording.stamp
         info.update(_calibration(sensor))
         if info["noise"][name].get("geodetic"):
-            origin = tuple(numbers[f"{name}.{part}"] for part in ("latitude", "longitude", "height"))
+            n = info["noise"][name]
+            origin = n["latitude"], n["longitude"], n["height"]
             streams[name], info[f"{name}_origin"] = s.as_geodetic(recording.series, origin), origin
     for part in _PARTS_OF_IMU if "imu" in chosen else ():
         info["noise"][part] = _of(part, numbers)
