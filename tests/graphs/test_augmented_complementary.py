@@ -92,8 +92,9 @@ def test_the_first_pose_says_nothing_of_the_velocity():
     np.testing.assert_allclose(found.position, 3.0)
 
 
+@pytest.mark.slow
 def test_its_covariance_is_as_large_as_its_errors():
-    """The NEES of 10 runs, nine numbers, on average over the ticks after 2 s: within a fifth of 9."""
+    """The NEES of 5 runs, nine numbers, on average over the ticks after 2 s: within a fifth of 9."""
     assert 7.2 < mean_nees() < 10.8
     assert mean_nees(position_noise=0.14, attitude_noise=0.14) < 7.2
     assert mean_nees(position_noise=0.07, attitude_noise=0.07) > 10.8
@@ -101,7 +102,7 @@ def test_its_covariance_is_as_large_as_its_errors():
 
 @cache
 def mean_nees(**noise: float) -> float:
-    on = [flight(seed, duration="10", **{"imu.oversample": "10"}) for seed in range(10)]
+    on = [flight(seed, duration="10", **{"imu.oversample": "10"}) for seed in range(5)]
     return float(np.mean([played(f, covariance=True, settle=2.0, **noise)["nees_mean"] for f in on]))
 
 
