@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, block
+from flowgraph.blocks.chi_square import gate_table
 from flowgraph.blocks.geometry import (
     conjugate,
     from_rotation_vector,
@@ -67,7 +68,8 @@ def aid_position(
         position: z, m in the world; or absent.
         noise: standard deviation, m.
         lever: the point in body coordinates, m.
-        gate: when given, a measurement with a nis above it changes nothing (for three axes 16.3 is 99.9 %).
+        gate: when given, a measurement with a nis above it changes nothing (for three axes 16.3 is 99.9 %);
+            below 1 it is that probability, such as 0.999.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a measurement.
@@ -142,7 +144,7 @@ def _correct(
     nis = (column.mT @ solved[..., 15:])[..., 0, 0]
     K = solved[..., :15].mT
     if gate is not None:
-        K = K * xp.astype(nis <= gate, K.dtype)[..., None, None]
+        K = K * xp.astype(nis <= float(gate_table(gate, 3)[3]), K.dtype)[..., None, None]
     d = (K @ column)[..., 0]
     one = xp.eye(15, dtype=P.dtype)
     turn = d[..., 6:9]

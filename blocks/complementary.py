@@ -16,6 +16,8 @@ complementary filters.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,12 +26,10 @@ from flowgraph import Array, Flight, Series, Signal, block, real
 from flowgraph.blocks.geometry import (
     conjugate,
     from_rotation_vector,
-    geodesic_angle,
     level,
     multiply,
     normalize,
     rotate,
-    tilt_and_heading,
     to_rotation_vector,
 )
 from flowgraph.blocks.inertial import GRAVITY
@@ -56,10 +56,10 @@ __all__ = [
     "dead_reckon",
     "correct_by_pose",
     "first_attitude",
-    "inertial_streams",
-    "needed",
+    "with_parts",
+    "own_density",
+    "reading_deviation",
     "check_alpha",
-    "attitude_errors",
 ]
 
 
@@ -233,35 +233,46 @@ def _(prior: Any, pose: Any, **_: Any) -> Any:
 # -- flights and their scores (NumPy) --------------------------------------------------------------------
 
 
-def inertial_streams(flight: Flight) -> dict[str, Series]:
-    """The flight's streams, with `gyro` and `accelerometer` taken out of its `imu` where they are missing."""
+def with_parts(flight: Flight) -> Flight:
+    """The flight, with `gyro` and `accelerometer` taken out of its `imu` where they are missing."""
     streams = dict(flight.streams)
     if "imu" in streams:
         imu = streams["imu"]
         streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
         force = SpecificForce(force=imu["specific_force"])
         streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
-    return streams
+    return replace(flight, streams=streams)
 
 
-def needed(
-    graph: str, flight: Flight, streams: dict[str, Series], *names: str, otherwise: str = ""
-) -> dict[str, Series]:
-    """Some of the streams, by name.
+def reading_deviation(flight: Flight, part: str, series: Series, density: float | None) -> float:
+    """The standard deviation of one reading of a gyroscope or accelerometer: its density times sqrt(rate).
+
+    Args:
+        part: gyro, accelerometer or coordinate_acceleration.
+        density: the setting; the flight's own if left out.
+    """
+    step = float(np.median(np.diff(series.time))) * 1e-9 if len(series) > 1 else 1.0
+    return own_density(flight, part, density) / math.sqrt(step)
+
+
+def own_density(flight: Flight, part: str, density: float | None) -> float:
+    """The density of the white noise of an inertial sensor: the setting, or the flight's own.
 
     Raises:
-        DataError: where one is not there.
+        DataError: where nobody says it.
     """
-    if all(name in streams for name in names):
-        return {name: streams[name] for name in names}
-    raise DataError(
-        f"this flight lacks what {graph} needs",
-        path=flight.name,
-        expected=f"streams {', '.join(names)}" + (f", or {otherwise}" if otherwise else ""),
-        got=", ".join(flight.streams),
-        fix=f"choose another flight (simulated: sensors={','.join(names)}), or build {graph} with your own "
-        "sources",
-    )
+    own = flight.info.get("noise", {}).get(part, {}).get("noise")
+    if density is None and own is None and "imu_noise" in flight.info:
+        own = getattr(flight.info["imu_noise"], part, None)
+    if density is None and own is None:
+        raise DataError(
+            f"this flight does not say the noise of its {part}, and a covariance needs it",
+            path=f"{flight.name}: info",
+            expected="imu_noise, or noise by sensor",
+            got=", ".join(flight.info) or "nothing",
+            fix="give it as a setting, or leave the covariance out",
+        )
+    return float(own if density is None else density)
 
 
 def check_alpha(graph: str, *alphas: float) -> None:
@@ -290,37 +301,3 @@ def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:
     if flight.truth is not None:
         return Attitude(attitude=interpolate_pose(flight.truth, gyro.time[:1])[1][0])
     return Attitude(attitude=np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np)))
-
-
-def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
-    """Compare attitudes with the truth, at ticks that it covers, `settle` seconds after the first on.
-
-    Returns:
-        attitude_rmse_deg (geodesic), tilt_rmse_deg, heading_rmse_deg, attitude_end_deg (geodesic, at the last
-        tick) and compared_ticks.
-
-    Raises:
-        DataError: when no tick of the estimate lies within the truth.
-    """
-    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
-    if len(truth):
-        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
-    if not len(truth) or not len(chosen):
-        raise DataError(
-            "no tick of the estimate lies within the truth",
-            path=estimate.name,
-            expected=f"ticks {settle} s or more after the first, between the truth's first and last time",
-            got=f"{estimate!r}, {truth!r}",
-            fix="check the time offsets, or make settle smaller",
-        )
-    attitude = interpolate_pose(truth, chosen.time)[1]
-    whole = geodesic_angle(chosen["attitude"], attitude)
-    tilt, heading = tilt_and_heading(chosen["attitude"], attitude)
-    rms = lambda x: float(np.sqrt(np.mean(np.square(x))))
-    return {
-        "attitude_rmse_deg": rms(whole),
-        "tilt_rmse_deg": rms(tilt),
-        "heading_rmse_deg": rms(heading),
-        "attitude_end_deg": float(whole[-1]),
-        "compared_ticks": float(len(chosen)),
-    }

@@ -42,6 +42,7 @@ __all__ = [
     "predict_pose",
     "quaternion_noise",
     "start_pose",
+    "tangent_jacobian",
     "update_pose",
 ]
 
@@ -141,7 +142,7 @@ def update_pose(
         pose: z; or absent.
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
-        gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
+        gate: when given, a measurement that is too far off changes nothing; see `update_linear`.
 
     An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
     the attitude with it.
@@ -173,10 +174,7 @@ def update_pose(
 def pose_belief(belief: QuaternionBelief, *, xp: Any) -> PoseBelief:
     """The same belief with its covariance in the tangent space (9, 9), in the order of `PoseBelief`."""
     q = belief.attitude
-    one, wide = np.eye(3), np.zeros((3, 4))
-    to_angle = xp.concat([xp.asarray(np.zeros((3, 6)), dtype=q.dtype), _to_angle(q, xp)], axis=-1)
-    swap = xp.asarray(np.block([[0 * one, one, wide], [one, 0 * one, wide]]), dtype=q.dtype)
-    T = xp.concat([swap, to_angle], axis=-2)
+    T = _to_tangent(q, xp)
     P = T @ belief.covariance @ T.mT
     return PoseBelief(
         position=belief.position, velocity=belief.velocity, attitude=q, covariance=0.5 * (P + P.mT)
@@ -211,6 +209,16 @@ def move_jacobian(q: Array, imu: Imu, dt: Any, xp: Any) -> Array:
     full = right_product(from_rotation_vector(imu.gyro * dt, xp=xp), xp=xp)
     low = xp.concat([xp.asarray(np.zeros((4, 6)), dtype=q.dtype), full], axis=-1)
     return xp.concat([top, low], axis=-2)
+
+
+def tangent_jacobian(q: Array, predicted: Array, imu: Imu, dt: Any, xp: Any) -> Array:
+    """The Jacobian (9, 9) of `move` from the tangent space at q to that at the q' that it predicted.
+
+    `move_jacobian` between T(q') and T(q)^+, where T (9, 10) makes of a small change of (v, p, q) its error
+    in the order of `PoseBelief`, and T^+ (10, 9) of an error the change.
+    """
+    back = _to_tangent(q, xp).mT * xp.asarray([1.0] * 6 + [0.25] * 3)  # T's rows of angles have length 2
+    return _to_tangent(predicted, xp) @ move_jacobian(q, imu, dt, xp) @ back
 
 
 def observe_jacobian(q: Array, lever: Array, xp: Any) -> Array:
@@ -287,6 +295,16 @@ def _to_angle(q: Array, xp: Any) -> Array:
     w, u = inverse[..., 0:1], inverse[..., 1:]
     vector = w[..., None] * xp.eye(3, dtype=q.dtype) + skew(u, xp=xp)
     return 2.0 * xp.concat([u[..., :, None], vector], axis=-1)
+
+
+def _to_tangent(q: Array, xp: Any) -> Array:
+    """The matrix (9, 10) that makes of a small change of (v, p, q) its error, ordered as in `PoseBelief`."""
+    one, wide = np.eye(3), np.zeros((3, 4))
+    angle = _to_angle(q, xp)
+    none = 0.0 * angle[..., :3]
+    swap = xp.asarray(np.block([[0 * one, one, wide], [one, 0 * one, wide]]), dtype=q.dtype)
+    swap = xp.broadcast_to(swap, (*q.shape[:-1], 6, 10)) if q.ndim > 1 else swap
+    return xp.concat([swap, xp.concat([none, none, angle], axis=-1)], axis=-2)
 
 
 def _unit(v: Array, p: Array, q: Array, P: Array, xp: Any) -> QuaternionBelief:

@@ -4,7 +4,8 @@
   blocks of `roots` carry a triangular root of it instead, whose square cannot become negative.
 - A measurement of which some entries are NaN corrects with the others (`arrays(..., not_finite="keep")` lets
   NaN pass as data). Nothing of the missing entries reaches the result.
-- The innovation is an output with its normalised square (NIS), and an optional gate on it.
+- The innovation is an output with its normalised square (NIS), and an optional gate on it, which is as strict
+  with a part of a measurement as with all of it.
 - A state or measurement of angles and quaternions is declared once, as a `StateSpace`.
 
 Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation",
@@ -16,9 +17,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, Signal, block, boolean, real, when
+from flowgraph.blocks.chi_square import gate_table
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.manifold import StateSpace
 
@@ -118,7 +121,10 @@ def update_linear(
         space: of the state, where some of it are angles: x' = x plus K r. (For quaternions:
             `update_extended`.)
         measured_space: of z, where some of it are angles: r = z minus H x.
-        gate: when given, a measurement with a nis above it changes nothing (`chi_square_gate` gives one).
+        gate: when given, a measurement that is too far off changes nothing. Below 1 it is the probability
+            with which an honest one passes, such as 0.999; from 1 on the largest nis of a whole measurement,
+            as `chi_square_gate` gives it, and where entries are missing one of the same probability
+            (`gate_table`).
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -191,7 +197,7 @@ def correct(
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
-    accepted = accepts(nis, gate)
+    accepted = accepts(nis, gate, present, xp)
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
@@ -233,9 +239,14 @@ def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
     return H * here[..., :, None], R * both + xp.eye(H.shape[-2], dtype=H.dtype) * (1.0 - here)[..., None]
 
 
-def accepts(nis: Array, gate: float | None) -> Array:
-    """Whether an innovation passes the gate; all do without one."""
-    return nis == nis if gate is None else nis <= gate
+def accepts(nis: Array, gate: float | None, present: Array, xp: Any) -> Array:
+    """Whether an innovation (...) of the entries `present` (..., m) passes the gate; all do without one."""
+    if gate is None:
+        return nis == nis
+    limits = gate_table(gate, present.shape[-1])
+    parts = xp.sum(xp.astype(present, nis.dtype), axis=-1)[..., None]
+    places = xp.asarray(np.arange(len(limits)), dtype=nis.dtype)
+    return nis <= xp.sum(xp.where(parts == places, xp.asarray(limits, dtype=nis.dtype), 0.0), axis=-1)
 
 
 def moved(mean: Array, shift: Array, space: StateSpace | None, xp: Any) -> Array:

@@ -1,18 +1,43 @@
 """How good an estimate is: errors against the truth, and whether the filter knew how large they would be.
 
-Position errors are root mean squares in metres; attitude errors geodesic, in degrees, with tilt and heading
-apart.
+Position errors are in metres, velocity errors in m/s; attitude errors geodesic, in degrees, with tilt and
+heading apart. Where there is a covariance, the NEES, the squared error in deviations of the filter's own,
+tells whether it is honest; see `consistency`. For a pose it is taken in the tangent space: position, velocity
+(world) and a rotation vector (body), nine numbers.
+
+Source of the NEES: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, sec. 5.4.2.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from flowgraph import Series
-from flowgraph.blocks.geometry import geodesic_angle, slerp, tilt_and_heading, to_matrix, world_error
+from flowgraph.blocks.chi_square import chi_square_band, inside
+from flowgraph.blocks.geometry import (
+    conjugate,
+    geodesic_angle,
+    multiply,
+    slerp,
+    tilt_and_heading,
+    to_matrix,
+    to_rotation_vector,
+    world_error,
+)
 from flowgraph.errors import DataError
 
-__all__ = ["interpolate_pose", "pose_errors"]
+__all__ = [
+    "attitude_errors",
+    "error_summary",
+    "interpolate_pose",
+    "nees",
+    "nees_summary",
+    "pose_errors",
+    "state_error",
+    "within_truth",
+]
 
 
 def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,21 +55,12 @@ def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.nd
     return position, slerp(q[left], q[right], part)
 
 
-def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
-    """Compare an estimate with the truth at the estimate's times, where the truth covers them.
-
-    Args:
-        estimate: with fields `position` and `attitude`, and perhaps the `covariance` of a `Belief`.
-        truth: with fields `position` and `attitude`.
-        settle: seconds after the estimate's first tick that are left out.
-
-    Returns:
-        position_rmse_m, attitude_rmse_deg, tilt_rmse_deg, heading_rmse_deg, compared_ticks (how many);
-        with a covariance also position_3sigma and tilt_3sigma, the fraction of errors within three standard
-        deviations over all axes (99.7 % when the filter is honest), and heading_3sigma.
+def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
+    """The ticks of an estimate that can be compared: covered by the truth, `settle` seconds or more after the
+    first.
 
     Raises:
-        DataError: when no tick of the estimate lies within the truth.
+        DataError: when there is none.
     """
     chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
     if len(truth):
@@ -57,29 +73,160 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
             got=f"{estimate!r}, {truth!r}",
             fix="check the time offsets, or make settle smaller",
         )
+    return chosen
+
+
+def error_summary(error: npt.ArrayLike) -> dict[str, float]:
+    """`rmse`, `mean` and `max` of the length of error vectors (..., k), or of angles (n,)."""
+    size = np.abs(np.asarray(error, dtype=float))
+    size = np.linalg.norm(size, axis=-1) if size.ndim > 1 else size
+    return {
+        "rmse": float(np.sqrt(np.mean(np.square(size)))),
+        "mean": float(np.mean(size)),
+        "max": float(np.max(size)),
+    }
+
+
+def state_error(
+    time: np.ndarray, truth: Series, position: np.ndarray, velocity: np.ndarray, attitude: np.ndarray | None =
+    None
+) -> np.ndarray:  # fmt: skip
+    """The errors (..., n, 6 or 9) of estimates at n times: position, velocity, and attitude where it is
+    given.
+
+    The error is that of the truth from the estimate: p_true - p, v_true - v, Log(q^-1 q_true).
+
+    Args:
+        time: (n,) int64 ns.
+        truth: with fields position, velocity and attitude; interpolated.
+        position, velocity: (..., n, 3).
+        attitude: (..., n, 4).
+    """
+    p, q = interpolate_pose(truth, time)
+    parts = [p - position, _true_velocity(truth, time) - velocity]
+    if attitude is not None:
+        parts.append(_turn(attitude, np.broadcast_to(q, attitude.shape)))
+    return np.concatenate(parts, axis=-1)
+
+
+def nees(error: npt.ArrayLike, covariance: npt.ArrayLike) -> np.ndarray:
+    """The normalised estimation error squared e^T P^-1 e (...), of errors e (..., k) and P (..., k, k).
+
+    Where a P is singular, which claims that something is known exactly, only the rest counts.
+    """
+    e, P = np.asarray(error, dtype=float), np.asarray(covariance, dtype=float)
+    try:
+        weighed = np.linalg.solve(P, e[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        weighed = (np.linalg.pinv(P, hermitian=True) @ e[..., None])[..., 0]
+    return np.asarray(np.vecdot(e, weighed))
+
+
+def nees_summary(error: npt.ArrayLike, covariance: npt.ArrayLike) -> dict[str, float]:
+    """Whether errors (n, k) are as large as their covariances (n, k, k) say.
+
+    Returns:
+        nees_mean, k in a consistent filter; nees_low and nees_high, the 95 % band of a single tick; and
+        nees_inside, the fraction of ticks in it. (Neighbouring ticks err alike, so the mean of one run
+        scatters more than one of as many independent ticks: for a sharp test average over runs.)
+    """
+    values = nees(error, covariance)
+    band = chi_square_band(np.shape(error)[-1])
+    return {
+        "nees_mean": float(np.mean(values)),
+        "nees_low": band[0],
+        "nees_high": band[1],
+        "nees_inside": inside(values, band),
+    }
+
+
+def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare an estimate with the truth at the estimate's times, where the truth covers them.
+
+    Args:
+        estimate: with fields `position` and `attitude`, perhaps `velocity`, and perhaps the `covariance` of
+            a `Belief` or `PoseBelief`.
+        truth: with fields `position` and `attitude`, and perhaps `velocity`.
+        settle: seconds after the estimate's first tick that are left out.
+
+    Returns:
+        position_rmse_m and attitude_rmse_deg, each with mean and max; tilt_rmse_deg, heading_rmse_deg,
+        velocity_rmse_mps where both have one, and compared_ticks (how many); with a covariance also
+        position_3sigma and tilt_3sigma, the fraction of errors within three standard deviations over all axes
+        (99.7 % when the filter is honest), heading_3sigma, and the nine numbers' `nees_summary`.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
     position, attitude = interpolate_pose(truth, chosen.time)
     error = chosen["position"] - position
-    tilt, heading = tilt_and_heading(chosen["attitude"], attitude)
-    found = {
-        "position_rmse_m": _rms(np.linalg.norm(error, axis=-1)),
-        "attitude_rmse_deg": _rms(geodesic_angle(chosen["attitude"], attitude)),
-        "tilt_rmse_deg": _rms(tilt),
-        "heading_rmse_deg": _rms(heading),
-        "compared_ticks": float(len(chosen)),
-    }
+    found = {f"position_{name}_m": value for name, value in error_summary(error).items()}
+    found.update(_angles(chosen["attitude"], attitude))
+    moving = "velocity" in chosen.leaves and "velocity" in truth.leaves
+    if moving:
+        speed = chosen["velocity"] - _true_velocity(truth, chosen.time)
+        found["velocity_rmse_mps"] = error_summary(speed)["rmse"]
+    found["compared_ticks"] = float(len(chosen))
     if "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9:
-        P = chosen["covariance"]
-        R = to_matrix(chosen["attitude"], xp=np)
-        in_world = R @ P[:, 6:9, 6:9] @ R.mT
-        turn = world_error(chosen["attitude"], attitude)
-        sigma = np.sqrt(np.einsum("nii->ni", in_world))
-        inside = np.abs(turn) <= 3.0 * sigma
+        P = chosen["covariance"][:, :9, :9]
         at = np.sqrt(np.einsum("nii->ni", P[:, :3, :3]))
         found["position_3sigma"] = float(np.mean(np.abs(error) <= 3.0 * at))
-        found["tilt_3sigma"] = float(np.mean(inside[:, :2]))
-        found["heading_3sigma"] = float(np.mean(inside[:, 2]))
+        found.update(_turn_3sigma(chosen["attitude"], attitude, P[:, 6:9, 6:9]))
+        if moving:
+            turn = _turn(chosen["attitude"], attitude)
+            found.update(nees_summary(np.concatenate([-error, -speed, turn], axis=-1), P))
     return found
 
 
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(x))))
+def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare attitudes with the truth, at ticks that it covers, `settle` seconds after the first on.
+
+    Returns:
+        attitude_rmse_deg (geodesic) with mean and max, tilt_rmse_deg, heading_rmse_deg, attitude_end_deg
+        (geodesic, at the last tick) and compared_ticks; with a covariance (3, 3) also tilt_3sigma,
+        heading_3sigma and the `nees_summary` of its three numbers.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    q, attitude = chosen["attitude"], interpolate_pose(truth, chosen.time)[1]
+    found = {
+        **_angles(q, attitude),
+        "attitude_end_deg": float(geodesic_angle(q[-1:], attitude[-1:])[0]),
+        "compared_ticks": float(len(chosen)),
+    }
+    if "covariance" in chosen.leaves:
+        found.update(_turn_3sigma(q, attitude, chosen["covariance"]))
+        found.update(nees_summary(_turn(q, attitude), chosen["covariance"]))
+    return found
+
+
+def _angles(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    tilt, heading = tilt_and_heading(estimate, truth)
+    whole = error_summary(geodesic_angle(estimate, truth))
+    return {
+        **{f"attitude_{name}_deg": value for name, value in whole.items()},
+        "tilt_rmse_deg": error_summary(tilt)["rmse"],
+        "heading_rmse_deg": error_summary(heading)["rmse"],
+    }
+
+
+def _turn_3sigma(estimate: np.ndarray, truth: np.ndarray, P: np.ndarray) -> dict[str, float]:
+    """How often tilt and heading are within three deviations, given the covariance (n, 3, 3) in the body."""
+    R = to_matrix(estimate, xp=np)
+    sigma = np.sqrt(np.einsum("nii->ni", R @ P @ R.mT))
+    held = np.abs(world_error(estimate, truth)) <= 3.0 * sigma
+    return {"tilt_3sigma": float(np.mean(held[:, :2])), "heading_3sigma": float(np.mean(held[:, 2]))}
+
+
+def _turn(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Log(q^-1 q_true), rad, body."""
+    return np.asarray(to_rotation_vector(multiply(conjugate(estimate, xp=np), truth, xp=np), xp=np))
+
+
+def _true_velocity(truth: Series, time: np.ndarray) -> np.ndarray:
+    """The truth's velocity (n, 3), interpolated."""
+    seconds, at = (truth.time - time[0]) * 1e-9, (time - time[0]) * 1e-9
+    return np.stack([np.interp(at, seconds, column) for column in truth["velocity"].T], axis=-1)

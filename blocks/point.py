@@ -20,6 +20,7 @@ from flowgraph.blocks.inertial import GRAVITY
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.tuning import reading_of
 from flowgraph.errors import DataError
 
 __all__ = [
@@ -115,7 +116,8 @@ def told_acceleration(flight: Flight) -> Series:
             got=", ".join(flight.streams) + (", no truth" if truth is None else ""),
             fix="choose a simulated flight, or give the filter accelerations of your own",
         )
-    attitude = interpolate_pose(truth, imu.time)[1]
+    half = flight.info["imu_period_ns"] // 2 if reading_of(flight) == "mean" else 0
+    attitude = interpolate_pose(truth, imu.time - half)[1]  # of a mean, that of its middle
     force = imu["specific_force"]
     if "accelerometer_bias" in truth.leaves:
         last = np.maximum(np.searchsorted(truth.time, imu.time, side="right") - 1, 0)

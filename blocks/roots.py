@@ -4,6 +4,10 @@ A covariance P = L L^T kept as its root L has twice the digits and cannot become
 need one thing: the triangle of a wide matrix, usually by a QR factorization. That is no instruction of a
 pipeline, so here it is written out: one Householder reflection a row, a fixed number of them.
 
+The linear filter is here whole, of the extended one the correction. Its prediction is its user's own model:
+`predict_root` shows the one line that it takes, the triangle of [F L, Q^(1/2)]. The graph `ekf` does not run
+on roots: its 10 x 10 covariance is singular along the quaternion.
+
 Sources: G. Golub and C. Van Loan, "Matrix Computations", 4th ed., 2013: algorithms 5.1.1, 5.2.1 and 4.2.2
 (the triangles); P. Kaminski, A. Bryson, S. Schmidt, "Discrete square root filtering: a survey", IEEE TAC
 16(6), 1971 (the filter).
@@ -11,6 +15,7 @@ Sources: G. Golub and C. Van Loan, "Matrix Computations", 4th ed., 2013: algorit
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,7 +34,14 @@ from flowgraph.blocks.kalman import (
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.manifold import StateSpace
 
-__all__ = ["GaussianRoot", "lower_root", "predict_root", "semidefinite_root", "update_root"]
+__all__ = [
+    "GaussianRoot",
+    "lower_root",
+    "predict_root",
+    "semidefinite_root",
+    "update_extended_root",
+    "update_root",
+]
 
 
 class GaussianRoot(Signal):
@@ -78,9 +90,37 @@ def update_root(
     """
     if measured is None:
         return prior, None
-    kind, m = prior.mean.dtype, np.shape(H)[0]
-    H, R = xp.asarray(H, dtype=kind), xp.asarray(R, dtype=kind)
-    residual, present = innovate(measured, (H @ prior.mean[..., None])[..., 0], measured_space, xp)
+    H = xp.asarray(H, dtype=prior.mean.dtype)
+    predicted = (H @ prior.mean[..., None])[..., 0]
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+
+
+@block
+def update_extended_root(
+    prior: GaussianRoot,
+    measured: Vector | None,
+    *,
+    observe: Callable[..., tuple[Array, Array]],
+    R: npt.ArrayLike,
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[GaussianRoot, KalmanInnovation | None]:
+    """`update_extended` on a root: `update_root` with the Jacobian that `observe` gives at the prior."""
+    if measured is None:
+        return prior, None
+    predicted, H = observe(prior.mean, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+
+
+def _update(
+    prior: GaussianRoot, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
+    space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
+) -> tuple[GaussianRoot, Any]:  # fmt: skip
+    kind, m = prior.mean.dtype, H.shape[-2]
+    R = xp.asarray(R, dtype=kind)
+    residual, present = innovate(measured, predicted, measured_space, xp)
     H, R = masked(H, R, present, xp)
     L = prior.root
     top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
@@ -89,7 +129,7 @@ def update_root(
     root_S, gain, new = whole[..., :m, :m], whole[..., m:, :m], whole[..., m:, m:]
     white = xp.linalg.solve(root_S, residual[..., None])
     nis = xp.linalg.vecdot(white[..., 0], white[..., 0])
-    accepted = accepts(nis, gate)
+    accepted = accepts(nis, gate, present, xp)
     shift = (gain @ white)[..., 0] * xp.astype(accepted, kind)[..., None]
     turn = None if space is None else space.reset(shift, xp)
     new = new if turn is None else lower_root(turn @ new, xp=xp)

@@ -3,7 +3,8 @@
 A filter gives p(x_k | z_1..z_k). The smoother of Rauch, Tung and Striebel goes back from the end and gives
 p(x_k | z_1..z_n); with a fixed lag L it gives p(x_k | z_1..z_(k+L)), which a filter could report L ticks
 late. Both need the whole run of a filter, so they are functions of its collected streams and run on the host;
-nothing of them is lowered.
+nothing of them is lowered. An extended filter is smoothed in the tangent space, with the Jacobians of its
+predictions.
 
     C_k = P_k F_k^T (P-_(k+1))^-1
     xs_k = x_k + C_k (xs_(k+1) - x-_(k+1))        Ps_k = P_k + C_k (Ps_(k+1) - P-_(k+1)) C_k^T
@@ -14,18 +15,70 @@ Journal 3(8), 1965, eqs. 3.28-3.31; R. Fiszel, thesis (2017), which defines filt
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from typing import NamedTuple
 
-from flowgraph import Series
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Result, Series
+from flowgraph.blocks.extended import PoseBelief, pose_belief, tangent_jacobian
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.linear import LinearModel
-from flowgraph.blocks.manifold import StateSpace
+from flowgraph.blocks.manifold import StateSpace, euclidean, quaternion
+from flowgraph.blocks.point import point_belief
 from flowgraph.errors import DataError
 
-__all__ = ["fixed_lag", "rauch_tung_striebel"]
+__all__ = ["Steps", "fixed_lag", "lag_ticks", "point_steps", "pose_steps", "rauch_tung_striebel"]
 
 Transition = LinearModel | np.ndarray
 """How the state at one tick goes on to the next: a model, or the n - 1 Jacobians (t, t) of the steps."""
+
+
+class Steps(NamedTuple):
+    """What a smoother needs of a run; and `named`, which makes beliefs with names of what it gives back."""
+
+    prior: Series
+    posterior: Series
+    transition: Transition
+    space: StateSpace | None
+    named: Callable[[Series], Series]
+
+
+def point_steps(result: Result, model: LinearModel) -> Steps:
+    """Those of a run of `kalman` or `async_kalman`, which collect `prior` and `posterior`."""
+
+    def named(smoothed: Series) -> Series:
+        return Series(smoothed.time, point_belief.step(smoothed.values), name=smoothed.name)
+
+    return Steps(result["prior"], result["posterior"], model, None, named)
+
+
+def pose_steps(result: Result) -> Steps:
+    """Those of a run of `ekf`, which collects `prior`, `posterior` and the `control` of each prediction.
+
+    The state is (position, velocity, attitude), ten numbers, and its errors are the nine of `PoseBelief`.
+    """
+    prior, posterior = (_in_tangent_space(result[name]) for name in ("prior", "posterior"))
+    rows = zip(
+        posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
+        np.diff(posterior.time) * 1e-9, strict=True,
+    )  # fmt: skip
+    jacobians = [tangent_jacobian(q, ahead, control, dt, np) for q, ahead, control, dt in rows]
+    space = StateSpace(euclidean(6), quaternion())
+
+    def named(smoothed: Series) -> Series:
+        p, v, q = np.split(smoothed["mean"], (3, 6), axis=-1)
+        return Series(smoothed.time, PoseBelief(p, v, q, smoothed["covariance"]), name=smoothed.name)
+
+    return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
+
+
+def _in_tangent_space(series: Series) -> Series:
+    """A series of `QuaternionBelief` as `Gaussian` of (position, velocity, attitude)."""
+    belief = pose_belief.step(series.values, xp=np)
+    mean = np.concatenate([belief.position, belief.velocity, belief.attitude], axis=-1)
+    return Series(series.time, Gaussian(mean=mean, covariance=belief.covariance), name=series.name)
 
 
 def rauch_tung_striebel(
@@ -52,14 +105,15 @@ def rauch_tung_striebel(
 
 
 def fixed_lag(
-    prior: Series, posterior: Series, transition: Transition, lag: int, *, space: StateSpace | None = None
-) -> Series:
+    prior: Series, posterior: Series, transition: Transition, lag: npt.ArrayLike, *, space: StateSpace | None
+    = None
+) -> Series:  # fmt: skip
     """Smooth each tick with the measurements of the `lag` ticks after it, or of those there are.
 
     With a lag of 0 it is the posterior, with one as long as the run that of `rauch_tung_striebel`.
 
     Args:
-        lag: in ticks, 0 or more.
+        lag: in ticks, 0 or more; one number, or one for each tick (n,), as `lag_ticks` gives them.
         prior, posterior, transition, space: as for `rauch_tung_striebel`.
 
     Returns:
@@ -68,23 +122,32 @@ def fixed_lag(
     Raises:
         DataError: where the series do not belong together, or the lag is negative.
     """
-    if lag < 0:
+    lags = np.asarray(lag)
+    if (lags < 0).any():
         raise DataError(
             "a lag cannot be negative",
             path="fixed_lag",
             expected="0 ticks or more",
-            got=str(lag),
+            got=str(lags.min()),
             fix="give how many later ticks may be used",
         )
     gains = _gains(prior, posterior, transition)
     n = len(posterior)
-    end = np.minimum(np.arange(n) + lag, n - 1)
+    end = np.minimum(np.arange(n) + lags, n - 1)
     mean, P = posterior["mean"][end], posterior["covariance"][end]
-    for ahead in range(min(lag, n) - 1, -1, -1):  # all ticks at once, one step back at a time
+    for ahead in range(
+        int((end - np.arange(n)).max(initial=0)) - 1, -1, -1
+    ):  # all ticks at once, one step back at a time
         active = np.flatnonzero(np.arange(n) + ahead < end)
         back = _back(posterior, prior, gains, active + ahead, mean[active], P[active], space)
         mean[active], P[active] = back
     return Series(posterior.time, Gaussian(mean=mean, covariance=P), name="smoothed")
+
+
+def lag_ticks(time: np.ndarray, seconds: float) -> np.ndarray:
+    """How many ticks after each of the times (n,) int64 ns come within so many seconds of it."""
+    ends = np.searchsorted(time, time + round(seconds * 1e9), side="right") - 1
+    return np.asarray(ends - np.arange(len(time)))
 
 
 def _gains(prior: Series, posterior: Series, transition: Transition) -> np.ndarray:

@@ -30,8 +30,9 @@ COLOURS = ("#3b6ea8", "#c8792b", "#4f8a5b", "#a85a6d", "#7a68a8", "#8b8378")
 TRUTH, BAND = "#22303c", "#9db4d0"
 MOST_COMPONENTS = 6
 PANELS_A_COLUMN = 8
-# where each quantity stands in the 15 error states
+# where each quantity stands in the 15 error states; a covariance of 6 or 9 holds the first of them
 STATES = {"position": 0, "velocity": 3, "attitude": 6, "gyro_bias": 9, "accelerometer_bias": 12}
+SIZES = (6, 9, 15)
 
 
 def plot_result(
@@ -94,7 +95,8 @@ def plot_trajectory(truth: Series, estimate: Series, file: str | Path | None = N
     """The trajectory in space beside its error over time, with 3-sigma bands where there is a covariance.
 
     Args:
-        truth, estimate: series with a field `position`; the estimate may have `covariance` (15, 15).
+        truth, estimate: series with a field `position`; the estimate may have a `covariance`, as in
+            `plot_navigation`.
     """
     figure = _figure(11, 5.2)
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
@@ -119,7 +121,7 @@ def plot_navigation(
     Args:
         estimate: a series with `position`, and any of `velocity`, `attitude` (quaternion w, x, y, z, body to
             world), `gyro_bias`, `accelerometer_bias` and `covariance` (15 x 15: position, velocity, attitude,
-            gyro bias, accelerometer bias).
+            gyro bias, accelerometer bias; or 9 x 9 or 6 x 6: the first of them).
         truth: the same fields, at times of its own, or None.
         file: ending in .png, .svg or .pdf.
         extra: more panels, by title: an array with one value for each time of the estimate, such as
@@ -252,9 +254,9 @@ def _need(series: Series, field: str) -> tuple[np.ndarray, ArrayType]:
 
 def _sigma(estimate: Series, field: str, k: int) -> np.ndarray | None:
     found = _find(estimate, "covariance")
-    if found is None or found[0].shape[1:] != (15, 15):
-        return None
     place = STATES[field] + k
+    if found is None or found[0].shape[-1] not in SIZES or place >= found[0].shape[-1]:
+        return None
     sigma: np.ndarray = np.sqrt(np.maximum(found[0][:, place, place], 0.0))
     return sigma
 
@@ -302,8 +304,35 @@ def _angles(quaternion: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
 
 
+def _angle_sigma(estimate: Series, k: int) -> np.ndarray | None:
+    """(n,) degrees: the deviation of roll, pitch or yaw, from that of the rotation vector in the body.
+
+    By the rates of the angles, d(roll, pitch, yaw) = E d(rotation vector), which has no bound at a pitch of
+    90 degrees; the band ends at half a turn.
+    """
+    found = _find(estimate, "covariance")
+    if found is None or found[0].shape[-1] not in SIZES or found[0].shape[-1] < 9:
+        return None
+    P, q = found[0][:, 6:9, 6:9], _need(estimate, "attitude")[0]
+    roll, pitch, _ = np.deg2rad(_angles(q)).T
+    s, c, level = np.sin(roll), np.cos(roll), np.maximum(np.abs(np.cos(pitch)), 1e-3)
+    one, none = np.ones_like(s), np.zeros_like(s)
+    rows = (
+        [one, s * np.sin(pitch) / level, c * np.sin(pitch) / level],
+        [none, c, -s],
+        [none, s / level, c / level],
+    )
+    row = np.stack(rows[k], axis=-1)
+    variance = np.einsum("ni,nij,nj->n", row, P, row)
+    return np.asarray(np.minimum(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))), 60.0))
+
+
 def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, start: int) -> None:
     angle = _angles(_need(estimate, "attitude")[0])[:, k]
+    sigma = _angle_sigma(estimate, k)
+    if sigma is not None:
+        seconds = (estimate.time - start) * 1e-9
+        axis.fill_between(seconds, angle - 3 * sigma, angle + 3 * sigma, color=BAND, alpha=0.35, lw=0)
     axis.plot((estimate.time - start) * 1e-9, angle, color=COLOURS[k], lw=1.0)
     known = None if truth is None else _find(truth, "attitude")
     if truth is not None and known is not None:
@@ -311,7 +340,9 @@ def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, start: in
         begin = np.interp(0, truth.time - start, right)
         right = right + 360 * np.round((angle[0] - begin) / 360)  # the same turn as the estimate
         axis.plot((truth.time - start) * 1e-9, right, color=TRUTH, lw=0.9, ls="--")
-    axis.set_title(("roll", "pitch", "yaw")[k], loc="left", fontsize=9)
+    axis.set_title(
+        ("roll", "pitch", "yaw")[k] + (", with 3σ" if sigma is not None else ""), loc="left", fontsize=9
+    )
     axis.set_ylabel("[deg]")
 
 

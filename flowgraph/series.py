@@ -246,8 +246,13 @@ class Flight:
     info: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    def need(self, graph: str, *names: str) -> dict[str, Series]:
+    def need(self, graph: str, *names: str, fix: str = "choose another flight") -> dict[str, Series]:
         """The streams of these names, for a graph that cannot run without them.
+
+        Args:
+            graph: who asks.
+            names: of the streams.
+            fix: what to do where one is missing.
 
         Raises:
             DataError: where one is missing, or holds no event.
@@ -259,7 +264,7 @@ class Flight:
                 path=self.name,
                 expected=f"streams {', '.join(names)}",
                 got=", ".join(self.streams) or "no stream",
-                fix=f"choose another flight, or build {graph} with your own sources",
+                fix=f"{fix}, or build {graph} with your own sources",
             )
         for name in names:
             if not len(self.streams[name]):

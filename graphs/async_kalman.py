@@ -13,22 +13,19 @@ holds dt.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from flowgraph import (
     Case,
-    DataError,
     Flight,
     Result,
     Series,
     Stream,
+    clocks_of,
     collect,
     delay,
     graph,
     latest,
-    timing_of,
 )  # fmt: skip
 from flowgraph.blocks.consistency import point_errors
 from flowgraph.blocks.kalman import Gaussian, predict_linear, update_linear
@@ -40,8 +37,10 @@ from flowgraph.blocks.point import (
     start_point,
     told_acceleration,
 )  # fmt: skip
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Position, Velocity
-from flowgraph.checks import need_numbers
+from flowgraph.blocks.smoothing import Steps, point_steps
+from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
 
 _AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
@@ -56,17 +55,20 @@ def async_kalman(
     noise: float,
     position_noise: float,
     velocity_noise: float = 0.1,
+    control: str = "instant",
     gate: float | None = None,
 ):
     """Kalman filter of position and velocity whose control and measurements keep clocks of their own.
+
+    `control` as in `kalman`: of an "instant", or the "mean" since the one before.
 
     Collected: `belief`, `prior` and `posterior` at every tick, and the innovation of each measurement.
     """
     ticks = acceleration | position if velocity is None else acceleration | position | velocity
     belief = delay(start, name="belief")
     last = delay(_AT_REST, name="last_control")
-    control = latest(acceleration, init=_AT_REST, at=ticks, name="control")
-    mean = between(last, control).map(lambda u: u.acceleration)
+    now = latest(acceleration, init=_AT_REST, at=ticks, name="control")
+    mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
     posterior, innovation = update_linear(
         prior, position.map(lambda z: z.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
@@ -79,7 +81,7 @@ def async_kalman(
         )  # fmt: skip
         collect(innovation, "velocity_innovation")
     belief.feed(posterior)
-    last.feed(control)
+    last.feed(now)
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
@@ -90,41 +92,33 @@ def for_flight(
     position_noise: float | None = None,
     accelerometer_noise: float | None = None,
     gate: float | None = None,
+    smooth: str = "none",
+    lag: float | None = None,
     settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 
     Args:
         flight: with the streams `imu` and `vicon` (Pose), at any times.
-        position_noise, accelerometer_noise, gate, settle: as for `kalman`.
+        position_noise, accelerometer_noise, gate, smooth, lag, settle: as for `kalman`.
     """
-    need_numbers(
-        "async_kalman",
-        positive={
-            "position_noise": position_noise,
-            "accelerometer_noise": accelerometer_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
-    control = told_acceleration(flight)
-    position = positions(flight)
-    truth = flight.truth
-    assert truth is not None  # as `told_acceleration` has checked
-    inputs = {"acceleration": control, "position": position}
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    own = flight.info["imu_noise"].accelerometer
+    own = {"position_noise": position_noise, "accelerometer_noise": accelerometer_noise}
+    check_settings("async_kalman", {**own, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
+    inputs = {"position": positions(flight), "acceleration": told_acceleration(flight)}
+    density = given(accelerometer_noise, imu_noise_of("async_kalman", flight).accelerometer)
     built = async_kalman.build(
-        **clocks,
-        start=start_point(position["position"][0]),
-        noise=own if accelerometer_noise is None else accelerometer_noise,
-        position_noise=flight.info["position_noise"] if position_noise is None else position_noise,
+        **clocks_of(inputs),
+        start=start_point(inputs["position"]["position"][0]),
+        noise=density,
+        position_noise=noise_of("async_kalman", flight, "position_noise", position_noise),
+        control=reading_of(flight),
         gate=gate,
     )
 
-    def score(result: Result) -> dict[str, float]:
-        return point_errors(result["belief"], truth, settle=settle)
+    def steps(result: Result) -> Steps:
+        return point_steps(result, point_model(density))
 
+    score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
     return Case(built, inputs, score)
 
 
@@ -134,13 +128,5 @@ def positions(flight: Flight) -> Series:
     Raises:
         DataError: without one.
     """
-    vicon = flight.streams.get("vicon")
-    if vicon is None:
-        raise DataError(
-            "this flight lacks what async_kalman needs",
-            path=flight.name,
-            expected="streams imu and vicon",
-            got=", ".join(flight.streams),
-            fix="choose another flight, or build async_kalman with your own sources",
-        )
+    vicon = flight.need("async_kalman", "imu", "vicon")["vicon"]
     return Series(vicon.time, Position(position=vicon["position"]), name="position")

@@ -7,8 +7,8 @@ capture corrects what has drifted, when it comes:
     each pose    p = alpha p- + (1 - alpha) z        q = q- * Exp((1 - alpha_q) Log(q-^-1 q_z))
                  v = v- + (1 - alpha_v) ((z - z_last) - (p- - p_last)) / dt_pose
 
-The shares are of a pose, not of a tick: rates may be any, and vary. There is no covariance; the shares stand
-for it and are set by hand.
+The shares are of a pose, not of a tick: rates may be any, and vary. They stand for a covariance, and are set
+by hand; how large the errors are that they leave can be asked for (`blocks/fixed_gain.py`).
 
 Source: R. Fiszel, thesis (2017), section on the asynchronous augmented complementary filter (in scala-flow:
 AugmentedComplementaryFilter). Three things are mended. The thesis adds the accelerometer to the velocity in
@@ -19,15 +19,17 @@ with the filter's own mean over the same interval, not with its velocity now.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Stream, delay, graph, latest, merge, timing_of
-from flowgraph.blocks.complementary import check_alpha, correct_by_pose, dead_reckon, needed
+from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest, merge
+from flowgraph.blocks.complementary import check_alpha, correct_by_pose, dead_reckon
+from flowgraph.blocks.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.inertial import GRAVITY
 from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
+from flowgraph.blocks.tuning import imu_noise_of, noise_of
+from flowgraph.checks import need_numbers
 
 
 @graph
@@ -40,24 +42,22 @@ def augmented_complementary(
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
     gravity: tuple[float, float, float] = GRAVITY,
+    covariance: PoseNoise | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
     The three shares are the IMU's, of position, velocity and attitude, at each pose; 1 is the IMU alone.
-    Collected: `pose` at every tick.
+    Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
     control = latest(imu, init=Imu.at_rest(), name="control")
     prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
-    corrected = correct_by_pose(
-        latest(prior, at=vicon),
-        vicon,
-        alpha=alpha,
-        velocity_alpha=velocity_alpha,
-        attitude_alpha=attitude_alpha,
-    )
+    shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
+    corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")
     previous.feed(pose)
+    if covariance is not None:
+        collect(pose_spread(previous, control, pose, vicon, noise=covariance, **shares), "belief")
     return {"pose": pose}
 
 
@@ -68,6 +68,9 @@ def for_flight(
     alpha: float = 0.4,
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
+    covariance: bool = False,
+    position_noise: float | None = None,
+    attitude_noise: float | None = None,
     settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the first measured pose, at rest.
@@ -75,24 +78,27 @@ def for_flight(
     Args:
         flight: with the streams `imu` and `vicon` (Pose).
         alpha, velocity_alpha, attitude_alpha: the IMU's shares at each pose, in (0, 1].
+        covariance: whether to give one too, and score it.
+        position_noise, attitude_noise: standard deviations in m and rad, for the covariance; the flight's own
+            if left out.
         settle: seconds at the start that the errors leave out.
     """
     check_alpha("augmented_complementary", alpha, velocity_alpha, attitude_alpha)
-    inputs = needed("augmented_complementary", flight, dict(flight.streams), "imu", "vicon")
-    vicon = inputs["vicon"]
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
+    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
+    need_numbers("augmented_complementary", positive=noises, not_negative={"settle": settle})
+    inputs = flight.need("augmented_complementary", "imu", "vicon")
+    first, noise = inputs["vicon"][0], None
+    if covariance:
+        place, turn = (noise_of("augmented_complementary", flight, n, s) for n, s in noises.items())
+        imu = imu_noise_of("augmented_complementary", flight)
+        noise = PoseNoise(imu, place, turn, start=(place, 0.7, turn))
     built = augmented_complementary.build(
-        **clocks,
-        start=PoseEstimate(
-            position=vicon["position"][0], velocity=np.zeros(3), attitude=vicon["attitude"][0]
-        ),
+        **clocks_of(inputs),
+        start=PoseEstimate(position=first.position, velocity=np.zeros(3), attitude=first.attitude),
         alpha=alpha,
         velocity_alpha=velocity_alpha,
         attitude_alpha=attitude_alpha,
+        covariance=noise,
     )
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["pose"], truth, settle=settle)
-
-    return Case(built, inputs, score, estimate="pose")
+    estimate = "belief" if covariance else "pose"
+    return Case(built, inputs, scorer(flight, pose_errors, estimate=estimate, settle=settle), estimate)

@@ -20,33 +20,34 @@ group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (r
 
 from __future__ import annotations
 
-from typing import Any
-
 from flowgraph import (
     Case,
     Flight,
-    Result,
     Stream,
+    clocks_of,
     collect,
     delay,
     graph,
     high_pass,
     latest,
     low_pass,
-    timing_of,
 )  # fmt: skip
 from flowgraph.blocks.complementary import (
     WorldForce,
-    attitude_errors,
     carry_to_world,
     check_alpha,
     first_attitude,
-    inertial_streams,
     level_near,
-    needed,
+    own_density,
+    reading_deviation,
     turn_by_gyro,
-)
+    with_parts,
+)  # fmt: skip
+from flowgraph.blocks.fixed_gain import AttitudeNoise, attitude_spread
+from flowgraph.blocks.metrics import attitude_errors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
+from flowgraph.checks import need_numbers
 
 
 @graph
@@ -56,6 +57,7 @@ def complementary(
     *,
     start: Attitude,
     alpha: float = 0.98,
+    covariance: AttitudeNoise | None = None,
 ):
     """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
 
@@ -64,7 +66,8 @@ def complementary(
 
     Collected: at each reading of the gyroscope `attitude`, and for comparison `gyroscope` and
     `accelerometer`, the attitudes by one of them alone; at each reading of the accelerometer `rejected`, what
-    the filter took for noise in it.
+    the filter took for noise in it. With the noise of a `covariance`, `belief` at each reading of either: the
+    attitude, and the covariance that a body which does not accelerate has.
     """
     at_rest = WorldForce.at_rest()
     previous = delay(start, name="turned")
@@ -80,28 +83,49 @@ def complementary(
     if alpha < 1.0:
         steady = low_pass(force, alpha=1.0 - alpha, init=at_rest)
         attitude = level_near(turned, latest(steady, init=at_rest, name="steady"), name="attitude")
+    if covariance is not None:
+        now = latest(attitude, init=start, at=gyro | accelerometer, name="held")
+        collect(attitude_spread(now, accelerometer, alpha=alpha, noise=covariance), "belief")
     return {"attitude": attitude, "gyroscope": turned}
 
 
 @complementary.on_flight
-def for_flight(flight: Flight, *, alpha: float = 0.98, settle: float = 1.0) -> Case:
+def for_flight(
+    flight: Flight,
+    *,
+    alpha: float = 0.98,
+    covariance: bool = False,
+    gyro_noise: float | None = None,
+    accelerometer_noise: float | None = None,
+    settle: float = 1.0,
+) -> Case:
     """Start the filter on a flight with a gyroscope and an accelerometer, at the truth's first attitude.
 
     Args:
         flight: with the streams `gyro` (Gyro) and `accelerometer` (SpecificForce), or `imu`, which holds
             both.
         alpha: the gyroscope's share, in (0, 1].
+        covariance: whether to give one too, and score it.
+        gyro_noise, accelerometer_noise: densities in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), for the covariance;
+            the flight's own if left out.
         settle: seconds at the start that the errors leave out.
     """
     check_alpha("complementary", alpha)
-    streams = inertial_streams(flight)
-    inputs = needed("complementary", flight, streams, "gyro", "accelerometer", otherwise="imu")
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    start = first_attitude(flight, inputs["gyro"], inputs["accelerometer"]["force"][0])
-    built = complementary.build(**clocks, start=start, alpha=alpha)
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else attitude_errors(result["attitude"], truth, settle=settle)
-
-    return Case(built, inputs, score, estimate="attitude")
+    noises = {"gyro_noise": gyro_noise, "accelerometer_noise": accelerometer_noise}
+    need_numbers("complementary", not_negative={**noises, "settle": settle})
+    flight = with_parts(flight)
+    inputs = flight.need("complementary", "gyro", "accelerometer", fix="choose a flight with an imu")
+    push = inputs["accelerometer"]
+    noise = None
+    if covariance:
+        force = reading_deviation(flight, "accelerometer", push, accelerometer_noise)
+        start = 1e-3 if flight.truth is not None else 0.3
+        noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start)
+    built = complementary.build(
+        **clocks_of(inputs),
+        start=first_attitude(flight, inputs["gyro"], push["force"][0]),
+        alpha=alpha,
+        covariance=noise,
+    )
+    estimate = "belief" if covariance else "attitude"
+    return Case(built, inputs, scorer(flight, attitude_errors, estimate=estimate, settle=settle), estimate)

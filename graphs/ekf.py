@@ -16,20 +16,7 @@ with a minus sign, and a correction starts from the prediction. The equations st
 
 from __future__ import annotations
 
-from typing import Any
-
-from flowgraph import (
-    Case,
-    DataError,
-    Flight,
-    Result,
-    Stream,
-    collect,
-    delay,
-    graph,
-    latest,
-    timing_of,
-)  # fmt: skip
+from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
 from flowgraph.blocks.extended import (
     QuaternionBelief,
     between_imu,
@@ -40,8 +27,10 @@ from flowgraph.blocks.extended import (
 )  # fmt: skip
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Imu, Pose
-from flowgraph.checks import need_numbers
+from flowgraph.blocks.smoothing import pose_steps
+from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
 
 
 @graph
@@ -54,24 +43,30 @@ def ekf(
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    reading: str = "instant",
     gate: float | None = None,
     gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Extended Kalman filter of velocity, position and quaternion: IMU control, motion capture pose.
 
-    Collected: `belief` at every tick, and the `innovation` at every pose.
+    A `reading` of the IMU is of an "instant", and a step is driven by the mean of the two at its ends; or it
+    is the "mean" over the time since the one before, and drives that step alone.
+
+    Collected: at every tick `belief`, and `prior`, `posterior` and `control` for a smoother; at every pose
+    the `innovation`.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | vicon, name="control")
-    prior = predict_pose(belief, between_imu(last, control), noise=noise, gravity=gravity)
+    drive = control if reading == "mean" else between_imu(last, control)
+    prior = predict_pose(belief, drive, noise=noise, gravity=gravity)
     posterior, innovation = update_pose(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
-    return {"belief": pose_belief(posterior)}
+    return {"belief": pose_belief(posterior), "prior": prior, "posterior": posterior, "control": drive}
 
 
 @ekf.on_flight
@@ -83,6 +78,8 @@ def for_flight(
     position_noise: float | None = None,
     attitude_noise: float | None = None,
     gate: float | None = None,
+    smooth: str = "none",
+    lag: float | None = None,
     settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the capture's first pose and at rest.
@@ -92,47 +89,28 @@ def for_flight(
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
-        gate: a measurement with a larger normalised innovation squared changes nothing.
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
+        smooth: "rts" also scores the smoothed run.
+        lag: s; also scores the run smoothed with a fixed lag.
         settle: seconds at the start that the errors leave out.
     """
-    need_numbers(
-        "ekf",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
-    if not {"imu", "vicon"} <= set(flight.streams):
-        raise DataError(
-            "this flight lacks what ekf needs",
-            path=flight.name,
-            expected="streams imu and vicon",
-            got=", ".join(flight.streams),
-            fix="choose another flight, or build ekf with your own sources",
-        )
-    inputs = {name: flight.streams[name] for name in ("imu", "vicon")}
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    truth, first, info = flight.truth, inputs["vicon"][0], flight.info
-    unit = info["imu_noise"]
+    factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
+    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
+    check_settings("ekf", {**factors, **noises, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
+    inputs = flight.need("ekf", "imu", "vicon")
+    first, unit = inputs["vicon"][0], imu_noise_of("ekf", flight)
     otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
     built = ekf.build(
-        **clocks,
+        **clocks_of(inputs),
         start=start_pose(first.position, first.attitude),
         noise=unit.scaled(
-            gyro=otherwise if gyro_factor is None else gyro_factor,
-            accelerometer=otherwise if accelerometer_factor is None else accelerometer_factor,
+            gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
         ),
-        position_noise=info.get("position_noise", 0.004) if position_noise is None else position_noise,
-        attitude_noise=info.get("attitude_noise", 0.01) if attitude_noise is None else attitude_noise,
-        lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
+        position_noise=noise_of("ekf", flight, "position_noise", position_noise, 0.004),
+        attitude_noise=noise_of("ekf", flight, "attitude_noise", attitude_noise, 0.01),
+        lever=tuple(flight.info.get("vicon_lever", (0.0, 0.0, 0.0))),
+        reading=reading_of(flight),
         gate=gate,
     )
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
-
+    score = scorer(flight, pose_errors, settle=settle, steps=pose_steps, smooth=smooth, lag=lag)
     return Case(built, inputs, score)

@@ -5,29 +5,16 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from flowgraph import (
-    Case,
-    DataError,
-    Flight,
-    Result,
-    Series,
-    Stream,
-    collect,
-    delay,
-    graph,
-    latest,
-    timing_of,
-)
+from flowgraph import Case, Flight, Series, Stream, clocks_of, collect, delay, graph, latest
 from flowgraph.blocks.aiding import aid_attitude, aid_position
 from flowgraph.blocks.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.metrics import interpolate_pose, pose_errors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
-from flowgraph.checks import need_numbers
+from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of
 
 
 @graph
@@ -84,73 +71,50 @@ def for_flight(
             real unit, whose data sheet knows nothing of vibration, aliasing and held samples; 1 for simulated
             noise, which is what it says.
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
-        gate: a measurement with a larger normalised innovation squared changes nothing.
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
         settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight lacks a stream.
         DeclarationError: for a setting that is out of range.
     """
-    need_numbers(
+    factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
+    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
+    check_settings("ins_eskf", {**factors, **noises, "gate": gate}, settle=settle)
+    inputs, lever = _inputs(flight)
+    real, imu, truth = "position_noise" not in flight.info, inputs["imu"], flight.truth
+    noise = imu_noise_of(
         "ins_eskf",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
+        flight,
+        given(gyro_factor, 15.0 if real else 1.0),
+        given(accelerometer_factor, 20.0 if real else 1.0),
     )
-    aids = _aids(flight)
-    inputs = {"imu": flight.streams["imu"], **aids}
-    real = "position_noise" not in flight.info
-    noise = flight.info["imu_noise"].scaled(
-        gyro=_given(gyro_factor, 15.0 if real else 1.0),
-        accelerometer=_given(accelerometer_factor, 20.0 if real else 1.0),
-    )
-    truth = flight.truth
-    imu = flight.streams["imu"]
     if truth is None:
-        place, turn = aids["position"].position[0], np.array([1.0, 0.0, 0.0, 0.0])
+        place, turn = inputs["position"].position[0], np.array([1.0, 0.0, 0.0, 0.0])
     else:
         places, turns = interpolate_pose(truth, imu.time[:1])
         place, turn = places[0], turns[0]
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
     built = ins_eskf.build(
-        **clocks,
+        **clocks_of(inputs),
         start=start_belief(place, turn, specific_force=imu.specific_force[0], spread=StartSpread()),
         noise=noise,
-        position_noise=_given(position_noise, flight.info.get("position_noise", 0.004)),
-        attitude_noise=_given(attitude_noise, flight.info.get("attitude_noise", 0.01)),
-        lever=flight.info.get("leica_lever" if "leica" in flight.streams else "vicon_lever", (0.0, 0.0, 0.0)),
+        position_noise=noise_of("ins_eskf", flight, "position_noise", position_noise, 0.004),
+        attitude_noise=noise_of("ins_eskf", flight, "attitude_noise", attitude_noise, 0.01),
+        lever=flight.info.get(lever, (0.0, 0.0, 0.0)),
         gate=gate,
     )
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
-
-    return Case(built, inputs, score)
+    return Case(built, inputs, scorer(flight, pose_errors, settle=settle))
 
 
-def _aids(flight: Flight) -> dict[str, Series]:
-    """The flight's position and, from a motion capture, attitude."""
-    if "imu" in flight.streams and "leica" in flight.streams:
-        return {"position": flight.streams["leica"]}
-    if "imu" in flight.streams and "vicon" in flight.streams:
-        vicon = flight.streams["vicon"]
-        return {
-            "position": Series(vicon.time, Position(position=vicon.position), name="position"),
-            "attitude": Series(vicon.time, Attitude(attitude=vicon.attitude), name="attitude"),
-        }
-    raise DataError(
-        "this flight lacks what ins_eskf needs",
-        path=flight.name,
-        expected="streams imu, and leica or vicon",
-        got=", ".join(flight.streams),
-        fix="choose another recording, or build ins_eskf with your own sources",
-    )
-
-
-def _given(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
+def _inputs(flight: Flight) -> tuple[dict[str, Series], str]:
+    """The flight's imu, position and, from a motion capture, attitude; and the name of the lever."""
+    if "leica" in flight.streams:
+        streams = flight.need("ins_eskf", "imu", "leica")
+        return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
+    streams = flight.need("ins_eskf", "imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
+    vicon = streams["vicon"]
+    aids = {
+        "position": Series(vicon.time, Position(position=vicon.position), name="position"),
+        "attitude": Series(vicon.time, Attitude(attitude=vicon.attitude), name="attitude"),
+    }
+    return {"imu": streams["imu"], **aids}, "vicon_lever"

@@ -15,8 +15,6 @@ for S), and the control matrix holds dt. Where the positions have a clock of the
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from flowgraph import (
@@ -27,10 +25,10 @@ from flowgraph import (
     Series,
     Stream,
     arrays,
+    clocks_of,
     collect,
     delay,
     graph,
-    timing_of,
 )  # fmt: skip
 from flowgraph.blocks.consistency import point_errors
 from flowgraph.blocks.kalman import Gaussian, predict_linear, update_linear
@@ -43,7 +41,9 @@ from flowgraph.blocks.point import (
     start_point,
     told_acceleration,
 )  # fmt: skip
-from flowgraph.checks import need_numbers
+from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.smoothing import Steps, point_steps
+from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
 
 _AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
@@ -55,23 +55,27 @@ def kalman(
     start: Gaussian,
     noise: float,
     position_noise: float,
+    control: str = "instant",
     gate: float | None = None,
 ):
     """Kalman filter of position and velocity: a record holds an acceleration and what was measured with it.
+
+    A `control` is of an "instant", and a step is driven by the mean of the two at its ends; or it is the
+    "mean" over the time since the one before, and drives that step alone.
 
     Collected: `belief`, `prior` and `posterior` at every tick, and the `innovation` where a coordinate was
     measured.
     """
     belief = delay(start, name="belief")
     last = delay(_AT_REST, name="last_control")
-    control = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
-    mean = between(last, control).map(lambda u: u.acceleration)
+    now = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
+    mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
     posterior, innovation = update_linear(
         prior, reading.map(lambda r: r.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
     )
     belief.feed(posterior)
-    last.feed(control)
+    last.feed(now)
     collect(innovation, "innovation")
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
@@ -83,6 +87,8 @@ def for_flight(
     position_noise: float | None = None,
     accelerometer_noise: float | None = None,
     gate: float | None = None,
+    smooth: str = "none",
+    lag: float | None = None,
     settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
@@ -94,34 +100,28 @@ def for_flight(
         flight: with the streams `imu` and `vicon` (Pose).
         position_noise: standard deviation, m; the flight's own if left out.
         accelerometer_noise: density, m/s^2/sqrt(Hz); the flight's own if left out.
-        gate: a measurement with a larger normalised innovation squared changes nothing.
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
+        smooth: "rts" also scores the smoothed run.
+        lag: s; also scores the run smoothed with a fixed lag.
         settle: seconds at the start that the errors leave out.
     """
-    need_numbers(
-        "kalman",
-        positive={
-            "position_noise": position_noise,
-            "accelerometer_noise": accelerometer_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
+    own = {"position_noise": position_noise, "accelerometer_noise": accelerometer_noise}
+    check_settings("kalman", {**own, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
     reading = readings(flight)
-    own = flight.info["imu_noise"].accelerometer
-    truth = flight.truth
-    assert truth is not None  # as `readings` has checked
-    clocks: dict[str, Any] = {"reading": timing_of(reading)}
+    density = given(accelerometer_noise, imu_noise_of("kalman", flight).accelerometer)
     built = kalman.build(
-        **clocks,
+        **clocks_of({"reading": reading}),
         start=start_point(flight.streams["vicon"]["position"][0]),
-        noise=own if accelerometer_noise is None else accelerometer_noise,
-        position_noise=flight.info["position_noise"] if position_noise is None else position_noise,
+        noise=density,
+        position_noise=noise_of("kalman", flight, "position_noise", position_noise),
+        control=reading_of(flight),
         gate=gate,
     )
 
-    def score(result: Result) -> dict[str, float]:
-        return point_errors(result["belief"], truth, settle=settle)
+    def steps(result: Result) -> Steps:
+        return point_steps(result, point_model(density))
 
+    score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
     return Case(built, {"reading": reading}, score)
 
 
@@ -132,18 +132,17 @@ def readings(flight: Flight) -> Series:
         DataError: without an IMU, motion capture or truth, or where a position comes between two IMU
             readings.
     """
+    vicon = flight.need("kalman", "imu", "vicon")["vicon"]
     control = told_acceleration(flight)
-    vicon = flight.streams.get("vicon")
-    rows = np.searchsorted(control.time, vicon.time) if vicon is not None else np.zeros(0, int)
-    if vicon is None or not np.isin(vicon.time, control.time).all():
+    if not np.isin(vicon.time, control.time).all():
         raise DataError(
             "the positions do not come with the controls",
             path=flight.name,
             expected="a stream vicon, at times of the stream imu",
-            got="no vicon" if vicon is None else "positions between two readings of the imu",
+            got="positions between two readings of the imu",
             fix="use async_kalman, which takes each when it comes",
         )
     position = np.full((len(control), 3), np.nan)
-    position[rows] = vicon["position"]
+    position[np.searchsorted(control.time, vicon.time)] = vicon["position"]
     values = PointReading(acceleration=control["acceleration"], position=position)
     return arrays(control.time, values, not_finite="keep", name="reading")

@@ -22,39 +22,47 @@ Trans. Automatic Control 53(5), 2008, sec. III.
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
 import numpy as np
 
 from flowgraph import (
     Case,
-    DeclarationError,
+    DataError,
     Flight,
-    Result,
     Stream,
+    clocks_of,
+    collect,
     delay,
     graph,
     latest,
-    timing_of,
 )  # fmt: skip
 from flowgraph.blocks.alignment import level_attitude
 from flowgraph.blocks.complementary import (
-    attitude_errors,
     blend,
     carry_to_world,
     check_alpha,
     first_attitude,
-    inertial_streams,
     level_near,
-    needed,
+    own_density,
+    reading_deviation,
     remove_thrust,
     turn_by_gyro,
+    with_parts,
 )
+from flowgraph.blocks.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.inertial import GRAVITY
+from flowgraph.blocks.metrics import attitude_errors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
+from flowgraph.blocks.tuning import check_choice, noise_of
+from flowgraph.checks import need_numbers
 
 _STILL = Gyro(rate=np.zeros(3))
 _HOVER = Thrust(thrust=np.float64(-GRAVITY[2]))
+
+MOST_ACROSS = 0.5
+"""m/s^2: more specific force across body z than this is not thrust."""
 
 
 @graph
@@ -66,13 +74,14 @@ def orientation_complementary(
     start: Attitude,
     alpha: float = 0.98,
     heading: str = "shortest_arc",
+    covariance: AttitudeNoise | None = None,
 ):
     """Complementary filter of a quadrotor's attitude: thrust is removed, and gravity remains.
 
     `alpha` is the gyroscope's share at each acceleration; 1 is the gyroscope alone. `heading` is
     "shortest_arc" or "gyroscope". The last thrust is held; before the first, the vehicle hovers. Collected:
     `attitude` at every tick of gyroscope or acceleration, and `seen`, by gravity alone, at every
-    acceleration.
+    acceleration. With the noise of a `covariance`, `belief` with every `attitude`.
     """
     previous = delay(start, name="previous")
     rate = latest(gyro, init=_STILL, name="rate")
@@ -85,12 +94,22 @@ def orientation_complementary(
         seen = level_near(now, carry_to_world(now, up, name="carried"), name="seen")
     attitude = blend(turned, seen, alpha=alpha, name="attitude")
     previous.feed(attitude)
+    if covariance is not None:
+        collect(attitude_spread(attitude, up, alpha=alpha, noise=covariance, heading=heading), "belief")
     return {"attitude": attitude, "seen": seen}
 
 
 @orientation_complementary.on_flight
 def for_flight(
-    flight: Flight, *, alpha: float = 0.98, heading: str = "shortest_arc", settle: float = 1.0
+    flight: Flight,
+    *,
+    alpha: float = 0.98,
+    heading: str = "shortest_arc",
+    covariance: bool = False,
+    gyro_noise: float | None = None,
+    acceleration_noise: float | None = None,
+    thrust_noise: float | None = None,
+    settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with thrust and coordinate acceleration, at the truth's first attitude.
 
@@ -101,27 +120,52 @@ def for_flight(
             `gyro` (Gyro) or `imu`.
         alpha: the gyroscope's share, in (0, 1].
         heading: "shortest_arc" (the vehicle has no heading of its own) or "gyroscope" (it has, and drifts).
+        covariance: whether to give one too, and score it.
+        gyro_noise, acceleration_noise: densities in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), for the covariance;
+            the flight's own if left out.
+        thrust_noise: m/s^2, the standard deviation of a thrust, which should be as frequent as the
+            acceleration: one that is held errs alike from one reading to the next.
         settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where a stream is missing, or the vehicle is not carried by its thrust.
     """
     check_alpha("orientation_complementary", alpha)
-    if heading not in ("shortest_arc", "gyroscope"):
-        raise DeclarationError(
-            "this rule for the heading does not exist",
-            path="orientation_complementary",
-            expected='"shortest_arc" or "gyroscope"',
-            got=repr(heading),
-            fix="write heading=gyroscope",
-        )
-    streams = inertial_streams(flight)
+    check_choice("orientation_complementary", "heading", heading, ("shortest_arc", "gyroscope"))
+    noises = {
+        "gyro_noise": gyro_noise,
+        "acceleration_noise": acceleration_noise,
+        "thrust_noise": thrust_noise,
+    }
+    need_numbers("orientation_complementary", not_negative={**noises, "settle": settle})
+    flight = with_parts(flight)
     names = ("gyro", "coordinate_acceleration", "thrust")
-    inputs = needed("orientation_complementary", flight, streams, *names)
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    up = np.array([0.0, 0.0, inputs["thrust"]["thrust"][0]])
-    start = first_attitude(flight, inputs["gyro"], up - inputs["coordinate_acceleration"]["acceleration"][0])
-    built = orientation_complementary.build(**clocks, start=start, alpha=alpha, heading=heading)
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else attitude_errors(result["attitude"], truth, settle=settle)
-
-    return Case(built, inputs, score, estimate="attitude")
+    fix = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(names)}"
+    inputs = flight.need("orientation_complementary", *names, fix=fix)
+    if flight.info.get("across", 0.0) > MOST_ACROSS:
+        raise DataError(
+            "thrust is not all that carries this vehicle",
+            path=flight.name,
+            expected=f"no specific force across body z (root mean square below {MOST_ACROSS:g} m/s^2)",
+            got=f"{flight.info['across']:.2g} m/s^2: the body is held, and its thrust shows no vertical",
+            fix="choose a flying world, --data sim:thesis or sim:hover, or the graph complementary",
+        )
+    gyro, acceleration, thrust = inputs.values()
+    noise = None
+    if covariance:
+        push = reading_deviation(flight, "coordinate_acceleration", acceleration, acceleration_noise)
+        own = flight.info.get("noise", {}).get("thrust", {}).get("noise")
+        lift = noise_of("orientation_complementary", flight, "thrust_noise", thrust_noise, own)
+        rate = own_density(flight, "gyro", gyro_noise)
+        start = 1e-3 if flight.truth is not None else 0.3
+        noise = AttitudeNoise(rate, (push, push, math.hypot(push, lift)), start)
+    up = np.array([0.0, 0.0, thrust["thrust"][0]])
+    built = orientation_complementary.build(
+        **clocks_of(inputs),
+        start=first_attitude(flight, gyro, up - acceleration["acceleration"][0]),
+        alpha=alpha,
+        heading=heading,
+        covariance=noise,
+    )
+    estimate = "belief" if covariance else "attitude"
+    return Case(built, inputs, scorer(flight, attitude_errors, estimate=estimate, settle=settle), estimate)

@@ -17,17 +17,15 @@ import numpy as np
 
 from flowgraph import (
     Case,
-    DataError,
     DeclarationError,
     Flight,
-    Result,
     Series,
     Stream,
+    clocks_of,
     delay,
     graph,
     latest,
     merge,
-    timing_of,
 )
 from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.calibration import subtract_rest_bias
@@ -47,7 +45,9 @@ from flowgraph.blocks.particles import (
 )
 from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.resampling import draw_ancestors, take_ancestors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Cloud, Imu, Pose
+from flowgraph.blocks.tuning import given, imu_noise_of, noise_of
 from flowgraph.checks import need_numbers
 
 MOST_PARTICLES = 2**20
@@ -204,47 +204,35 @@ def for_flight(
             got=repr(particles),
             fix="write particles=1000",
         )
-    for stream in ("imu", "vicon"):
-        if stream not in flight.streams:
-            raise DataError(
-                "this flight lacks what rbpf_indoor needs",
-                path=flight.name,
-                expected="streams imu and vicon",
-                got=", ".join(flight.streams),
-                fix="choose another recording, or build rbpf_indoor with your own sources",
-            )
-    imu, vicon = flight.streams["imu"], flight.streams["vicon"]
+    inputs = flight.need("rbpf_indoor", "imu", "vicon")
+    imu, vicon = inputs.values()
     simulated = "position_noise" in flight.info
-    still = _given(still, flight.info.get("still", 1.0 if simulated else 0.0))
+    still = given(still, flight.info.get("still", 1.0 if simulated else 0.0))
     attitude = None
     up = np.array([0.0, 0.0, 1.0])
     if not unknown_yaw:
         attitude = _first_attitude(imu, vicon, still)
         up = to_matrix(attitude, xp=np)[2]
     built = rbpf_indoor.build(
-        imu=timing_of(imu),
-        vicon=timing_of(vicon),
+        **clocks_of(inputs),
         start=start_cloud(
             particles, seed=seed, position=vicon.position[0], attitude=attitude, spread=StartSpread()
         ),
-        noise=flight.info["imu_noise"].scaled(
-            gyro=_given(gyro_factor, 3.0 if simulated else 15.0),
-            accelerometer=_given(accelerometer_factor, 2.0 if simulated else 20.0),
+        noise=imu_noise_of(
+            "rbpf_indoor",
+            flight,
+            given(gyro_factor, 3.0 if simulated else 15.0),
+            given(accelerometer_factor, 2.0 if simulated else 20.0),
         ),
-        position_noise=_given(position_noise, flight.info.get("position_noise", 0.004)),
-        attitude_noise=_given(attitude_noise, flight.info.get("attitude_noise", 0.01)),
+        position_noise=noise_of("rbpf_indoor", flight, "position_noise", position_noise, 0.004),
+        attitude_noise=noise_of("rbpf_indoor", flight, "attitude_noise", attitude_noise, 0.01),
         lever=flight.info.get("vicon_lever", (0.0, 0.0, 0.0)),
         still=still,
         up=tuple(up.tolist()),
         resample_below=resample_below,
         scheme=scheme,
     )
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["pose"], truth, settle=settle)
-
-    return Case(built, {"imu": imu, "vicon": vicon}, score, estimate="pose")
+    return Case(built, inputs, scorer(flight, pose_errors, estimate="pose", settle=settle), estimate="pose")
 
 
 def _first_attitude(imu: Series, vicon: Series, still: float) -> np.ndarray:
@@ -253,7 +241,3 @@ def _first_attitude(imu: Series, vicon: Series, still: float) -> np.ndarray:
         return np.asarray(level(vicon.attitude[0], imu.specific_force[0], xp=np))
     seen = vicon.attitude[vicon.time - vicon.time[0] <= round(still * 1e9)]
     return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), seen[0], xp=np))
-
-
-def _given(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value

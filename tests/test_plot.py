@@ -173,11 +173,11 @@ def test_the_navigation_page_shows_what_there_is(tmp_path):
         "from above",
         *(f"position error {k}, with 3σ" for k in "xyz"),
         *(f"velocity {k}, with 3σ" for k in "xyz"),  # the truth has none
-        "roll", "pitch", "yaw",
+        *(f"{angle}, with 3σ" for angle in ("roll", "pitch", "yaw")),
         *(f"gyro bias {k}, with 3σ" for k in "xyz"),
         "tilt error [deg]",
     ]  # fmt: skip
-    yaw = panel(figure, "yaw")
+    yaw = panel(figure, "yaw, with 3σ")
     estimated, right = (line.get_ydata() for line in yaw.lines)
     assert estimated[-1] == pytest.approx(np.rad2deg(4.9))
     assert right[0] == pytest.approx(np.rad2deg(1.0))

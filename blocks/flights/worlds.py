@@ -17,6 +17,7 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks import sensors as s
+from flowgraph.blocks.geometry import geodesic_angle
 from flowgraph.blocks.signals import NavigationState
 from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
 from flowgraph.errors import DeclarationError, UnknownNameError
@@ -28,34 +29,41 @@ MOST_SAMPLES = 10_000_000
 
 _CLOCK = {"phase": 0.0, "latency": 0.0, "jitter": 0.0}
 _DRIFT = {"bias": 0.0, "walk": 0.0}
+_TURN_DRIFT = {"attitude_bias": 0.0, "attitude_walk": 0.0}
+_LOOKS = {"oversample": 1.0}
+_EARTH = {"geodetic": 0.0, "latitude": 0.0, "longitude": 0.0, "height": 0.0}
 _THESIS = math.sqrt(0.1 / 200.0)  # the density of a variance of 0.1 per sample at 200 Hz
 _DEVIATION = math.sqrt(0.1)
 _LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
 
 SENSORS: Mapping[str, Mapping[str, float]] = {
-    "imu": {"rate": 200.0, **_CLOCK},
-    "gyro": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
-    "accelerometer": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
-    "coordinate_acceleration": {"rate": 200.0, **_CLOCK, "noise": _THESIS, **_DRIFT},
+    "imu": {"rate": 200.0, **_CLOCK, **_LOOKS},
+    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
+    "accelerometer": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
+    "coordinate_acceleration": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "position": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, **_LEVER},
     "attitude": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT},
-    "vicon": {"rate": 4.0, **_CLOCK, "noise": 0.1, "attitude_noise": 0.1},
-    "gps": {"rate": 2.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER},
-    "gps2": {"rate": 1.25, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER},
+    "vicon": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, "attitude_noise": 0.1, **_TURN_DRIFT},
+    "gps": {"rate": 2.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER, **_EARTH},
+    "gps2": {"rate": 1.25, **_CLOCK, "noise": _DEVIATION, **_DRIFT, **_LEVER, **_EARTH},
     "magnetometer": {
         **{"rate": 50.0, **_CLOCK, "noise": 5e-7, **_DRIFT},
         **{"declination": 0.0, "dip": math.radians(60.0), "strength": 50e-6},
     },
     "magnetic_attitude": {"rate": 50.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
     "altimeter": {"rate": 80.0, **_CLOCK, "noise": 0.1, **_DRIFT, "most_tilt": math.radians(75.0)},
-    "optical_flow": {"rate": 20.0, **_CLOCK, "noise": 0.01, "attitude_noise": 0.01},
+    "optical_flow": {
+        **{"rate": 20.0, **_CLOCK, "noise": 0.01, **_DRIFT, "attitude_noise": 0.01, **_TURN_DRIFT}
+    },
     "thrust": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
     "body_rate": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
 }
 """What each sensor can be set to, and what it is when left out, in SI units and radians. `noise` is a
 continuous density for gyro, accelerometer and coordinate_acceleration (the imu has theirs), and for all
 others a standard deviation per sample; `bias` is the standard deviation of a constant, `walk` the density of
-its random walk."""
+its random walk; `oversample` is how many looks a reading is the mean of. A GPS with geodetic=1 gives
+latitude, longitude and height, of a world whose origin is at `latitude`, `longitude` (rad) and `height`
+(m)."""
 
 WORLDS: Mapping[str, Mapping[str, float]] = {
     "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 30.0, "most_rate": 35.0},
@@ -72,7 +80,8 @@ SETTINGS: Mapping[str, str | float] = {
 """All settings of `load_world`, and their values when left out."""
 
 _POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "rate", "strength", "most_tilt")
-_SIGNED = ("angle", "declination", "dip", *_LEVER)
+_SIGNED = ("angle", "declination", "dip", "latitude", "longitude", "height", *_LEVER)
+_SWITCHES = ("geodetic",)
 _PARTS_OF_IMU = ("gyro", "accelerometer")
 
 Numbers = Mapping[str, float]
@@ -90,9 +99,14 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         A `Flight`: a stream for each sensor, by time of arrival. truth: `NavigationState` at the times of the
         fastest sensor, with the biases of the gyroscope and accelerometer. info:
         `world` (the `World`); `still` (s at rest at the start); `noise` (the settings of each sensor);
-        `NAME_period_ns`; `stamps` (when each reading of a late sensor was true, int64 ns, row by row);
+        `NAME_period_ns`; `NAME_oversample` of an inertial sensor; `stamps` (when each reading of a late
+        sensor was true, int64 ns, row by row);
         `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `vicon_lever`, `gps_lever`,
-        `gps2_lever`, `position_lever` (m, body) and `magnetic_field` (T, world) where there are such sensors.
+        `gps2_lever`, `position_lever` (m, body), `magnetic_field` (T, world) and, where it is geodetic,
+        `gps_origin` and `gps2_origin` (latitude and longitude in rad, height in m) where there are such
+        sensors; `across` (m/s^2, the root mean square of the specific force across body z: zero for a
+        vehicle carried by its thrust).
+        notes: of each late sensor, how late, and how far the body has gone meanwhile.
 
     Raises:
         UnknownNameError: for a setting, sensor or world that is not there.
@@ -121,6 +135,10 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         if sensor.latency or sensor.jitter:
             stamps[name] = recording.stamp
         info.update(_calibration(sensor))
+        if info["noise"][name].get("geodetic"):
+            n = info["noise"][name]
+            origin = n["latitude"], n["longitude"], n["height"]
+            streams[name], info[f"{name}_origin"] = s.as_geodetic(recording.series, origin), origin
     for part in _PARTS_OF_IMU if "imu" in chosen else ():
         info["noise"][part] = _of(part, numbers)
 
@@ -133,8 +151,21 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         gyro_bias=_bias("gyro", made, time, numbers, seed),
         accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
     )
-    note = f"simulated with seed {seed}: {figures(world)}"
-    return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, (note,))
+    info["across"] = float(np.sqrt(np.mean(np.square(motion.specific_force[:, :2]).sum(-1))))
+    notes = [f"simulated with seed {seed}: {figures(world)}"]
+    notes += [_late(name, streams[name], stamp, world) for name, stamp in stamps.items() if len(stamp)]
+    return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, tuple(notes))
+
+
+def _late(name: str, series: Series, stamp: np.ndarray, world: World) -> str:
+    """What a filter gets wrong that takes a late reading for one of the time when it arrived."""
+    then, now = world.at(stamp / 1e9), world.at(np.minimum(series.time / 1e9, world.duration))
+    gone = np.sqrt(np.mean(np.square(now.position - then.position).sum(-1)))
+    turned = np.sqrt(np.mean(np.square(geodesic_angle(then.attitude, now.attitude))))
+    return (
+        f"{name} arrives {np.mean(series.time - stamp) * 1e-6:.1f} ms late on average; a filter that takes "
+        f"it as fresh is told where the body was {gone:.3f} m and {turned:.1f} deg ago (root mean squares)"
+    )
 
 
 def check_samples(numbers: Numbers, rates: Iterable[str], path: str) -> None:
@@ -172,12 +203,15 @@ def _world(kind: str, n: Numbers, seed: int, path: str) -> tuple[World, float]:
 
 def _noise(n: Numbers, *, density: bool = False, white: str = "noise") -> s.Noise:
     kind = {"density" if density else "deviation": n[white]}
-    return s.Noise(**kind, bias=n.get("bias", 0.0), walk=n.get("walk", 0.0))
+    kind["bias"], kind["walk"] = (n.get(white.replace("noise", part), 0.0) for part in ("bias", "walk"))
+    return s.Noise(**kind)
 
 
 def _sensor(name: str, numbers: Numbers) -> s.Sensor:
     n = _of(name, numbers)
     common: dict[str, Any] = {"name": name, "rate": n["rate"], **{k: n[k] for k in _CLOCK}}
+    if "oversample" in n:
+        common["oversample"] = int(n["oversample"])
     if name == "imu":
         gyro, push = (_noise(_of(part, numbers), density=True) for part in _PARTS_OF_IMU)
         return s.InertialUnit(**common, gyro=gyro, accelerometer=push)
@@ -211,7 +245,9 @@ _MAKERS: Mapping[str, Callable[..., s.Sensor]] = {
 def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     """What a filter may know of a sensor, under the names that recorded flights use too."""
     if isinstance(sensor, s.InertialUnit):
-        return {"imu_noise": sensor.densities}
+        return {"imu_noise": sensor.densities, "imu_oversample": sensor.oversample}
+    if isinstance(sensor, s.InertialSensor):
+        return {f"{sensor.name}_oversample": sensor.oversample}
     if isinstance(sensor, s.Vicon):
         noise = {"position_noise": sensor.noise.deviation, "attitude_noise": sensor.attitude_noise.deviation}
         return {**noise, "vicon_lever": (0.0, 0.0, 0.0)}
@@ -281,8 +317,14 @@ def _number(name: str, part: str, text: str | float, otherwise: float, path: str
     except (TypeError, ValueError):
         number = math.nan
     least = -math.inf if part in _SIGNED else 0.0
-    if not math.isfinite(number) or number < least or (part in _POSITIVE and number == 0.0):
+    wrong = not math.isfinite(number) or number < least or (part in _POSITIVE and number == 0.0)
+    if part in _SWITCHES:
+        wrong, kind = number not in (0.0, 1.0), "0 or 1"
+    elif part in _LOOKS:
+        wrong, kind = number not in range(1, s.MOST_LOOKS + 1), f"a whole number from 1 to {s.MOST_LOOKS}"
+    else:
         kind = "a positive number" if part in _POSITIVE else "a number that is not negative"
+    if wrong:
         raise DeclarationError(
             f"setting {name!r} is not usable",
             path=path,

@@ -11,7 +11,14 @@ from flowgraph.blocks.sensors.control import BodyRateInput, ThrustInput
 from flowgraph.blocks.sensors.flow import OpticalFlowSensor
 from flowgraph.blocks.sensors.geodetic import as_geodetic, as_position, from_enu, to_enu
 from flowgraph.blocks.sensors.gps import Gps
-from flowgraph.blocks.sensors.inertial import Accelerometer, CoordinateAccelerometer, Gyroscope, InertialUnit
+from flowgraph.blocks.sensors.inertial import (
+    MOST_LOOKS,
+    Accelerometer,
+    CoordinateAccelerometer,
+    Gyroscope,
+    InertialSensor,
+    InertialUnit,
+)
 from flowgraph.blocks.sensors.magnetic import MagneticAttitude, Magnetometer, earth_field
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.pose import AttitudeSensor, PositionSensor, Vicon
@@ -22,6 +29,8 @@ __all__ = [
     "Recording",
     "Noise",
     "NO_NOISE",
+    "MOST_LOOKS",
+    "InertialSensor",
     "Gyroscope",
     "Accelerometer",
     "CoordinateAccelerometer",

@@ -5,6 +5,10 @@ m/s^2 upwards at rest. The thesis's reads the *coordinate acceleration* R^T a, z
 by an attitude that nobody has). They are two sensors with two signal types here.
 
 Noise is a continuous density by default; `Noise.variance` takes the thesis's variances per sample.
+
+A reading is what there was at its stamp, as the thesis has it, or, with `oversample`, the mean over the
+interval that ends there, as a unit gives it that samples fast inside and hands on averages. The two differ
+where a rate jumps: between two instants nobody knows when it did, but the mean holds all of the turn.
 """
 
 from __future__ import annotations
@@ -18,12 +22,63 @@ from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.sensor import Sensor
 from flowgraph.blocks.signals import CoordinateAcceleration, Gyro, Imu, SpecificForce
 from flowgraph.blocks.world.motion import Motion
+from flowgraph.errors import DeclarationError
 
-__all__ = ["Accelerometer", "CoordinateAccelerometer", "Gyroscope", "InertialUnit"]
+__all__ = [
+    "MOST_LOOKS",
+    "Accelerometer",
+    "CoordinateAccelerometer",
+    "Gyroscope",
+    "InertialSensor",
+    "InertialUnit",
+]
+
+MOST_LOOKS = 1000
+"""The most looks that make one reading."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gyroscope(Sensor):
+class InertialSensor(Sensor):
+    """The base of those that may average.
+
+    Args:
+        oversample: 1: a reading is of its stamp. n > 1: it is the mean of n evenly spaced looks at the
+            interval of one period that ends at the stamp (before the world begins, it stands still). The
+            noise is that of the reading, in either case.
+
+    Raises:
+        DeclarationError: where `oversample` is no whole number from 1 to 1000.
+    """
+
+    oversample: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.oversample, int) or not 1 <= self.oversample <= MOST_LOOKS:
+            raise DeclarationError(
+                "a sensor cannot take so many looks",
+                path=self.name,
+                expected=f"oversample a whole number from 1 to {MOST_LOOKS}",
+                got=repr(self.oversample),
+                fix="write oversample=10, or 1 for readings of an instant",
+            )
+
+    def _looks(self, seconds: np.ndarray) -> np.ndarray:
+        if self.oversample == 1:
+            return seconds
+        back = (np.arange(self.oversample)[::-1] + 0.5) / self.oversample * (self.period * 1e-9)
+        return np.maximum(seconds[:, None] - back, 0.0).ravel()
+
+    def _present(self, motion: Motion) -> np.ndarray:
+        return np.ones(len(motion) // self.oversample, dtype=bool)
+
+    def _mean(self, looks: np.ndarray) -> np.ndarray:
+        """The reading (n, 3) without its error, from what there was at each look."""
+        return looks.reshape(-1, self.oversample, 3).mean(1) if self.oversample > 1 else looks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gyroscope(InertialSensor):
     """Reads the angular rate in the body (`Gyro`, rad/s): rate + bias + noise."""
 
     name: str = "gyro"
@@ -31,11 +86,13 @@ class Gyroscope(Sensor):
     noise: Noise = NO_NOISE
 
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> Gyro:
-        return Gyro(rate=motion.rate + self.noise.error(self.name, seed, seconds, 3, rate=self.rate))
+        return Gyro(
+            rate=self._mean(motion.rate) + self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Accelerometer(Sensor):
+class Accelerometer(InertialSensor):
     """Reads the specific force in the body (`SpecificForce`, m/s^2): R^T (a - gravity) + bias + noise."""
 
     name: str = "accelerometer"
@@ -44,11 +101,11 @@ class Accelerometer(Sensor):
 
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> SpecificForce:
         error = self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
-        return SpecificForce(force=motion.specific_force + error)
+        return SpecificForce(force=self._mean(motion.specific_force) + error)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoordinateAccelerometer(Sensor):
+class CoordinateAccelerometer(InertialSensor):
     """Reads the second derivative of position in the body (`CoordinateAcceleration`, m/s^2): R^T a + bias +
     noise.
 
@@ -61,11 +118,11 @@ class CoordinateAccelerometer(Sensor):
 
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> CoordinateAcceleration:
         error = self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
-        return CoordinateAcceleration(acceleration=motion.coordinate_acceleration + error)
+        return CoordinateAcceleration(acceleration=self._mean(motion.coordinate_acceleration) + error)
 
 
 @dataclass(frozen=True, kw_only=True)
-class InertialUnit(Sensor):
+class InertialUnit(InertialSensor):
     """Reads rate and specific force at the same times (`Imu`).
 
     Args:
@@ -85,7 +142,8 @@ class InertialUnit(Sensor):
             noise.error(part, seed, seconds, 3, rate=self.rate)
             for noise, part in zip((self.gyro, self.accelerometer), self.parts, strict=True)
         )
-        return Imu(gyro=motion.rate + turn, specific_force=motion.specific_force + push)
+        rate, force = self._mean(motion.rate), self._mean(motion.specific_force)
+        return Imu(gyro=rate + turn, specific_force=force + push)
 
     @property
     def densities(self) -> ImuNoise:

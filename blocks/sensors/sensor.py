@@ -91,7 +91,7 @@ class Sensor(abc.ABC):
         """The readings, with the stamps at which they were true."""
         end = math.floor(world.duration * 1e9 + 0.5) if until is None else nanoseconds(until, what="until")
         stamp = np.arange(round(self.phase * 1e9), end + 1, self.period, dtype=np.int64)
-        motion = world.at(stamp / 1e9)
+        motion = world.at(self._looks(stamp / 1e9))
         values = self._read(motion, stamp / 1e9, seed)
         arrival = stamp + self._lateness(len(stamp), seed)
         here = np.flatnonzero(self._present(motion))
@@ -107,9 +107,13 @@ class Sensor(abc.ABC):
         spread = generator(seed, f"{self.name}.latency").standard_normal(count) * self.jitter
         return np.rint(np.maximum(self.latency + spread, 0.0) * 1e9).astype(np.int64)
 
+    def _looks(self, seconds: np.ndarray) -> np.ndarray:
+        """The times in s at which `_read` needs the motion, for stamps (n,) in s: those of the stamps."""
+        return seconds
+
     @abc.abstractmethod
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> Signal:
-        """The readings at (n,) seconds, where the motion is `motion`; leaves have a leading axis of n."""
+        """The readings at (n,) seconds, with the motion at `_looks`; leaves have a leading axis of n."""
 
     def _present(self, motion: Motion) -> np.ndarray:
         """(n,) whether there is a reading at all; all are drawn, so that what is left out moves no draws."""

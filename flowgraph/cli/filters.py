@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, Name, Seed, Settings, case_of
+from flowgraph.cli.options import AsJson, Data, DataOrNone, Name, Seed, Settings, case_of, example_of
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -53,12 +53,12 @@ def show(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
     ] = None,
-    data: Data = "sim",
+    data: DataOrNone = None,
     settings: Settings = None,
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file."""
-    case, _ = case_of(graph, data, settings, seed)
+    case, _ = example_of(graph, settings, seed) if data is None else case_of(graph, data, settings, seed)
     if output is None:
         print(case.graph.text())
         return

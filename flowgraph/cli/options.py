@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flowgraph.errors import DeclarationError
+from flowgraph.errors import DataError, DeclarationError
 from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.series import Flight
 
@@ -20,6 +20,13 @@ Data = Annotated[
         help="sim, sim:thesis, sim:hover, sim:roundtrip, euroc:PATH, broad:FILE, ese650:DIR:N, ...",
     ),
 ]
+DataOrNone = Annotated[
+    str | None,
+    typer.Option("--data", metavar="SPEC", help="As for run; if left out, a simulated flight that fits."),
+]
+EXAMPLES: tuple[tuple[str, tuple[str, ...]], ...] = (("sim", ()), ("sim:thesis", ("sensors=all",)))
+"""The flights on which a graph is shown when nobody names one: the first that has what it needs."""
+
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
@@ -40,6 +47,18 @@ def case_of(name: str, spec: str, settings: list[str] | None, seed: int) -> tupl
     if "seed" in inspect.signature(graph.prepare).parameters:
         mine.setdefault("seed", seed)
     return graph.case(flight, **mine), flight
+
+
+def example_of(name: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
+    """`case_of` on the first of `EXAMPLES` that has what the graph needs; if none has, the first's error."""
+    first: DataError | None = None
+    for spec, more in EXAMPLES:
+        try:
+            return case_of(name, spec, [*more, *(settings or [])], seed)
+        except DataError as error:
+            first = first or error
+    assert first is not None
+    raise first
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -166,5 +166,5 @@ def test_each_measurement_corrects_the_part_that_it_sees():
 def test_a_flight_without_motion_capture_is_refused():
     whole = flight(1)
     part = Flight(whole.name, {"imu": whole.streams["imu"]}, whole.truth, whole.info)
-    with pytest.raises(DataError, match=r"lacks what async_kalman needs[\s\S]*imu and vicon"):
+    with pytest.raises(DataError, match=r"lacks what async_kalman needs[\s\S]*imu, vicon"):
         async_kalman.case(part)

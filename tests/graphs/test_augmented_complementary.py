@@ -92,6 +92,28 @@ def test_the_first_pose_says_nothing_of_the_velocity():
     np.testing.assert_allclose(found.position, 3.0)
 
 
+@pytest.mark.slow
+def test_its_covariance_is_as_large_as_its_errors():
+    """The NEES of 5 runs, nine numbers, on average over the ticks after 2 s: within a fifth of 9."""
+    assert 7.2 < mean_nees() < 10.8
+    assert mean_nees(position_noise=0.14, attitude_noise=0.14) < 7.2
+    assert mean_nees(position_noise=0.07, attitude_noise=0.07) > 10.8
+
+
+@cache
+def mean_nees(**noise: float) -> float:
+    on = [flight(seed, duration="10", **{"imu.oversample": "10"}) for seed in range(5)]
+    return float(np.mean([played(f, covariance=True, settle=2.0, **noise)["nees_mean"] for f in on]))
+
+
+@pytest.mark.parametrize("settings", [{}, {"vicon_rate": "7", "vicon_phase": "0.003"}], ids=["tied", "apart"])
+def test_engines_agree_on_the_covariance(settings):
+    case = augmented_complementary.case(flight(duration="3", **settings), covariance=True)
+    result = engines_agree(case.graph, case.inputs)
+    np.testing.assert_array_equal(result["belief"].position, result["pose"].position)
+    is_lowered_and_drawn(case, "pose_spread")
+
+
 def test_it_runs_without_a_truth():
     case = augmented_complementary.case(Flight("bare", flight(duration="2").streams))
     assert case.score(simulate(case.graph, case.inputs)) == {}

@@ -26,7 +26,7 @@ from flowgraph import (
 from flowgraph.blocks.geometry import geodesic_angle, rotate
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
 from flowgraph.graphs import complementary
-from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+from tests.graphs.estimation import THESIS, engines_agree, is_lowered_and_drawn
 
 LEVEL = Attitude(attitude=np.array([1.0, 0.0, 0.0, 0.0]))
 
@@ -116,6 +116,58 @@ def test_on_a_flying_quadrotor_it_fails_even_with_perfect_sensors():
     assert np.sqrt(np.mean(by_gyro**2)) < 3.0
 
 
+def test_the_ratio_of_the_thesis_is_met_in_the_tilt_and_not_in_the_whole_attitude():
+    """What remains is the heading, which gravity does not show: it bounds how far the whole can come down."""
+    for seed in range(3):
+        filtered, alone = score(seed, 0.98), score(seed, 1.0)
+        assert filtered["attitude_rmse_deg"] > alone["attitude_rmse_deg"] / 5.0
+        rest = np.hypot(filtered["tilt_rmse_deg"], filtered["heading_rmse_deg"])
+        assert filtered["attitude_rmse_deg"] == pytest.approx(rest, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", [0.98, 0.9])
+def test_its_covariance_is_as_large_as_its_errors(alpha):
+    """The NEES of 5 runs, three numbers, on average over the ticks after 2 s: within a fifth of 3."""
+    assert 2.4 < mean_nees(alpha) < 3.6
+    assert mean_nees(alpha, accelerometer_noise=2.0 * THESIS) < 2.4
+    assert mean_nees(alpha, gyro_noise=0.5 * THESIS) > 3.6
+
+
+@cache
+def mean_nees(alpha: float, **noise: float) -> float:
+    found = []
+    for seed in range(5):
+        trip = flight(seed=seed, duration="8")
+        case = complementary.case(trip, alpha=alpha, covariance=True, settle=2.0, **noise)
+        found.append(case.score(simulate(case.graph, case.inputs))["nees_mean"])
+    return float(np.mean(found))
+
+
+def test_asking_for_the_covariance_does_not_change_the_estimate():
+    plain, asked = (complementary.case(flight(duration="2"), covariance=c) for c in (False, True))
+    a, b = (simulate(case.graph, case.inputs) for case in (plain, asked))
+    np.testing.assert_array_equal(a["attitude"].attitude, b["attitude"].attitude)
+    np.testing.assert_array_equal(a["attitude"].attitude, b["belief"].attitude)
+    assert "belief" not in a.series
+
+
+@pytest.mark.parametrize("rate", ["200", "73"])
+def test_engines_agree_on_the_covariance(rate):
+    case = complementary.case(flight(duration="2", accelerometer_rate=rate), covariance=True)
+    engines_agree(case.graph, case.inputs)
+    is_lowered_and_drawn(case, "attitude_spread")
+
+
+def test_a_covariance_needs_a_noise():
+    bare = Flight("bare", flight(duration="2").streams)
+    with pytest.raises(DataError, match="does not say the noise of its accelerometer"):
+        complementary.case(bare, covariance=True)
+    assert (
+        complementary.case(bare, covariance=True, accelerometer_noise=0.1, gyro_noise=0.1).score is not None
+    )
+
+
 def test_alpha_1_is_the_gyroscope_alone():
     case = complementary.case(flight(duration="2"), alpha=1.0)
     result = simulate(case.graph, case.inputs)
@@ -152,7 +204,7 @@ def test_a_flight_without_an_accelerometer_is_refused():
     with pytest.raises(DataError, match="this flight lacks what complementary needs") as error:
         complementary.case(bare)
     assert error.value.got == "gyro"
-    assert "imu" in str(error.value.expected)
+    assert "imu" in str(error.value.fix)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -0.1, 1.01, float("nan")])

@@ -1,0 +1,78 @@
+"""What a run is worth, in one table: errors against the truth, consistency, and what a smoother makes of it.
+
+Every graph scores its runs with `scorer`, so all print the same names: those of `metrics` and `consistency`
+for the estimate; for each stream of innovations those of `nis_summary`, with the name of the stream in front
+where there are several; and the errors of the smoothed run behind `smoothed_` and `lagged_` where that was
+asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flowgraph import Flight, Result, Series
+from flowgraph.blocks.consistency import nis_summary
+from flowgraph.blocks.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+
+__all__ = ["SMOOTHED", "scorer"]
+
+Errors = Callable[..., dict[str, float]]
+
+SMOOTHED = (
+    "position_rmse_m",
+    "position_max_m",
+    "velocity_rmse_mps",
+    "attitude_rmse_deg",
+    "nees_mean",
+    "nees_inside",
+)
+"""The errors of a smoothed run that are worth a line."""
+
+
+def scorer(
+    flight: Flight,
+    errors: Errors,
+    *,
+    estimate: str = "belief",
+    settle: float = 1.0,
+    steps: Callable[[Result], Steps] | None = None,
+    smooth: str = "none",
+    lag: float | None = None,
+) -> Callable[[Result], dict[str, float]]:
+    """The `score` of a `Case`.
+
+    Args:
+        flight: whose truth the estimate is compared with; without one there are innovations only.
+        errors: `pose_errors`, `point_errors` or `attitude_errors`.
+        estimate: the stream that is compared.
+        settle: seconds at the start that the errors leave out.
+        steps: what a smoother needs of a result.
+        smooth: "rts" smooths the whole run, "none" does not.
+        lag: s: with one, each tick is smoothed with what came until so much later.
+    """
+    truth = flight.truth
+
+    def compared(series: Series) -> dict[str, float]:
+        return {} if truth is None else errors(series, truth, settle=settle)
+
+    def score(result: Result) -> dict[str, float]:
+        found = compared(result[estimate])
+        innovations = {n: s for n, s in result.series.items() if "nis" in s.leaves and len(s)}
+        for name, series in innovations.items():
+            front = name.removesuffix("innovation")
+            found.update({front + key: value for key, value in nis_summary(series).items()})
+        smoothed: dict[str, Any] = {}
+        if steps is not None and truth is not None and (smooth == "rts" or lag is not None):
+            prior, posterior, transition, space, named = steps(result)
+            if smooth == "rts":
+                smoothed["smoothed"] = rauch_tung_striebel(prior, posterior, transition, space=space)
+            if lag is not None:
+                ticks = lag_ticks(posterior.time, lag)
+                smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
+            for front, series in smoothed.items():
+                better = compared(named(series))
+                found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
+        return found
+
+    return score
