@@ -2,7 +2,8 @@
 
 A pass takes a program and returns one that computes the same with less. It knows the instructions and
 nothing of a backend; what it makes are the same typed instructions in single-assignment form, so whatever
-plays the one list plays the other. Each can be switched off by its name.
+plays the one list plays the other. Each can be switched off by its name. The last two change no
+list: with `loops` they are what `plan` tells a backend about loops, buffers and the order of axes.
 
 The first four change no bit, and `algebra` none but for 0 times NaN or infinity. `symmetry`, `structure` and
 `unroll` add in another order than a matrix product does, or not at all where a zero is known, so results
@@ -20,6 +21,7 @@ import numpy as np
 from flowgraph.errors import UnknownNameError
 from flowgraph.optimise.algebra import simplify
 from flowgraph.optimise.loops import gather
+from flowgraph.optimise.memory import Plan, plan
 from flowgraph.optimise.simple import drop, fold, share
 from flowgraph.optimise.structure import split_products
 from flowgraph.optimise.symmetry import halve_products
@@ -27,7 +29,18 @@ from flowgraph.optimise.unroll import LARGEST_WORK, unroll
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import Program, is_symmetric
 
-__all__ = ["ARRAYS", "DEFAULT", "PASSES", "check_passes", "for_engine", "optimise", "usable", "without"]
+__all__ = [
+    "ARRAYS",
+    "DEFAULT",
+    "PASSES",
+    "Plan",
+    "check_passes",
+    "for_engine",
+    "optimise",
+    "plan",
+    "usable",
+    "without",
+]
 
 PASSES = {
     "fold": "compute now what depends on constants alone",
@@ -38,6 +51,8 @@ PASSES = {
     "symmetry": "compute one half of A P A^T",
     "structure": "split products along zero and identity blocks",
     "unroll": "take small arrays apart into scalars",
+    "reuse": "let arrays share memory whose times do not overlap",
+    "layout": "lay the axis of particles out innermost",
 }
 """The passes by name, and what each does."""
 
