@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,9 @@ from flowgraph.study import (
     read_table,
     read_trajectory,
     run_study,
+    tasks,
 )
+from flowgraph.study.execution import tasks_of
 
 pytest.importorskip("pyarrow")
 SMALL = {"graphs": ["ekf"], "data": ["sim"], "parameters": {"duration": 1.5, "imu.rate": 50}}
@@ -165,8 +168,6 @@ def test_vectorised_runs_are_those_of_one_at_a_time(tmp_path):
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
     pytest.importorskip("jax")
     from flowgraph import xla
-    from flowgraph.study import tasks
-
     tasks._programs.clear()
     compiled = []
     made = xla.Scan.__init__
@@ -188,7 +189,22 @@ def test_a_vectorised_run_does_not_depend_on_what_else_is_asked_for(tmp_path):
     assert told(resumed.rows) == told(many.rows)
 
 
-def test_parameters_that_change_shapes_are_grouped(tmp_path):
+def test_parameters_that_change_shapes_are_grouped():
+    study = Study(
+        graphs=["rbpf_indoor"], data=["sim"], seeds=3, engine="xla", chunk=4,
+        parameters={"duration": 1.2, "position_noise": [0.01, 0.02], "particles": [10, 20]},
+    )  # fmt: skip
+    planned = plan(study)
+    made = tasks_of(study, planned, [r.key for r in planned.runs])
+    assert [len(t.runs) for t in made] == [4, 4, 2, 2]
+    assert all(len({r.parameters["particles"] for r in t.runs}) == 1 for t in made)
+    later = tasks_of(study, planned, [r.key for r in planned.runs if r.seed != 1])
+    assert sum(len(t.runs) for t in later) == 8
+    assert all({r.key for r in t.runs} <= {r.key for r in o.runs} for t, o in zip(later, made, strict=True))
+
+
+@pytest.mark.slow
+def test_runs_of_several_shapes_are_those_of_one_at_a_time(tmp_path):
     pytest.importorskip("jax")
     study = Study(
         graphs=["rbpf_indoor"], data=["sim"], seeds=2, engine="xla", chunk=4,
@@ -333,9 +349,19 @@ def test_an_unknown_metric_is_a_row_error_that_lists_those_there_are(tmp_path):
     assert "position_rmse_m" in done.rows[0]["error"]
 
 
-def test_an_estimate_that_is_not_finite_is_an_error(tmp_path):
-    done = run_study(small(parameters={"position_noise": 1e-300, "attitude_noise": 1e-300}), tmp_path)
-    assert "astray" in done.rows[0]["error"] or "finite" in done.rows[0]["error"]
+def test_an_estimate_that_is_not_finite_is_an_error(tmp_path, monkeypatch):
+    made = tasks.prepared
+
+    def diverging(*arguments):
+        case, flight = made(*arguments)
+        return replace(case, score=lambda result: {"position_rmse_m": math.nan, "tilt_rmse_deg": 1.0}), flight
+
+    monkeypatch.setattr(tasks, "prepared", diverging)
+    done = run_study(small(), tmp_path)
+    assert "went astray: position_rmse_m is nan" in done.rows[0]["error"]
+    assert done.rows[0]["tilt_rmse_deg"] == 1.0
+    monkeypatch.undo()
+    assert run_study(small(), tmp_path).done == 0
 
 
 # -- what may be asked -----------------------------------------------------------------------------------
