@@ -278,7 +278,7 @@ class OnDask(_Closing):
                 ) from None
         self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
         self._futures: dict[str, str] = {}
-        self._done = distributed.as_completed(with_results=False)
+        self._done = distributed.as_completed(loop=self._client.loop)
 
     def pids(self) -> list[int]:
         """The worker processes of the cluster."""

@@ -107,7 +107,8 @@ def structure(pipeline: Pipeline) -> tuple[Any, ...]:
     Two pipelines of one structure are one program on different numbers.
     """
     ports = lambda these: tuple(
-        (p.name, p.present, tuple((x.name, x.value, x.shape, x.dtype) for x in p.leaves)) for p in these
+        (p.name, p.present, p.timing, tuple((x.name, x.value, x.shape, x.dtype) for x in p.leaves))
+        for p in these
     )
     cells = lambda r: tuple((c.name, c.read, c.write, c.shape, c.dtype) for c in r.cells)
     fixed = lambda r: tuple(

@@ -1,0 +1,97 @@
+"""Executors: the same protocol, and what they do when workers die."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from flowgraph import DeclarationError
+from flowgraph.study import InProcess, OnDask, ProcessPool
+from tests.study import deeds
+
+
+def finished(executor):
+    return {done.task: done for done in executor.as_completed()}
+
+
+@pytest.fixture(params=["inprocess", "pool", "dask"])
+def executor(request):
+    if request.param == "dask":
+        pytest.importorskip("distributed")
+    made = {"inprocess": InProcess, "pool": lambda: ProcessPool(2), "dask": lambda: OnDask(workers=2)}
+    with made[request.param]() as found:
+        yield found
+
+
+def test_each_task_ends_with_its_value_or_its_error(executor):
+    for x in range(5):
+        executor.submit(f"double {x}", deeds.double, x)
+    executor.submit("fail", deeds.fail, 7)
+    done = finished(executor)
+    assert {n: d.value for n, d in done.items() if n != "fail"} == {f"double {x}": 2 * x for x in range(5)}
+    assert "no 7" in str(done["fail"].error)
+    executor.submit("later", deeds.double, 21)
+    assert finished(executor)["later"].value == 42
+
+
+def test_tasks_may_be_submitted_while_others_end(executor):
+    executor.submit("0", deeds.double, 0)
+    seen = []
+    for done in executor.as_completed():
+        seen.append(done.task)
+        if len(seen) < 4:
+            executor.submit(f"{len(seen)}", deeds.double, 1)
+    assert sorted(seen) == ["0", "1", "2", "3"]
+
+
+@pytest.mark.parametrize("kind", [ProcessPool, OnDask])
+def test_a_task_that_kills_its_workers_is_given_up_and_the_rest_end(kind):
+    if kind is OnDask:
+        pytest.importorskip("distributed")
+    with kind(workers=2, deaths=2) as pool:
+        pool.submit("poison", deeds.die, 0)
+        for x in range(6):
+            pool.submit(f"{x}", deeds.slow, x)
+        done = finished(pool)
+    assert len(done) == 7
+    assert done["poison"].lost
+    assert "2" in done["poison"].lost or kind is OnDask
+    assert all(done[f"{x}"].value == x for x in range(6))
+
+
+def test_a_death_is_forgiven_once(tmp_path):
+    with ProcessPool(2, deaths=2) as pool:
+        pool.submit("weak", deeds.die_once, str(tmp_path / "dead"), 5)
+        assert finished(pool)["weak"].value == 5
+
+
+def test_a_worker_killed_from_outside_loses_nothing():
+    with ProcessPool(2) as pool:
+        for x in range(20):
+            pool.submit(f"{x}", deeds.slow, x)
+        values, killed = [], False
+        for done in pool.as_completed():
+            values.append(done.value)
+            if not killed:
+                os.kill(pool.pids()[0], signal.SIGKILL)
+                killed = True
+    assert sorted(values) == list(range(20))
+
+
+@pytest.mark.parametrize("kind", [ProcessPool, OnDask])
+@pytest.mark.parametrize("workers", [0, -1, 1.5, True])
+def test_a_number_of_workers_that_cannot_be_is_refused(kind, workers):
+    with pytest.raises(DeclarationError, match="so many workers"):
+        kind(workers=workers)
+
+
+def test_a_scheduler_that_does_not_answer_is_an_error():
+    distributed = pytest.importorskip("distributed")
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": "500ms"}):
+        assert distributed
+        with pytest.raises(DeclarationError, match="no scheduler answers"):
+            OnDask("tcp://127.0.0.1:9")
