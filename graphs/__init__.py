@@ -4,10 +4,15 @@ from flowgraph.graphs.async_kalman import async_kalman
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
+from flowgraph.graphs.ins_ekf_pose import ins_ekf_pose
 from flowgraph.graphs.ins_eskf import ins_eskf
+from flowgraph.graphs.ins_particle import ins_particle
+from flowgraph.graphs.ins_ukf_pose import ins_ukf_pose
+from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
 from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.orientation_complementary import orientation_complementary
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.tag_pose import tag_pose
 from flowgraph.graphs.ukf import ukf
 
 __all__ = [
@@ -20,4 +25,9 @@ __all__ = [
     "ins_eskf",
     "rbpf_indoor",
     "ukf",
+    "tag_pose",
+    "ins_ekf_pose",
+    "ins_ukf_pose",
+    "ins_ukf_velocity",
+    "ins_particle",
 ]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flowgraph import Flight
+from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matlab import known_settings, number
 from flowgraph.blocks.datasets.parameters import Parameters
 from flowgraph.blocks.datasets.studentdata import SETTINGS as READING
@@ -24,6 +24,8 @@ from flowgraph.blocks.datasets.studentdata import flight_of
 from flowgraph.blocks.euler import angles_from_matrix
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.vision.camera import Camera
+from flowgraph.blocks.vision.motion import CameraMotion, camera_motion_of
+from flowgraph.errors import DeclarationError
 
 __all__ = ["SETTINGS", "Motion", "load", "motion", "see", "simulated_content"]
 
@@ -37,8 +39,12 @@ DEFAULTS: Mapping[str, float] = {
     "accelerometer.bias": 0.1,
     "gyro.walk": 1e-4,
     "accelerometer.walk": 1e-3,
+    "motion.rate": 50.0,
+    "motion.velocity_noise": 0.05,
+    "motion.rate_noise": 0.1,
 }
-"""s; Hz of packets; px; continuous densities; standard deviations of the constant biases; their walks."""
+"""s; Hz of packets; px; continuous densities; standard deviations of the constant biases; their walks; and the
+camera's velocity, as optical flow would give it: Hz, m/s and rad/s."""
 
 SETTINGS: Mapping[str, str] = {
     **{name: f"{value:g} if left out" for name, value in DEFAULTS.items()},
@@ -170,9 +176,11 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
     given = dict(settings or {})
     known_settings(given, SETTINGS, "course")
     ours = {name: number(given, name, value, "course") for name, value in DEFAULTS.items() if name in given}
-    if ours.get("duration", 1.0) * ours.get("rate", 100.0) < 1.0 or min(ours.values(), default=0.0) < 0.0:
-        from flowgraph.errors import DeclarationError
-
+    if (
+        min(ours.get("motion.rate", 1.0), ours.get("rate", 1.0)) == 0.0
+        or ours.get("duration", 1.0) * ours.get("rate", 100.0) < 1.0
+        or min(ours.values(), default=0.0) < 0.0
+    ):
         raise DeclarationError(
             "this flight has no packet",
             path="course",
@@ -187,4 +195,17 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
     unit = ImuNoise(
         use["gyro.noise"], use["accelerometer.noise"], use["gyro.walk"], use["accelerometer.walk"]
     )
-    return Flight(flight.name, flight.streams, flight.truth, {**flight.info, "imu_noise": unit}, flight.notes)
+    streams = {**flight.streams, "motion": _optical_flow(flight, seed, use)}
+    return Flight(flight.name, streams, flight.truth, {**flight.info, "imu_noise": unit}, flight.notes)
+
+
+def _optical_flow(flight: Flight, seed: int, use: Mapping[str, float]) -> Series:
+    """The camera's velocity and rate with white noise, at a rate of its own."""
+    truth = flight.truth
+    assert truth is not None
+    time = np.arange(truth.time[0], truth.time[-1] + 1, round(1e9 / use["motion.rate"]))
+    rng = np.random.default_rng([seed, 11])
+    velocity, rate = camera_motion_of(truth, time, flight.info["mount"])
+    velocity = velocity + rng.normal(size=velocity.shape) * use["motion.velocity_noise"]
+    rate = rate + rng.normal(size=rate.shape) * use["motion.rate_noise"]
+    return Series(time, CameraMotion(velocity=velocity, rate=rate), name="motion")

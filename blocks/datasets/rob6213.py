@@ -55,8 +55,13 @@ axes about its z, rad."""
 USUAL_DELAY = 0.067
 """s, where no motion capture tells."""
 
-NOISE = ImuNoise(gyro=0.02, accelerometer=0.05, gyro_bias=1e-4, accelerometer_bias=1e-3)
-"""Densities of the derived IMU."""
+NOISE = ImuNoise(gyro=0.002, accelerometer=0.2, gyro_bias=1e-4, accelerometer_bias=1e-3)
+"""Densities of the derived IMU: a motion capture's attitude is better than what two derivatives leave of its
+position."""
+
+POSE_NOISE = {"position_noise": 0.01, "attitude_noise": 0.05}
+"""What the on-board poses are taken for, m and rad; their errors last for tenths of a second, so the rad are
+more than the errors' own 0.015."""
 
 _COLUMNS = "t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz"
 
@@ -113,7 +118,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         pose.time, CameraMotion(velocity=table["linearVel"][keep], rate=table["angVel"][keep]), name="motion"
     )
     streams = {"pose": pose}
-    info: dict[str, Any] = {"mount": COURSE_MOUNT, "imu_noise": NOISE}
+    info: dict[str, Any] = {"mount": COURSE_MOUNT, "imu_noise": NOISE, **POSE_NOISE}
     truth = None
     csv = csv or _beside(file)
     delay = USUAL_DELAY

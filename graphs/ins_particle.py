@@ -1,0 +1,154 @@
+"""A particle filter of the fifteen states of inertial navigation, corrected by a pose.
+
+    x = (p, e, v, b_g, b_a)      each particle is one
+
+The same process and observation model as `ins_ukf_pose`, without a Gaussian: every tick moves the particles with
+the IMU and noises drawn for each; a tick with a pose weighs them, and resamples when few carry the weight.
+
+Source: the course's particle filter on AprilTags; equations: `blocks/euler_ins.py`, `blocks/state_particles.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flowgraph import Case, DeclarationError, Flight, Stream, delay, graph, latest, merge
+from flowgraph.blocks.euler import need_order
+from flowgraph.blocks.euler_ins import euler_angles, navigation_belief
+from flowgraph.blocks.extended import between_imu
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.state_particles import (
+    StateCloud,
+    average_state,
+    propagate_states,
+    resample_states,
+    start_states,
+    weigh_states,
+)
+from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.checks import need_numbers
+from flowgraph.graphs.euler_flight import noise_of, pose_covariance, scored, start_at
+from flowgraph.graphs.tag_pose import poses_of
+from flowgraph.inputs import clocks_of
+
+MOST_PARTICLES = 2**18
+
+
+@graph
+def ins_particle(
+    imu: Stream[Imu],
+    pose: Stream[PoseMeasurement],
+    *,
+    start: StateCloud,
+    noise: ImuNoise,
+    R: Any,
+    order: str = "zxy",
+    factor: float = 1.0,
+    resample_below: float = 0.5,
+    spread: float = 0.1,
+    scheme: str = "systematic",
+    draws: str = "ins_particle",
+):
+    """Particle filter of 15 states with Euler angles: IMU control, camera pose.
+
+    Collected: `belief` (the particles' mean and covariance, before resampling) and `angles` at every tick;
+    `effective_sample_size` and `ancestors` at every pose.
+    """
+    cloud = delay(start, name="cloud")
+    last = delay(Imu.at_rest(), name="last_control")
+    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
+    prior = propagate_states(
+        cloud, between_imu(last, control), order=order, noise=noise, draws=f"{draws}.process", name="predict"
+    )
+    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
+    fresh, size, ancestors = resample_states(
+        weighed,
+        below=resample_below,
+        spread=spread,
+        scheme=scheme,
+        draws=f"{draws}.resample",
+        name="resample",
+    )
+    cloud.feed(merge(fresh, prior, tie="left", name="next"))
+    last.feed(control)
+    mean = average_state(merge(weighed, prior, tie="left", name="now"))
+    return {
+        "belief": navigation_belief(mean, order=order),
+        "angles": euler_angles(mean, order=order),
+        "effective_sample_size": size,
+        "ancestors": ancestors,
+    }
+
+
+@ins_particle.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    particles: int = 1000,
+    seed: int = 0,
+    order: str = "zxy",
+    tags: str = "all",
+    gyro_factor: float = 3.0,
+    accelerometer_factor: float = 3.0,
+    position_noise: float | None = None,
+    attitude_noise: float | None = None,
+    inflate: float = 2.0,
+    resample_below: float = 0.5,
+    spread: float = 0.1,
+    scheme: str = "systematic",
+    settle: float = 1.0,
+) -> Case:
+    """Start the particles around the first measured pose of a flight, at rest and without biases.
+
+    Args:
+        flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and `vicon`.
+        particles: how many; the course asks for 5,000.
+        seed: of the start's draws; that of the run is given to `simulate`.
+        order: zxy (the course's) or zyx (the report's).
+        tags: all, even or odd: the ids that PnP uses.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU: particles need room.
+        position_noise, attitude_noise: as in `ins_ukf_pose`.
+        inflate: on all standard deviations of the measured pose.
+        resample_below: resample when the effective sample size is below this part of the particles.
+        spread: by what part of the cloud's deviations the copies are shaken apart.
+        scheme: systematic, stratified, residual or multinomial.
+        settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where the flight lacks a stream.
+        DeclarationError, UnknownNameError: for a setting that is out of range.
+    """
+    need_order(order, "ins_particle.order")
+    need_numbers(
+        "ins_particle",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "position_noise": position_noise,
+            "attitude_noise": attitude_noise,
+            "inflate": inflate,
+        },
+        not_negative={"settle": settle, "resample_below": resample_below, "spread": spread},
+    )
+    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
+        raise DeclarationError(
+            "setting 'particles' is out of range",
+            path="ins_particle.particles",
+            expected=f"a whole number from 1 to {MOST_PARTICLES}",
+            got=repr(particles),
+            fix="write particles=5000",
+        )
+    inputs = flight.need("ins_particle", "imu") | {"pose": poses_of("ins_particle", flight, tags=tags)}
+    built = ins_particle.build(
+        **clocks_of(inputs),
+        start=start_states(particles, start_at(inputs["pose"], order), seed=seed),
+        noise=noise_of(flight, gyro_factor, accelerometer_factor),
+        R=pose_covariance(flight.info, position_noise, attitude_noise) * inflate**2,
+        factor=inflate**2,
+        order=order,
+        resample_below=resample_below,
+        spread=spread,
+        scheme=scheme,
+    )
+    return Case(built, inputs, scored(flight.truth, order, settle))

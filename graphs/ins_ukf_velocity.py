@@ -1,0 +1,136 @@
+"""The unscented Kalman filter of a camera's velocity: IMU as control, optical flow as measurement.
+
+    x = (p, e, v, b_g, b_a)      v_c = R_cb (R(e)^T v + w x r)
+
+The camera sits at r in the body, so its velocity has a part of the body's rate w. That rate is the camera's own
+(rate="camera", the report's eq. 9), or the gyroscope's minus its bias (rate="gyro", eq. 10), which the filter
+estimates. The noises of rate and velocity augment the sigma points. Nothing measures position and heading: both
+drift.
+
+Source: the report's second filter. Equations: `blocks/euler_ins.py` and `blocks/unscented_ins.py`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
+from flowgraph.blocks.euler import need_order
+from flowgraph.blocks.euler_ins import euler_angles, navigation_belief, start_gaussian
+from flowgraph.blocks.extended import between_imu
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.unscented_ins import RATES, predict_unscented_ins, update_camera_velocity
+from flowgraph.blocks.vision.camera import Mount
+from flowgraph.blocks.vision.motion import CameraMotion
+from flowgraph.checks import need_numbers
+from flowgraph.errors import UnknownNameError
+from flowgraph.graphs.euler_flight import noise_of, scored
+from flowgraph.inputs import clocks_of
+
+
+@graph
+def ins_ukf_velocity(
+    imu: Stream[Imu],
+    motion: Stream[CameraMotion],
+    *,
+    start: Gaussian,
+    noise: ImuNoise,
+    mount: Mount,
+    velocity_noise: float,
+    rate_noise: float,
+    rate: str = "gyro",
+    order: str = "zyx",
+    gate: float | None = None,
+):
+    """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
+
+    Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
+    """
+    belief = delay(start, name="belief")
+    last = delay(Imu.at_rest(), name="last_control")
+    control = latest(imu, init=Imu.at_rest(), at=imu | motion, name="control")
+    prior = predict_unscented_ins(
+        belief, between_imu(last, control), order=order, noise=noise, name="predict"
+    )
+    posterior, innovation = update_camera_velocity(
+        prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
+        rate_noise=rate_noise, rate=rate, gate=gate, name="update",
+    )  # fmt: skip
+    belief.feed(posterior)
+    last.feed(control)
+    collect(innovation, "innovation")
+    return {
+        "belief": navigation_belief(posterior, order=order),
+        "angles": euler_angles(posterior, order=order),
+    }
+
+
+@ins_ukf_velocity.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    rate: str = "gyro",
+    order: str = "zyx",
+    gyro_factor: float = 1.0,
+    accelerometer_factor: float = 1.0,
+    velocity_noise: float = 0.1,
+    rate_noise: float | None = None,
+    gate: float | None = None,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
+
+    Args:
+        flight: with the streams `imu` and `motion`, a truth, and the `mount` of the camera in its info.
+        rate: gyro (the report's eq. 10) or camera (eq. 9).
+        order: zxy (the course's) or zyx (the report's).
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
+        velocity_noise: standard deviation of the camera's velocity, m/s.
+        rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
+        gate: a measurement with a larger normalised innovation squared changes nothing.
+        settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where the flight lacks a stream or the truth.
+        DeclarationError, UnknownNameError: for a setting that is out of range.
+    """
+    need_order(order, "ins_ukf_velocity.order")
+    if rate not in RATES:
+        raise UnknownNameError("source of the rate", rate, RATES, path="ins_ukf_velocity.rate")
+    need_numbers(
+        "ins_ukf_velocity",
+        positive={
+            "gyro_factor": gyro_factor,
+            "accelerometer_factor": accelerometer_factor,
+            "velocity_noise": velocity_noise,
+            "rate_noise": rate_noise,
+            "gate": gate,
+        },
+        not_negative={"settle": settle},
+    )
+    inputs = flight.need("ins_ukf_velocity", "imu", "motion")
+    if flight.truth is None:
+        raise DataError(
+            "this flight does not tell where ins_ukf_velocity starts",
+            path=flight.name,
+            expected="a truth",
+            got="none",
+            fix="build the graph with a start of your own: start_gaussian(position, attitude, order=...)",
+        )
+    first = np.array([min(int(s.time[0]) for s in inputs.values())])
+    position, attitude = interpolate_pose(flight.truth, first)
+    built = ins_ukf_velocity.build(
+        **clocks_of(inputs),
+        start=start_gaussian(position[0], attitude[0], order=order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)),
+        noise=noise_of(flight, gyro_factor, accelerometer_factor),
+        mount=flight.info["mount"],
+        velocity_noise=velocity_noise,
+        rate_noise={"gyro": 0.02, "camera": 0.2}[rate] if rate_noise is None else rate_noise,
+        rate=rate,
+        order=order,
+        gate=gate,
+    )
+    return Case(built, inputs, scored(flight.truth, order, settle))
