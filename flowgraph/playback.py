@@ -1,4 +1,4 @@
-"""Playing a lowered pipeline over recorded events, in the reference interpreter or in XLA.
+"""Playing a lowered pipeline over recorded events, in the reference interpreter, in XLA or in C.
 
 Works from the description alone: a pipeline read from disk needs no graph and no block to be importable.
 """
@@ -85,8 +85,8 @@ def run_pipeline(
     passes: Collection[str] | None = None,
 ) -> Result:
     """Play a pipeline without its graph; see `Pipeline.run`."""
-    if engine not in ("reference", "xla"):
-        raise UnknownNameError("engine of a pipeline", engine, ("reference", "xla"))
+    if engine not in _ENGINES:
+        raise UnknownNameError("engine of a pipeline", engine, _ENGINES)
     if dtype not in ("float64", "float32"):
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
     check_start(init, state, path=pipeline.name)
@@ -250,15 +250,8 @@ def _result(
 ) -> Result:
     pipeline.need_numbers(dtype)
     real = np.dtype(dtype)
-    outcome = (_reference if engine == "reference" else _xla)(
-        pipeline,
-        events,
-        cells,
-        real,
-        seed_words(seed),
-        progress,
-        usable(pipeline, for_engine(engine, passes), cells),
-    )
+    chosen = usable(pipeline, for_engine(engine, passes), cells)
+    outcome = _ENGINES[engine](pipeline, events, cells, real, seed_words(seed), progress, chosen)
     check_faults(pipeline, outcome.cells)
     series = {}
     for port, type_, (times, leaves) in zip(pipeline.outputs, types, outcome.outputs, strict=True):
@@ -380,10 +373,41 @@ def _xla(
         if progress is not None:
             progress.update(done, int(times[-1]))
     wall = perf_counter() - start
+    return _Outcome(cells, _joined(pipeline, parts, events), wall)
+
+
+def _c(
+    pipeline: Pipeline, events: Tape, cells: list[Any], real: Any, seed: np.ndarray, progress: Meter | None,
+    passes: tuple[str, ...],
+) -> _Outcome:  # fmt: skip
+    from flowgraph.c.engine import compiled
+
+    library = compiled(pipeline, real, events.patterns, passes)
+    rows = library.rows([real_leaves(s, real) for s in events.series])
+    parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in pipeline.outputs]
+    done = 0
+    start = perf_counter()
+    for part, after in library.play(cells, seed, events.time, events.key, rows):
+        cells = after
+        times = events.time[done : done + part.ticks]
+        for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
+            kept.append((times[mask], leaves))
+        done += part.ticks
+        if progress is not None:
+            progress.update(done, int(times[-1]))
+    wall = perf_counter() - start
+    return _Outcome(cells, _joined(pipeline, parts, events), wall)
+
+
+def _joined(
+    pipeline: Pipeline, parts: list[list[tuple[np.ndarray, list[np.ndarray]]]], events: Tape
+) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+    """Stretches of each output in one."""
     outputs = []
     for port, kept in zip(pipeline.outputs, parts, strict=True):
         count = sum(len(t) for t, _ in kept)
-        times = events.time if count == len(events.time) else np.concatenate([t for t, _ in kept])
+        whole = count == len(events.time)
+        times = events.time if whole else np.concatenate([t for t, _ in kept])
         arrays = [
             np.concatenate([leaves[k] for _, leaves in kept])
             if kept
@@ -391,7 +415,10 @@ def _xla(
             for k, leaf in enumerate(port.leaves)
         ]
         outputs.append((times, arrays))
-    return _Outcome(cells, outputs, wall)
+    return outputs
+
+
+_ENGINES = {"reference": _reference, "xla": _xla, "c": _c}
 
 
 def _compiled(pipeline: Pipeline) -> dict[Any, Any]:

@@ -13,7 +13,7 @@ from flowgraph.many import Batch, simulate_many
 from flowgraph.result import Result
 from flowgraph.run import Meter, Run
 
-ENGINES = ("python", "reference", "xla")
+ENGINES = ("python", "reference", "xla", "c")
 
 
 @typing.overload
@@ -63,8 +63,9 @@ def simulate(
         graph: a built graph.
         inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of
             `(time, value)`.
-        engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy)
-            or "xla" (the same instructions in one compiled scan; needs JAX).
+        engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy),
+            "xla" (the same instructions in one compiled scan; needs JAX) or "c" (generated, compiled by the
+            system's C compiler and called in this process).
         dtype: what `real` is, "float64" or "float32"; the Python engine has float64 only.
         init: other initial values, by register path.
         state: a `run.state` or `result.state` to go on from.
@@ -77,7 +78,7 @@ def simulate(
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
         FifoOverflowError: where a queue of a join overflows.
-        MissingDependencyError: for "xla" without JAX.
+        MissingDependencyError: for "xla" without JAX, for "c" without a C compiler.
     """
     if engine not in ENGINES:
         raise UnknownNameError("engine", engine, ENGINES)

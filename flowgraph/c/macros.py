@@ -1,0 +1,274 @@
+"""Operations with loops of their own: products and factorizations of larger matrices, sorts, random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from flowgraph.c.nodes import Macro, View
+from flowgraph.c.syntax import ctype, number
+
+if TYPE_CHECKING:
+    from flowgraph.c.statements import Writer
+
+
+def write_macro(w: Writer, m: Macro) -> None:
+    """Write a macro's loops."""
+    _MACROS[m.kind](w, m)
+
+
+def element(w: Writer, view: View, index: Sequence[str]) -> str:
+    """An element of a view; an axis of size one, and leading axes that are not there, are left out."""
+    index = index[len(index) - len(view.shape) :]
+    terms = [
+        (i if s == 1 else f"{s} * {i}")
+        for i, s, n in zip(index, view.strides, view.shape, strict=True)
+        if s and n > 1
+    ]
+    if view.offset or not terms:
+        terms.insert(0, str(view.offset))
+    return w.at(view.buffer, " + ".join(terms))
+
+
+class _Loops:
+    """Opens loops over axes and closes them again."""
+
+    def __init__(self, w: Writer, sizes: Sequence[int], letter: str = "b") -> None:
+        self.w, self.sizes, self.letter = w, sizes, letter
+
+    def __enter__(self) -> list[str]:
+        names = []
+        for k, n in enumerate(self.sizes):
+            name = f"{self.letter}{k}"
+            self.w.line(f"for (int32_t {name} = 0; {name} < {n}; {name}++) {{")
+            self.w.depth += 1
+            names.append(name)
+        return names
+
+    def __exit__(self, *_: object) -> None:
+        for _n in self.sizes:
+            self.w.depth -= 1
+            self.w.line("}")
+
+
+def _matmul(w: Writer, m: Macro) -> None:
+    a, b = m.inputs
+    out = m.output
+    rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
+    kind = ctype(out.buffer.dtype, w.write.real)
+    zero = number(0, out.buffer.dtype, w.write.real)
+    steps = b.strides[-1] != 1 and columns > 1
+    with _Loops(w, out.shape[:-2]) as batch:
+        w.line("{")
+        w.depth += 1
+        if steps:
+            w.line(f"{kind} right[{inner * columns}];")
+            with _Loops(w, (inner, columns), "k") as (k, j):
+                w.line(f"right[{columns} * {k} + {j}] = {element(w, b, [*batch, k, j])};")
+        with _Loops(w, (rows,), "r") as (i,):
+            w.line(f"{kind} row[{columns}];")
+            with _Loops(w, (columns,), "c") as (j,):
+                w.line(f"row[{j}] = {zero};")
+            with _Loops(w, (inner,), "k") as (k,):
+                w.line(f"const {kind} left = {element(w, a, [*batch, i, k])};")
+                right = f"right[{columns} * {k} + c0]" if steps else element(w, b, [*batch, k, "c0"])
+                with _Loops(w, (columns,), "c"):
+                    w.line(f"row[c0] += left * {right};")
+            with _Loops(w, (columns,), "c") as (j,):
+                w.line(f"{element(w, out, [*batch, i, j])} = row[{j}];")
+        w.depth -= 1
+        w.line("}")
+
+
+def _cholesky(w: Writer, m: Macro) -> None:
+    (a,), out = m.inputs, m.output
+    n = out.shape[-1]
+    real = w.write.real
+    name = w.write.helper("fg_cholesky")
+    with _Loops(w, out.shape[:-2]) as batch:
+        w.line("{")
+        w.depth += 1
+        w.line(f"{real} factor[{n * n}];")
+        with _Loops(w, (n, n), "r") as (i, j):
+            w.line(f"factor[{n} * {i} + {j}] = {element(w, a, [*batch, i, j])};")
+        w.line(f"{name}(factor, {n});")
+        with _Loops(w, (n, n), "r") as (i, j):
+            w.line(f"{element(w, out, [*batch, i, j])} = factor[{n} * {i} + {j}];")
+        w.depth -= 1
+        w.line("}")
+
+
+def _solve(w: Writer, m: Macro) -> None:
+    a, b = m.inputs
+    out = m.output
+    n, columns = out.shape[-2:]
+    real = w.write.real
+    name = w.write.helper("fg_solve")
+    with _Loops(w, out.shape[:-2]) as batch:
+        w.line("{")
+        w.depth += 1
+        w.line(f"{real} matrix[{n * n}];")
+        w.line(f"{real} right[{n * columns}];")
+        with _Loops(w, (n, n), "r") as (i, j):
+            w.line(f"matrix[{n} * {i} + {j}] = {element(w, a, [*batch, i, j])};")
+        with _Loops(w, (n, columns), "r") as (i, j):
+            w.line(f"right[{columns} * {i} + {j}] = {element(w, b, [*batch, i, j])};")
+        w.line(f"{name}(matrix, right, {n}, {columns});")
+        with _Loops(w, (n, columns), "r") as (i, j):
+            w.line(f"{element(w, out, [*batch, i, j])} = right[{columns} * {i} + {j}];")
+        w.depth -= 1
+        w.line("}")
+
+
+def _reduce(w: Writer, m: Macro) -> None:
+    (x,), out, axes = m.inputs, m.output, m.extra["axes"]
+    kind, dtype = m.extra["joins"], out.buffer.dtype
+    kept = [k for k in range(len(x.shape)) if k not in axes]
+    with _Loops(w, [x.shape[k] for k in kept], "r") as outer:
+        w.line("{")
+        w.depth += 1
+        first = [dict(zip(kept, outer, strict=True)).get(k, "0") for k in range(len(x.shape))]
+        c = ctype(dtype, w.write.real)
+        start = {"sum": "0", "prod": "1", "any": "0", "all": "1"}.get(kind) or element(w, x, first)
+        w.line(f"{c} total = {start};")
+        with _Loops(w, [x.shape[k] for k in axes], "k") as inner:
+            at = dict(zip(kept, outer, strict=True)) | dict(zip(axes, inner, strict=True))
+            w.line(f"const {c} term = {element(w, x, [at[k] for k in range(len(x.shape))])};")
+            if kind in ("max", "min"):
+                sign = ">" if kind == "max" else "<"
+                nan = " || term != term" if dtype == "real" else ""
+                w.line(f"total = (term {sign} total{nan}) ? term : total;")
+            elif dtype == "bool":
+                w.line(f"total = total {'||' if kind == 'any' else '&&'} term;")
+            elif dtype in ("int32", "int64"):
+                sign, wide = "+" if kind == "sum" else "*", f"uint{dtype[3:]}_t"
+                w.line(f"total = ({c})(({wide})total {sign} ({wide})term);")
+            else:
+                w.line(f"total {'+' if kind == 'sum' else '*'}= term;")
+        w.line(f"{element(w, out, outer)} = total;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _lines(w: Writer, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[str], str], str]]:
+    """Loops over all axes but one, and how an element along that one is written."""
+    shape = m.inputs[0].shape
+    others = [n for k, n in enumerate(shape) if k != axis]
+
+    def at(view: View, outer: list[str], inner: str) -> str:
+        short = len(view.shape) < len(shape)
+        return element(w, view, outer if short else [*outer[:axis], inner, *outer[axis:]])
+
+    return _Loops(w, others, "r"), at
+
+
+def _cumulative(w: Writer, m: Macro) -> None:
+    axis, dtype = m.extra["axis"], m.output.buffer.dtype
+    loops, at = _lines(w, m, axis)
+    c = ctype(dtype, w.write.real)
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line(f"{c} total = 0;")
+        with _Loops(w, (m.inputs[0].shape[axis],), "k") as (k,):
+            term = at(m.inputs[0], outer, k)
+            if dtype in ("int32", "int64"):
+                wide = f"uint{dtype[3:]}_t"
+                w.line(f"total = ({c})(({wide})total + ({wide}){term});")
+            else:
+                w.line(f"total += {term};")
+            w.line(f"{at(m.output, outer, k)} = total;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _place(w: Writer, m: Macro) -> None:
+    axis = m.extra["axis"]
+    x = m.inputs[0]
+    sign = ">" if m.kind == "argmax" else "<"
+    loops, at = _lines(w, m, axis)
+    c = ctype(x.buffer.dtype, w.write.real)
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line("int64_t place = 0;")
+        w.line(f"{c} best = {at(x, outer, '0')};")
+        with _Loops(w, (x.shape[axis],), "k") as (k,):
+            w.line(f"const {c} term = {at(x, outer, k)};")
+            nan = " || (term != term && best == best)" if x.buffer.dtype == "real" else ""
+            w.line(f"if (term {sign} best{nan}) {{ best = term; place = {k}; }}")
+        w.line(f"{at(m.output, outer, '0')} = place;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _sort(w: Writer, m: Macro) -> None:
+    """In order by insertion for short lines, by heap for long ones; ties by place, NaN last."""
+    axis = m.extra["axis"]
+    x = m.inputs[0]
+    n = x.shape[axis]
+    loops, at = _lines(w, m, axis)
+    real = x.buffer.dtype == "real"
+
+    def value(place: str) -> str:
+        return at(x, outer, place)
+
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line(f"int32_t order[{max(n, 1)}];")
+        w.line(f"for (int32_t k = 0; k < {n}; k++) order[k] = k;")
+        w.line(f"for (int32_t top = {n} / 2, end = {n}; end > 1;) {{")
+        w.depth += 1
+        w.line("int32_t item;")
+        w.line("if (top > 0) { item = order[--top]; }")
+        w.line(
+            "else { end--; item = order[end]; order[end] = order[0]; if (end == 1) { order[0] = item; break; } }"
+        )
+        w.line("int32_t hole = top;")
+        w.line("for (int32_t child; (child = 2 * hole + 1) < end; hole = child) {")
+        w.depth += 1
+
+        def after(a: str, b: str) -> str:
+            p, q = value(a), value(b)
+            if real:
+                return (
+                    f"({p} > {q} || ({p} != {p} && {q} == {q}) || "
+                    f"(({p} == {q} || ({p} != {p} && {q} != {q})) && {a} > {b}))"
+                )
+            return f"({p} > {q} || ({p} == {q} && {a} > {b}))"
+
+        w.line(f"if (child + 1 < end && {after('order[child + 1]', 'order[child]')}) child++;")
+        w.line(f"if (!{after('order[child]', 'item')}) break;")
+        w.line("order[hole] = order[child];")
+        w.depth -= 1
+        w.line("}")
+        w.line("order[hole] = item;")
+        w.depth -= 1
+        w.line("}")
+        chosen = "order[k]" if m.kind == "argsort" else value("order[k]")
+        w.line(f"for (int32_t k = 0; k < {n}; k++) {at(m.output, outer, 'k')} = {chosen};")
+        w.depth -= 1
+        w.line("}")
+
+
+def _random(w: Writer, m: Macro) -> None:
+    name = w.write.helper(f"fg_{m.extra['draws']}")
+    blocks = m.output.buffer.size // 4
+    seed = w.at(m.inputs[0].buffer, "0")
+    w.line(f"{name}({w.names(m.output.buffer)}, {blocks}, UINT32_C({m.extra['hash']}), time, {seed}, "
+           f"{w.at(m.inputs[0].buffer, '1')});")  # fmt: skip
+
+
+_MACROS: dict[str, Callable[[Writer, Macro], None]] = {
+    "matmul": _matmul,
+    "cholesky": _cholesky,
+    "solve": _solve,
+    "reduce": _reduce,
+    "cumulative_sum": _cumulative,
+    "argmax": _place,
+    "argmin": _place,
+    "sort": _sort,
+    "argsort": _sort,
+    "random": _random,
+}
