@@ -126,7 +126,7 @@ def update_unscented(
         R: covariance of the noise, in the tangent space of z.
         space, measured_space: of the state and of z; without one it is a vector.
         points: the set of sigma points.
-        gate: when given, a measurement with a nis above it changes nothing.
+        gate: when given, as in `update_linear`.
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -145,7 +145,7 @@ def update_unscented(
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
-    accepted = accepts(nis, gate)
+    accepted = accepts(nis, gate, present, xp)
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
