@@ -24,7 +24,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.aiding import aid_attitude, aid_position
 from flowgraph.blocks.alignment import StartSpread, start_belief
-from flowgraph.blocks.inertial import ImuNoise, predict
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.metrics import interpolate_pose, pose_errors
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
 from flowgraph.checks import need_numbers
@@ -41,6 +41,7 @@ def ins_eskf(
     position_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     attitude_noise: float = 0.01,
+    gravity: tuple[float, float, float] = GRAVITY,
     gate: float | None = None,
 ):
     """15-state error-state Kalman filter: every tick predicts to now; a tick with a measurement also updates.
@@ -51,7 +52,7 @@ def ins_eskf(
     ticks = imu | position if attitude is None else imu | position | attitude
     belief = delay(start, name="belief")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = predict(belief, control, noise=noise, at=ticks)
+    prior = predict(belief, control, noise=noise, gravity=gravity, at=ticks)
     posterior, innovation = aid_position(prior, position, noise=position_noise, lever=lever, gate=gate)
     collect(innovation, "position_innovation")
     if attitude is not None:

@@ -32,7 +32,7 @@ from flowgraph import (
 from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.calibration import subtract_rest_bias
 from flowgraph.blocks.geometry import level, to_matrix
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.particles import (
     attitude_likelihood,
@@ -54,10 +54,20 @@ MOST_PARTICLES = 2**20
 
 
 @graph
-def predict(cloud: Stream[Cloud], imu: Stream[Imu], *, noise: ImuNoise, draws: str, at: Any):
+def predict(
+    cloud: Stream[Cloud],
+    imu: Stream[Imu],
+    *,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float] = GRAVITY,
+    draws: str,
+    at: Any,
+):
     """Carry the cloud to now: attitudes drawn through the gyroscope, motion by a Kalman prediction each."""
     turned = propagate_attitude(cloud, imu, gyro_noise=noise.gyro, draws=draws, at=at, name="attitude")
-    return predict_motion(turned, imu, accelerometer_noise=noise.accelerometer, name="kalman")
+    return predict_motion(
+        turned, imu, accelerometer_noise=noise.accelerometer, gravity=gravity, name="kalman"
+    )
 
 
 @graph
@@ -103,9 +113,10 @@ def rbpf_indoor(
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    gravity: tuple[float, float, float] = GRAVITY,
     still: float = 0.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    resample_below: float = 0.1,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_indoor",
 ):
@@ -121,7 +132,9 @@ def rbpf_indoor(
         imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
     cloud = delay(start, name="cloud")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = predict(cloud, control, noise=noise, draws=f"{draws}.attitude", at=imu | vicon)
+    prior = predict(
+        cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon
+    )
     posterior = update(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
     )
@@ -139,7 +152,7 @@ def for_flight(
     *,
     particles: int = 1000,
     seed: int = 0,
-    resample_below: float = 0.1,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     unknown_yaw: bool = True,
     gyro_factor: float | None = None,
