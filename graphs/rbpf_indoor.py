@@ -113,12 +113,12 @@ def rbpf_indoor(
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    gravity: tuple[float, float, float] = GRAVITY,
     still: float = 0.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    resample_below: float = 0.1,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_indoor",
-    gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Rao-Blackwellized particle filter: attitude by particles, motion by a Kalman filter each.
 
@@ -132,7 +132,9 @@ def rbpf_indoor(
         imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
     cloud = delay(start, name="cloud")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = predict(cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
+    prior = predict(
+        cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon
+    )
     posterior = update(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
     )
@@ -150,7 +152,7 @@ def for_flight(
     *,
     particles: int = 1000,
     seed: int = 0,
-    resample_below: float = 0.1,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     unknown_yaw: bool = True,
     gyro_factor: float | None = None,

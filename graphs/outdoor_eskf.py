@@ -1,0 +1,105 @@
+"""outdoor_eskf: an error-state Kalman filter on the outdoor sensors, each whenever it comes.
+
+What `rbpf_outdoor` is measured against: the same streams, the same knowledge of them, and one Gaussian in
+place of particles. Every tick predicts to now with the IMU; each sensor that is present then corrects, one
+after the other. Optical flow measures from a clone of the pose at the last picture.
+
+Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017; S. I.
+Roumeliotis and J. W. Burdick, "Stochastic cloning", ICRA 2002. The equations stand in
+`blocks/outdoor_belief.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Case, Flight, Result, Stream, collect, delay, graph, latest, timing_of
+from flowgraph.blocks.alignment import StartSpread
+from flowgraph.blocks.kalman import Gaussian, update_extended
+from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor_belief import (
+    FLOW,
+    OUTDOOR,
+    flow_vector,
+    new_picture,
+    observe_distance,
+    observe_field,
+    observe_flow,
+    observe_position,
+    outdoor_pose,
+    predict_clone,
+    start_outdoor,
+)
+from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.checks import need_numbers
+
+
+@graph
+def outdoor_eskf(
+    imu: Stream[Imu],
+    gps: Stream[Position],
+    gps2: Stream[Position],
+    altimeter: Stream[Range],
+    magnetometer: Stream[MagneticField],
+    optical_flow: Stream[OpticalFlow],
+    *,
+    start: Gaussian,
+    sensors: OutdoorSensors,
+):
+    """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
+
+    Collected: `belief` at every tick, and the innovation of each sensor where there was a reading.
+    """
+    s = sensors
+    belief = delay(start, name="belief")
+    control = latest(imu, init=Imu.at_rest(), name="control")
+    ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
+    now = predict_clone(belief, control, noise=s.imu, at=ticks, name="predict")
+    readings: dict[str, tuple[Stream, Any, float]] = {
+        "gps": (gps.map(lambda z: z.position), observe_position(s.gps_lever), s.gps),
+        "gps2": (gps2.map(lambda z: z.position), observe_position(s.gps2_lever), s.gps2),
+        "magnetometer": (
+            magnetometer.map(lambda z: z.field / s.magnetometer), observe_field(s.field, s.magnetometer), 1.0,
+        ),
+    }  # fmt: skip
+    for name, (reading, observe, noise) in readings.items():
+        R = np.eye(3) * noise**2
+        now, innovation = update_extended(now, reading, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}")
+        collect(innovation, f"{name}_innovation")
+    now, innovation = update_extended(
+        now, altimeter.map(lambda z: z.distance[..., None]),
+        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, name="fuse_altimeter",
+    )  # fmt: skip
+    collect(innovation, "altimeter_innovation")
+    now, innovation = update_extended(
+        now, optical_flow.map(flow_vector), observe=observe_flow, name="fuse_flow",
+        R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
+    )  # fmt: skip
+    collect(innovation, "optical_flow_innovation")
+    now = new_picture(now, optical_flow, name="picture")
+    belief.feed(now)
+    return {"belief": outdoor_pose(now)}
+
+
+@outdoor_eskf.on_flight
+def for_flight(flight: Flight, *, settle: float = 1.0) -> Case:
+    """Start the filter on an outdoor flight, at its first readings and at rest.
+
+    Args:
+        flight: with the streams and the knowledge that `outdoor_flight` asks for.
+        settle: seconds at the start that the errors leave out.
+    """
+    need_numbers("outdoor_eskf", not_negative={"settle": settle})
+    inputs, sensors, first = outdoor_flight(flight, "outdoor_eskf")
+    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
+    start = start_outdoor(first, spread=StartSpread())
+    built = outdoor_eskf.build(**clocks, start=start, sensors=sensors)
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
+
+    return Case(built, inputs, score)

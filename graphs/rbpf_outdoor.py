@@ -1,0 +1,150 @@
+"""rbpf_outdoor: a Rao-Blackwellized particle filter on six sensors, each whenever it comes.
+
+The attitude is sampled through the gyroscope; given it, velocity and position have a Kalman filter of their
+own. What is then linear in them, two GPS receivers, an altimeter and the displacement of optical flow, is a
+partial Kalman update of each particle; what sees the attitude only, a magnetometer and the turn of optical
+flow, weighs the particles. No sensor waits for another.
+
+Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the asynchronous
+Rao-Blackwellized particle filter. Mended: the altimeter reads p_z / cos(tilt) (the thesis prints a sine), and
+optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0 q_1, in the world). The equations
+stand in `blocks/outdoor_cloud.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flowgraph import (
+    Case,
+    DeclarationError,
+    Flight,
+    Result,
+    Stream,
+    delay,
+    graph,
+    latest,
+    merge,
+    timing_of,
+)  # fmt: skip
+from flowgraph.blocks.alignment import StartSpread
+from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor_cloud import (
+    OutdoorCloud,
+    as_cloud,
+    correct_distance,
+    correct_flow,
+    correct_position,
+    predict_outdoor,
+    start_outdoor_cloud,
+    take_outdoor_ancestors,
+    weigh_field,
+)
+from flowgraph.blocks.particles import average_attitude, average_pose, effective_sample_size, weights
+from flowgraph.blocks.resampling import draw_ancestors
+from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.checks import need_numbers
+
+MOST_PARTICLES = 2**20
+
+
+@graph
+def average(cloud: Stream[Cloud]):
+    """The weighted expectation of the pose."""
+    weight = weights(cloud)
+    return average_pose(cloud, weight, average_attitude(cloud, weight, name="attitude"), name="pose")
+
+
+@graph
+def rbpf_outdoor(
+    imu: Stream[Imu],
+    gps: Stream[Position],
+    gps2: Stream[Position],
+    altimeter: Stream[Range],
+    magnetometer: Stream[MagneticField],
+    optical_flow: Stream[OpticalFlow],
+    *,
+    start: OutdoorCloud,
+    sensors: OutdoorSensors,
+    resample_below: float = 0.5,
+    scheme: str = "systematic",
+    draws: str = "rbpf_outdoor",
+):
+    """Rao-Blackwellized particle filter of pose and velocity on asynchronous sensors.
+
+    Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
+    resampled if its weights have become too uneven. Collected: `pose` at every tick, averaged before
+    resampling; `effective_sample_size` and `ancestors` at every tick with a reading.
+    """
+    s = sensors
+    cloud = delay(start, name="cloud")
+    control = latest(imu, init=Imu.at_rest(), name="control")
+    seen = gps | gps2 | altimeter | magnetometer | optical_flow
+    now = predict_outdoor(cloud, control, noise=s.imu, draws=f"{draws}.attitude", at=imu | seen, name="predict")
+    now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
+    now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
+    now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
+    now = weigh_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
+    now = correct_flow(now, optical_flow, displacement=s.displacement, turn=s.turn, name="fuse_flow")
+
+    plain = as_cloud(now, name="plain")
+    size = effective_sample_size(plain, at=seen, name="size")
+    ancestors = draw_ancestors(
+        plain, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", at=seen, name="ancestors"
+    )
+    fresh = take_outdoor_ancestors(now, ancestors, at=seen, name="resample")
+    cloud.feed(merge(fresh, now, tie="left", name="next"))
+    return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
+
+
+@rbpf_outdoor.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    particles: int = 1000,
+    seed: int = 0,
+    resample_below: float = 0.5,
+    scheme: str = "systematic",
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on an outdoor flight, at its first readings and at rest.
+
+    Args:
+        flight: with the streams and the knowledge that `outdoor_flight` asks for, such as that of
+            `sim:thesis` with sensors=imu,gps,gps2,altimeter,magnetometer,optical_flow.
+        particles: how many.
+        seed: of the start's draws; that of the run is given to `simulate`.
+        resample_below: resample when the effective sample size is below this fraction of the particles.
+        scheme: systematic, stratified, residual or multinomial.
+        settle: seconds at the start that the errors leave out.
+
+    Raises:
+        DataError: where the flight lacks a stream, or optical flow has a gap.
+        DeclarationError: for a setting that is out of range.
+        UnknownNameError: for a scheme that is not there.
+    """
+    need_numbers("rbpf_outdoor", not_negative={"settle": settle, "resample_below": resample_below})
+    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
+        raise DeclarationError(
+            "setting 'particles' is out of range",
+            path="rbpf_outdoor.particles",
+            expected=f"a whole number from 1 to {MOST_PARTICLES}",
+            got=repr(particles),
+            fix="write particles=1000",
+        )
+    inputs, sensors, first = outdoor_flight(flight, "rbpf_outdoor")
+    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
+    built = rbpf_outdoor.build(
+        **clocks,
+        start=start_outdoor_cloud(particles, first, seed=seed, spread=StartSpread()),
+        sensors=sensors,
+        resample_below=resample_below,
+        scheme=scheme,
+    )
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else pose_errors(result["pose"], truth, settle=settle)
+
+    return Case(built, inputs, score, estimate="pose")
