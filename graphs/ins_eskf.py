@@ -28,7 +28,6 @@ def ins_eskf(
     position_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     attitude_noise: float = 0.01,
-    gravity: tuple[float, float, float] = GRAVITY,
     gate: float | None = None,
     gravity: tuple[float, float, float] = GRAVITY,
 ):

@@ -1,16 +1,18 @@
-"""`lower`: graphs as fixed-size pipelines."""
+"""`lower`: graphs as fixed-size pipelines, and what they cost."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, Data, Name, Seed, Settings, case_of
-from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors
+from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.lowering import lower as lower_graph
+from flowgraph.optimise import PASSES
+from flowgraph.optimise import without as passes_without
 
 
 @app.command()
@@ -22,15 +24,35 @@ def lower(
     settings: Settings = None,
     seed: Seed = 0,
     dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed")] = "float64",
+    report: Annotated[bool, typer.Option("--report", help="Write what it costs, as text and HTML.")] = False,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PASS", help=f"Leave a pass out, repeatable: {', '.join(PASSES)}."),
+    ] = None,
+    multipliers: Annotated[int, typer.Option(min=1, help="Of a lane, for the report.")] = 16,
+    lanes: Annotated[int, typer.Option(min=1, help="Particles at once, for the report.")] = 1,
+    clock: Annotated[float, typer.Option(min=1.0, help="In Hz, for the report.")] = 100e6,
     as_json: AsJson = False,
 ) -> None:
     """Lower a graph to a fixed-size pipeline description."""
+    passes = passes_without(*(without or ()))
     case, _ = case_of(graph, data, settings, seed)
     pipeline = lower_graph(case.graph, dtype=dtype)
     pipeline.save(output)
-    totals = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
+    totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
+    if report:
+        from flowgraph.costs import cost_report
+
+        costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
+        for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):
+            with writing(output / name) as file:
+                file.write_text(text)
+        totals["cost"] = {section.title: list(section.rows) for section in costs.sections}
     if as_json:
         return print_json({**totals, "output": str(output)})
+    cost = totals.pop("cost", None)
     for key, value in totals.items():
         out_console.print(f"{key:<16}{value}", highlight=False)
+    for row in (cost or {}).get("Ticks", ()):
+        out_console.print(", ".join(f"{k} {v}" for k, v in row.items()), highlight=False, markup=False)
     err_console.print(f"wrote {output / 'pipeline.json'} and {output / 'pipeline.txt'}", markup=False)

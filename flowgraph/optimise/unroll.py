@@ -110,20 +110,20 @@ class _Unroller:
             return draft.keep(made)
         spec = draft.specs[value]
         row = spec.shape[-1:] if self.elements.laned(spec) else ()
-        parts = [self._row(self.entry(e), row) for e in entries]
-        whole = parts[0] if draft.specs[parts[0]].shape == spec.shape else self._stacked(parts, spec)
+        parts = [self._row(self.entry(e), row, made) for e in entries]
+        whole = parts[0] if draft.specs[parts[0]].shape == spec.shape else self._stacked(parts, spec, made)
         draft.replace(value, whole)
 
-    def _row(self, entry: int, row: tuple[int, ...]) -> int:
+    def _row(self, entry: int, row: tuple[int, ...], by: Instruction) -> int:
         if self.draft.specs[entry].shape == row:
             return entry
-        return self.draft.emit("broadcast_to", entry, by=self.by, shape=list(row))
+        return self.draft.emit("broadcast_to", entry, by=by, shape=list(row))
 
-    def _stacked(self, parts: list[int], spec: Spec) -> int:
-        whole = self.draft.emit("stack", *parts, by=self.by, axis=0)
+    def _stacked(self, parts: list[int], spec: Spec, by: Instruction) -> int:
+        whole = self.draft.emit("stack", *parts, by=by, axis=0)
         if self.draft.specs[whole].shape == spec.shape:
             return whole
-        return self.draft.emit("reshape", whole, by=self.by, shape=list(spec.shape))
+        return self.draft.emit("reshape", whole, by=by, shape=list(spec.shape))
 
 
 def unroll(program: Program, *, largest: int = LARGEST_WORK) -> Program:

@@ -46,7 +46,8 @@ def test_a_reshape_is_where_its_argument_is():
     program = record(lambda xp, x: xp.reshape(xp.linalg.cholesky(x), (16,)), (4, 4))
     (place,) = set(plan(program).place.values())
     assert place == 0
-    assert len(plan(program).place) == 2
+    (reshape,) = [i for i in program.instructions if i.op == "reshape"]
+    assert plan(program).view == {reshape.out: (reshape.args[0], 0)}
 
 
 def test_the_axis_of_particles_is_innermost():
@@ -71,23 +72,64 @@ def test_no_two_values_share_a_place_at_one_time(name, passes):
     for group in found.loops:
         step[group.start : group.stop] = [group.start] * (group.stop - group.start)
     inside: dict[int, int] = {}  # what is in a place
-    root: dict[int, int] = {}  # the value whose memory another is a view of
     born: dict[int, int] = {}
+
+    def root(value):
+        while value in found.view:
+            value = found.view[value][0]
+        return value
+
     for n, i in enumerate(program.instructions):
         for a in i.args:
-            if a in found.place:
-                assert inside[found.place[a]] == root[a], f"%{a} is gone when %{i.out} needs it"
-        if i.out not in found.place:
+            if root(a) in found.place:
+                assert inside[found.place[root(a)]] == root(a), f"%{a} is gone when %{i.out} needs it"
+        whole = root(i.out)
+        if whole not in found.place or any(i.out in loop.local for loop in found.loops):
             continue
-        place = found.place[i.out]
-        view = i.op in ("reshape", "matrix_transpose") and found.place.get(i.args[0]) == place
-        root[i.out] = root[i.args[0]] if view else i.out
-        if not view:
+        place = found.place[whole]
+        if inside.get(place) != whole:
             assert born.get(place) != step[n], "two values of one loop in one place"
-            inside[place], born[place] = i.out, step[n]
-    for flag, leaves in program.outputs:
-        for v in (*leaves, *([] if flag is None else [flag])):
-            assert v not in found.place or inside[found.place[v]] == root[v]
-    for v in program.writes:
-        assert v not in found.place or inside[found.place[v]] == root[v]
+            inside[place], born[place] = whole, step[n]
+    for v in (*program.writes, *(x for _, leaves in program.outputs for x in leaves)):
+        assert root(v) not in found.place or inside[found.place[root(v)]] == root(v)
     assert found.bytes < 0.8 * plan(program, ()).bytes
+
+
+def test_parts_of_a_stack_are_made_where_it_will_be():
+    def step(xp, x):
+        rows = [xp.cumulative_sum(x[k], axis=0) for k in range(3)]
+        return xp.stack(rows) @ rows[0]
+
+    program = record(step, (3, 50), lanes=(50,))
+    found = plan(program)
+    stack = next(i for i in program.instructions if i.op == "stack")
+    assert [found.view[a] for a in stack.args] == [(stack.out, 50 * k) for k in range(3)]
+    assert {found.view[i.out] for i in program.instructions if i.op == "getitem"} == {
+        (0, 0),
+        (0, 50),
+        (0, 100),
+    }
+    assert [b.size for b in found.buffers] == [150, 3]
+
+
+@pytest.mark.parametrize(
+    ("index", "begin"),
+    [
+        ((1,), 12),
+        ((1, 2), 20),
+        ((slice(1, None),), 12),
+        ((0, slice(1, 3)), 4),
+        ((slice(None), 1), None),
+        ((slice(None), slice(1, 2)), None),
+        ((slice(None, None, -1),), None),
+        ((slice(None, None, 2),), None),
+    ],
+)
+def test_whole_rows_are_views(index, begin):
+    program = record(lambda xp, x: xp.cumulative_sum(x[index], axis=-1), (2, 3, 4))
+    (item,) = [i for i in program.instructions if i.op == "getitem"]
+    assert plan(program).view.get(item.out) == (None if begin is None else (0, begin))
+    if begin is not None:
+        x = np.arange(24.0).reshape(2, 3, 4)
+        part = x.reshape(-1)[begin : begin + int(np.prod(item.spec.shape))].reshape(item.spec.shape)
+        np.testing.assert_array_equal(part, x[index])
