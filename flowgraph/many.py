@@ -208,7 +208,12 @@ def _one_by_one(
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
         result = simulate(
-            graph, _of_run(inputs, n, seed), engine=engine, dtype=dtype, init=_of_run(init, n, seed), seed=seed
+            graph,
+            _of_run(inputs, n, seed),
+            engine=engine,
+            dtype=dtype,
+            init=_of_run(init, n, seed),
+            seed=seed,
         )
         wall, ticks = wall + result.wall_s, result.ticks
         for name in kept:
