@@ -1,4 +1,4 @@
-"""`batch`: studies over flights, seeds and parameters."""
+"""`batch`, `report` and `tune`: studies over flights, seeds and parameters."""
 
 from __future__ import annotations
 
@@ -82,9 +82,49 @@ def batch(
         first = outcome.failed[0]
         where = f"{first['graph']} on {first['data']}, seed {first['seed']}"
         err_console.print(
-            f"{len(outcome.failed)} of {len(outcome.rows)} runs failed; {where}: {first['error']}", markup=False
+            f"{len(outcome.failed)} of {len(outcome.rows)} runs failed; {where}: {first['error']}",
+            markup=False,
         )
         raise typer.Exit(1)
+
+
+@app.command()
+@reports_errors
+def report(
+    folder: Annotated[Path | None, typer.Argument(metavar="[DIR]", help="Of a study's results.")] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="A B", help="Pair the runs of two studies by seed and flight."),
+    ] = None,
+    metric: Annotated[str | None, typer.Option(help="To draw and rank by; the first if left out.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="For a comparison; B if left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write what a study found as an HTML page and pictures, or compare two studies."""
+    from flowgraph.study.report import write_comparison, write_report
+
+    if (folder is None) == (compare is None):
+        raise DeclarationError(
+            "a report is of one study, or of two compared",
+            path="report",
+            expected="DIR, or --compare A B",
+            got="both" if folder is not None else "neither",
+            fix="flowgraph report DIR",
+        )
+    rows: Any
+    if compare is not None:
+        page, rows = write_comparison(*compare, out or compare[1], metric=metric)
+    else:
+        found = write_report(folder or "", metric=metric)
+        page, rows = found.page, found.summary
+    if as_json:
+        return print_json({"page": str(page), "rows": rows})
+    out_console.print(table([{n: _short(v) for n, v in row.items()} for row in rows]))
+    err_console.print(f"wrote {page}", markup=False)
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else value
 
 
 def _executor(name: str, scheduler: str | None, workers: int) -> Any:

@@ -79,7 +79,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
     Each distinct setting of a graph and a flight is prepared once, with seed 0, to describe it.
     """
     watcher = watcher or Watcher()
-    flights = _Flights(many=len(study.seeds) > 1)
+    flights = _Flights(many=len(study.each_seed) > 1)
     total = len(study.data) * sum(1 for g in study.graphs for _ in study.combinations(g))
     runs: list[RunSpec] = []
     programs: list[str] = []
@@ -89,7 +89,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
         for data in study.data:
             for parameters in study.combinations(graph):
                 identity, seeded, described, program = flights.described(graph, data, parameters)
-                watcher.planning(len(runs) // len(study.seeds), total)
+                watcher.planning(len(runs) // len(study.each_seed), total)
                 common = {
                     "graph": [graph, described, code],
                     "data": identity,
@@ -97,7 +97,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
                     "engine": [study.engine, study.dtype, study.chunk if study.engine in MANY else 1],
                     "metrics": study.metrics,
                 }
-                for seed in study.seeds:
+                for seed in study.each_seed:
                     key = keys.run_key({**common, "seed": seed})
                     runs.append(RunSpec(graph, data, seed, parameters, key, seeded))
                     programs.append(program)
@@ -143,7 +143,7 @@ class _Flights:
 def tasks_of(study: Study, planned: Plan, wanted: Iterable[str]) -> list[Task]:
     """Tasks for the wanted keys, in the order of the plan; chunks keep the places that they have in it."""
     missing = set(wanted)
-    how = (study.engine, study.dtype, study.chunk, study.metrics, study.keep)
+    metrics = None if study.metrics is None else tuple(study.metrics)
     chunks: dict[Any, list[RunSpec]] = {}
     counts: dict[Any, int] = {}
     for place, (run, program) in enumerate(zip(planned.runs, planned.programs, strict=True)):
@@ -155,7 +155,10 @@ def tasks_of(study: Study, planned: Plan, wanted: Iterable[str]) -> list[Task]:
             chunk = place
         if run.key in missing:
             chunks.setdefault(chunk, []).append(run)
-    return [Task(f"{k}", tuple(runs), *how) for k, runs in enumerate(chunks.values())]
+    return [
+        Task(f"{k}", tuple(runs), study.engine, study.dtype, study.chunk, metrics, study.keep)
+        for k, runs in enumerate(chunks.values())
+    ]
 
 
 def run_study(
@@ -213,7 +216,8 @@ def run_study(
             rows = _there(study, store, planned, retry)
         kept = len(rows)
         watcher.start(len(planned.runs), list(rows.values()))
-        work = {t.name: t for t in tasks_of(study, planned, (r.key for r in planned.runs if r.key not in rows))}
+        missing = [r.key for r in planned.runs if r.key not in rows]
+        work = {t.name: t for t in tasks_of(study, planned, missing)}
         for task in work.values():
             runner.submit(task.name, run_task, task)
         for finished in runner.as_completed():

@@ -223,6 +223,7 @@ def serve(descriptor: int) -> None:
                 task, function, arguments = connection.recv()
             except (EOFError, OSError):
                 return
+            answer: tuple[str, Any, Exception | None]
             try:
                 answer = (task, function(*arguments), None)
             except Exception as error:
@@ -249,7 +250,7 @@ class OnDask(_Closing):
         _need_workers(workers)
         try:
             import dask
-            import distributed
+            import distributed as found
         except ImportError as error:
             raise MissingDependencyError(
                 "a cluster needs dask.distributed",
@@ -258,6 +259,7 @@ class OnDask(_Closing):
                 got=str(error),
                 fix='pip install "flowgraph-filters[distributed]"',
             ) from None
+        distributed: Any = found  # it has no types of its own
         self._distributed = distributed
         self._cluster: Any = None
         with dask.config.set({"distributed.scheduler.allowed-failures": deaths - 1}):
@@ -277,7 +279,7 @@ class OnDask(_Closing):
                     fix="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
                 ) from None
         self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
-        self._futures: dict[str, str] = {}
+        self._futures: dict[Any, str] = {}
         self._done = distributed.as_completed(loop=self._client.loop)
 
     def pids(self) -> list[int]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.errors import FlowgraphError
-from flowgraph.pipeline import Pipeline
+from flowgraph.pipeline import Pipeline, Port, Register
 from flowgraph.series import Flight, Series
 
 FORMAT = 1
@@ -106,27 +106,36 @@ def structure(pipeline: Pipeline) -> tuple[Any, ...]:
 
     Two pipelines of one structure are one program on different numbers.
     """
-    ports = lambda these: tuple(
-        (p.name, p.present, p.timing, tuple((x.name, x.value, x.shape, x.dtype) for x in p.leaves))
-        for p in these
-    )
-    cells = lambda r: tuple((c.name, c.read, c.write, c.shape, c.dtype) for c in r.cells)
-    fixed = lambda r: tuple(
-        np.asarray(c.reset).tobytes() if r.role in ("join", "stamp") else None for c in r.cells
-    )
     return (
         pipeline.name,
         pipeline.time,
         pipeline.seed,
-        ports(pipeline.inputs),
-        ports(pipeline.outputs),
-        tuple((r.path, r.role, cells(r), fixed(r)) for r in pipeline.registers),
+        _ports(pipeline.inputs),
+        _ports(pipeline.outputs),
+        tuple((r.path, r.role, _cells(r)) for r in pipeline.registers),
         tuple(
             (n, a.shape, a.dtype.str, None if a.dtype.kind == "f" else a.tobytes())
             for n, a in pipeline.constants.items()
         ),
         tuple((i.op, i.args, _plain(i.attrs), i.out) for i in pipeline.instructions),
         tuple((f.register, f.cell) for f in pipeline.faults),
+    )
+
+
+def _ports(ports: tuple[Port, ...]) -> tuple[Any, ...]:
+    """The timing is in it too: events are checked against it."""
+    return tuple(
+        (p.name, p.present, p.timing, tuple((x.name, x.value, x.shape, x.dtype) for x in p.leaves))
+        for p in ports
+    )
+
+
+def _cells(register: Register) -> tuple[Any, ...]:
+    """Its cells; those of joins and stamps with their values at the start, which no run may set."""
+    fixed = register.role in ("join", "stamp")
+    return tuple(
+        (c.name, c.read, c.write, c.shape, c.dtype, np.asarray(c.reset).tobytes() if fixed else None)
+        for c in register.cells
     )
 
 

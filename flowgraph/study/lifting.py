@@ -1,10 +1,10 @@
 """Lifting: the real constants of a lowered graph become registers that never change.
 
-Settings are constants of a pipeline, so each value of a noise would be another program to compile. As registers
-they are initial values, which each run of a batch has of its own: one compilation then serves all seeds and
-all parameters that leave the instructions alone. What remains in the program are shapes, integers and truth
-values. All real constants are lifted, whichever may vary, so that the program, and with it each run's last
-bit, does not depend on what else a study asks for.
+Settings are constants of a pipeline, so each value of a noise would be another program to compile. As
+registers they are initial values, which each run of a batch has of its own: one compilation then serves all
+seeds and all parameters that leave the instructions alone. What remains in the program are shapes, integers
+and truth values. All real constants are lifted, whichever may vary, so that the program, and with it each
+run's last bit, does not depend on what else a study asks for.
 """
 
 from __future__ import annotations

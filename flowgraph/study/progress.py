@@ -60,9 +60,10 @@ class Tally(Watcher):
             self.metric = next((n for n in names if n not in self.study.names()), None)
         value = row.get(self.metric or "")
         best = self.best.get(row["graph"])
-        if isinstance(value, int | float) and math.isfinite(value):
-            if best is None or value < best[self.metric or ""]:
-                self.best[row["graph"]] = row
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            return
+        if best is None or value < best[self.metric or ""]:
+            self.best[row["graph"]] = row
 
     @property
     def rate(self) -> float:
@@ -97,7 +98,8 @@ class Lines(Tally):
             self._console.print(self._line(), markup=False)
 
     def _line(self) -> str:
-        at = f"{self.kept + self.done} of {self.total}, {self.rate:.3g} runs/s, {duration(self.remaining)} left"
+        at = f"{self.kept + self.done} of {self.total}"
+        at += f", {self.rate:.3g} runs/s, {duration(self.remaining)} left"
         return at + (f", {self.failed} failed" if self.failed else "")
 
 
@@ -193,4 +195,6 @@ def duration(seconds: float | None) -> str:
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
-    return f"{whole // 60} min {whole % 60:02d} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -8,11 +8,13 @@ knowing how it was drawn.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -72,7 +74,7 @@ class Study:
     out: str | None = None
 
     def __post_init__(self) -> None:
-        put = lambda name, value: object.__setattr__(self, name, value)
+        put: Callable[[str, Any], None] = functools.partial(object.__setattr__, self)
         put("graphs", _names("graphs", self.graphs))
         put("data", _names("data", self.data))
         put("seeds", _seeds(self.seeds))
@@ -97,7 +99,9 @@ class Study:
     def _check_runs(self) -> None:
         for spec in self.data:
             _one_of("data", spec.partition(":")[0], flight_names(), kind="kind of flight")
-        swept = {name for name, _ in self.parameters.items() if not isinstance(self.parameters[name], Mapping)}
+        swept = {
+            name for name, _ in self.parameters.items() if not isinstance(self.parameters[name], Mapping)
+        }
         for k, point in enumerate(self.points):
             for name in point:
                 if name in swept:
@@ -107,14 +111,16 @@ class Study:
             if prepare is None:
                 raise _wrong("graphs", "graphs that can be prepared for a flight", graph)
             sizes = {n: len(v) for n, v in self._axes(graph).items()}
-            count = math.prod(sizes.values()) * max(len(self.points), 1) * len(self.seeds) * len(self.data)
+            count = math.prod(sizes.values()) * max(len(self.points), 1)
+            count *= len(self.each_seed) * len(self.data)
             if count > MOST_RUNS:
                 raise _wrong("parameters", f"at most {MOST_RUNS} runs a graph", f"{count} of {graph}")
             for spec in self.data:
                 also = flight_settings(spec)
                 for name, values in self._axes(graph).items():
                     for value in values:
-                        parsed_settings(prepare, {name: text(value)}, also=also, path=f"parameters, {graph}")
+                        given = {name: text(value)}
+                        parsed_settings(prepare, given, also=also, path=f"parameters, {graph}")
                 for k, point in enumerate(self.points):
                     given = {n: text(v) for n, v in point.items()}
                     parsed_settings(prepare, given, also=also, path=f"points[{k}], {graph}")
@@ -122,6 +128,11 @@ class Study:
     def _axes(self, graph: str) -> dict[str, tuple[Value, ...]]:
         shared = {n: v for n, v in self.parameters.items() if not isinstance(v, Mapping)}
         return {**shared, **self.parameters.get(graph, {})}
+
+    @property
+    def each_seed(self) -> tuple[int, ...]:
+        """The seeds, one by one."""
+        return typing.cast("tuple[int, ...]", self.seeds)
 
     def combinations(self, graph: str) -> Iterator[dict[str, Value]]:
         """All points at which a graph is run, in a fixed order."""
@@ -183,7 +194,9 @@ class Study:
 
 def text(value: Value) -> str:
     """A value as `--set` writes it; a float to its last bit."""
-    return str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, float) else str(value)
 
 
 def _engines() -> tuple[str, ...]:
@@ -276,7 +289,7 @@ def _axis(key: str, given: Any) -> tuple[Value, ...]:
     if isinstance(given, Mapping):
         if len(given) != 1 or next(iter(given)) not in ("linspace", "logspace"):
             raise _wrong(key, "{linspace = [first, last, count]} or {logspace = ...}", dict(given))
-        (kind, ends), = given.items()
+        ((kind, ends),) = given.items()
         key = f"{key}.{kind}"
         numbers = _listed(key, ends)
         if len(numbers) != 3 or not all(_number(x) for x in numbers) or type(numbers[2]) is not int:

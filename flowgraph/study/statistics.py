@@ -22,7 +22,9 @@ _NAMES = ("graph", "data", "seed", "error", "key", "ticks", "compared_ticks")
 RESAMPLES = 2000
 
 
-def metrics_of(rows: Sequence[Row], parameters: Iterable[str], chosen: Sequence[str] | None = None) -> list[str]:
+def metrics_of(
+    rows: Sequence[Row], parameters: Iterable[str], chosen: Sequence[str] | None = None
+) -> list[str]:
     """The columns that are measures: numbers, and neither names, parameters nor times."""
     other = {*_NAMES, *parameters}
     found = dict.fromkeys(
@@ -50,7 +52,11 @@ def grouped(rows: Sequence[Row], by: Sequence[str]) -> dict[tuple[Any, ...], lis
 
 
 def summarised(
-    rows: Sequence[Row], parameters: Sequence[str], chosen: Sequence[str] | None = None, *, most: int | None = None
+    rows: Sequence[Row],
+    parameters: Sequence[str],
+    chosen: Sequence[str] | None = None,
+    *,
+    most: int | None = None,
 ) -> list[dict[str, Any]]:
     """A row a setting (graph, flight, parameters): how many runs, how many failed, and each metric as
     "median (quartile .. quartile)"; of the first `most` metrics."""
@@ -81,20 +87,24 @@ def quantiles(
             if not len(values):
                 continue
             line = dict(zip(by, setting, strict=True))
-            line.update(metric=name, runs=len(values), failed=sum(r.get("error") is not None for r in members))
+            line.update(
+                metric=name, runs=len(values), failed=sum(r.get("error") is not None for r in members)
+            )
             line.update({f"q{round(100 * q)}": float(np.quantile(values, q)) for q in QUANTILES})
             table.append(line)
     return table
 
 
 def compared(
-    a: Sequence[Row], b: Sequence[Row], metrics: Sequence[str], *, level: float = 0.95, seed: int = 0
-) -> list[dict[str, Any]]:
+    a: Sequence[Row], b: Sequence[Row], metrics: Sequence[str], parameters: Iterable[str] = (), *,
+    level: float = 0.95, seed: int = 0,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Two studies run by run: for each graph of b beside that of a, and each metric, the ratio b / a.
 
     Runs are paired by seed and flight. A graph is compared with the one of its name, or, where each study has
-    only one, with that. Where a pair of seed and flight stands for several runs of a study (a grid of
-    parameters), these are paired by their parameters too.
+    only one, with that. Where a pair of seed and flight stands for several runs of a study (a grid), these
+    are paired by those `parameters` too that take the same values in both; of runs that even then cannot be
+    told apart the median counts.
 
     Returns:
         For each, `pairs`, the `ratio` (the median of the pairs' ratios) and its bootstrap interval `low` to
@@ -104,18 +114,17 @@ def compared(
         DataError: where nothing can be paired.
     """
     table = []
+    by = ["data", "seed"]
+    if any(len({(r["graph"], r["data"], r["seed"]) for r in rows}) < len(rows) for rows in (a, b)):
+        by += [n for n in dict.fromkeys(parameters) if {r.get(n) for r in a} == {r.get(n) for r in b}]
     graphs_a, graphs_b = ({r["graph"]: None for r in rows} for rows in (a, b))
     lone = len(graphs_a) == len(graphs_b) == 1
     for graph in graphs_b:
         other = next(iter(graphs_a)) if lone else graph
-        ours = _by_run([r for r in b if r["graph"] == graph], metrics)
-        theirs = _by_run([r for r in a if r["graph"] == other], metrics)
         for metric in metrics:
-            pairs = [
-                (x[metric], y[metric])
-                for k, y in ours.items()
-                if (x := theirs.get(k)) is not None and _positive(x.get(metric)) and _positive(y.get(metric))
-            ]
+            ours = _by_run([r for r in b if r["graph"] == graph], by, metric)
+            theirs = _by_run([r for r in a if r["graph"] == other], by, metric)
+            pairs = [(theirs[k], y) for k, y in ours.items() if k in theirs]
             if not pairs:
                 continue
             logs = np.log([y / x for x, y in pairs])
@@ -150,18 +159,7 @@ def bootstrap_median(values: np.ndarray, *, level: float, seed: int) -> tuple[fl
     return float(low), float(high)
 
 
-def _by_run(rows: Sequence[Row], metrics: Sequence[str]) -> dict[Any, Row]:
-    """Rows by seed and flight; with the parameters where these two do not tell runs apart."""
-    rows = [r for r in rows if r.get("error") is None]
-    plain = {(r["data"], r["seed"]): r for r in rows}
-    if len(plain) == len(rows):
-        return dict(plain)
-    parameters = [
-        n for n in dict.fromkeys(k for r in rows for k in r)
-        if n not in (*_NAMES, *metrics) and not n.endswith("_s")
-    ]  # fmt: skip
-    return {(r["data"], r["seed"], *((n, r.get(n)) for n in parameters)): r for r in rows}
-
-
-def _positive(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value) and value > 0
+def _by_run(rows: Sequence[Row], by: Sequence[str], metric: str) -> dict[tuple[Any, ...], float]:
+    """The metric of each run, where it is positive, by what tells runs apart."""
+    found = {k: finite_values(members, metric) for k, members in grouped(rows, by).items()}
+    return {k: float(np.median(v)) for k, v in found.items() if len(v) and (v > 0).all()}

@@ -25,6 +25,7 @@ import numpy as np
 from flowgraph.errors import DataError, MissingDependencyError, writes
 from flowgraph.series import Series
 from flowgraph.study.keys import content_digest
+from flowgraph.study.spec import Study
 
 RESULTS, RESOLVED = "results.parquet", "study.json"
 Row = dict[str, Any]
@@ -134,6 +135,15 @@ def read_table(folder: str | Path) -> list[Row]:
             fix="run the study first: flowgraph batch STUDY.toml --out DIR",
         ) from None
     return found
+
+
+def read_study(folder: str | Path) -> Study:
+    """The resolved study of a folder of results.
+
+    Raises:
+        DataError: where there is none.
+    """
+    return Study.load(Path(folder) / RESOLVED)
 
 
 def as_table(rows: Sequence[Row], first: Iterable[str] = ()) -> Any:

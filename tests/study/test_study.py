@@ -58,7 +58,7 @@ def undisturbed(tmp_path_factory):
 
 
 def test_a_row_is_what_a_single_run_gives(undisturbed):
-    study, rows = undisturbed
+    _, rows = undisturbed
     assert len(rows) == 20
     row = next(r for r in rows if r["seed"] == 3 and r["position_noise"] == 0.02)
     flight = load_flight("sim", seed=3, settings={"duration": "1.5", "imu.rate": "50"})
@@ -129,7 +129,9 @@ def test_what_is_not_whole_is_no_result(tmp_path, damage):
 
 
 def test_the_resolved_study_is_itself_a_study(tmp_path):
-    study = small(seeds=2, sample={"count": 3, "parameters": {"gate": {"low": 10, "high": 1000, "scale": "log"}}})
+    study = small(
+        seeds=2, sample={"count": 3, "parameters": {"gate": {"low": 10, "high": 1000, "scale": "log"}}}
+    )
     run_study(study, tmp_path)
     again = Study.load(tmp_path / "study.json")
     assert again == study
@@ -168,10 +170,13 @@ def test_vectorised_runs_are_those_of_one_at_a_time(tmp_path):
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
     pytest.importorskip("jax")
     from flowgraph import xla
+
     tasks._programs.clear()
     compiled = []
     made = xla.Scan.__init__
-    monkeypatch.setattr(xla.Scan, "__init__", lambda self, *a, **k: (compiled.append(1), made(self, *a, **k))[1])
+    monkeypatch.setattr(
+        xla.Scan, "__init__", lambda self, *a, **k: (compiled.append(1), made(self, *a, **k))[1]
+    )
     points = [{"position_noise": 0.001 * k, "gyro_factor": float(k)} for k in range(3, 10)]
     run_study(small(seeds=3, points=points, engine="xla", chunk=4), tmp_path)
     assert len(compiled) == 1
@@ -181,7 +186,9 @@ def test_a_vectorised_run_does_not_depend_on_what_else_is_asked_for(tmp_path):
     pytest.importorskip("jax")
     few = run_study(small(seeds=3, engine="xla", chunk=4), tmp_path / "few")
     many = run_study(small(seeds=9, engine="xla", chunk=4), tmp_path / "many")
-    assert told(few.rows) == told(many.rows[:3]) or {r["key"] for r in few.rows} <= {r["key"] for r in many.rows}
+    assert told(few.rows) == told(many.rows[:3]) or {r["key"] for r in few.rows} <= {
+        r["key"] for r in many.rows
+    }
     by_key = {r["key"]: r for r in told(many.rows)}
     assert all(by_key[r["key"]] == r for r in told(few.rows))
     resumed = run_study(small(seeds=9, engine="xla", chunk=4), tmp_path / "few")
@@ -336,7 +343,11 @@ def test_a_graph_that_the_flight_does_not_suit_is_a_row(tmp_path, engine):
     if engine == "xla":
         pytest.importorskip("jax")
     study = Study(
-        graphs=["orientation_complementary", "ekf"], data=["sim"], seeds=2, engine=engine, parameters={"duration": 1.5}
+        graphs=["orientation_complementary", "ekf"],
+        data=["sim"],
+        seeds=2,
+        engine=engine,
+        parameters={"duration": 1.5},
     )
     done = run_study(study, tmp_path)
     assert [r["graph"] for r in done.failed] == ["orientation_complementary"] * 2
@@ -395,7 +406,7 @@ BAD = [
     ({"sample": {"count": 3, "method": "halton", "parameters": {}}}, "sample.method"),
     ({"sample": {"count": 3, "points": 1}}, "sample.points"),
     ({"sample": {"count": 3, "parameters": {"gate": {"low": 2, "high": 1}}}}, "sample.parameters.gate"),
-    ({"sample": {"count": 3, "parameters": {"gate": {"low": 0, "high": 1, "scale": "log"}}}}, "sample.parameters.gate"),
+    ({"sample": {"count": 3, "parameters": {"gate": {"low": 0, "high": 1, "scale": "log"}}}}, "parameters.gate"),
     ({"points": [{}]}, "points"),
     ({"points": [{"gate": [1, 2]}]}, "points"),
     ({"points": [{"settle": 1.0}], "parameters": {"settle": [0.5]}}, "points"),
@@ -428,22 +439,28 @@ def test_ranges_and_samples_are_spelled_out():
 
 
 def test_a_longer_sobol_sample_starts_with_the_shorter():
-    drawn = lambda n: Study(
-        graphs=["ekf"], data=["sim"], sample={"count": n, "parameters": {"gate": {"low": 0, "high": 1}}}
-    ).points
+    drawn = lambda n: (
+        Study(
+            graphs=["ekf"], data=["sim"], sample={"count": n, "parameters": {"gate": {"low": 0, "high": 1}}}
+        ).points
+    )
     assert drawn(20)[:5] == drawn(5)
 
 
 def test_parameters_of_one_graph_alone():
     study = Study(
-        graphs=["ekf", "ins_eskf"], data=["sim"], parameters={"settle": 1.0, "ekf": {"attitude_noise": [0.01, 0.02]}}
+        graphs=["ekf", "ins_eskf"],
+        data=["sim"],
+        parameters={"settle": 1.0, "ekf": {"attitude_noise": [0.01, 0.02]}},
     )
     assert len(list(study.combinations("ekf"))) == 2
     assert list(study.combinations("ins_eskf")) == [{"settle": 1.0}]
     assert study.names() == ["settle", "attitude_noise"]
 
 
-@pytest.mark.parametrize("text", ["graphs = ", "data = ['sim']", "graphs = ['ekf']\ndata = ['sim']\nseed = 3"])
+@pytest.mark.parametrize(
+    "text", ["graphs = ", "data = ['sim']", "graphs = ['ekf']\ndata = ['sim']\nseed = 3"]
+)
 def test_a_wrong_file_is_an_error(tmp_path, text):
     file = tmp_path / "study.toml"
     file.write_text(text)
