@@ -103,6 +103,11 @@ def run_pipeline(
     return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress, passes)
 
 
+def sources_of(pipeline: Pipeline, inputs: Any) -> tuple[Graph, dict[str, Any]]:
+    """A graph of a pipeline's inputs alone, and recorded events as it takes them."""
+    return _sources(pipeline), _inputs(pipeline, inputs)
+
+
 def _sources(pipeline: Pipeline) -> Graph:
     """A graph of the inputs alone, with their types and timing, so that events are checked as for a graph."""
     nodes = tuple(

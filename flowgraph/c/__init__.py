@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from flowgraph.c.compile import FLAGS, CompileError, build, cache_folder
+from flowgraph.c.harness import write_c, write_events
 from flowgraph.c.source import Source, generate
 
-__all__ = ["FLAGS", "CompileError", "Source", "build", "cache_folder", "generate"]
+__all__ = ["FLAGS", "CompileError", "Source", "build", "cache_folder", "generate", "write_c", "write_events"]

@@ -168,8 +168,9 @@ class Compiled:
                 state[name] = np.asarray(value).reshape(state[name].shape)
         state["fg_seed"] = seed
         done = [0] * len(rows)
-        outputs = [np.zeros(self.chunk + 1, s) for s in self._outputs]  # one more: written, though absent
-        made = np.zeros(self.chunk, np.uint64)
+        most = min(self.chunk, len(time))
+        outputs = [np.zeros(most + 1, s) for s in self._outputs]  # one more: written, though absent
+        made = np.zeros(most, np.uint64)
         out = (ctypes.c_void_p * max(len(outputs), 1))(*(o.ctypes.data for o in outputs))
         time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
         for first in range(0, len(time), self.chunk):

@@ -373,9 +373,65 @@ class Expander:
                 term = self.tape.op("multiply", spec.dtype, p, q)
                 made[index] = self.tape.reduce("sum", term, (inner,))
             return Value(spec, made)
+        if len(a.shape) == len(b.shape) == 2:
+            sparse = self._sparse(spec, a, b)
+            if sparse is not None:
+                return sparse
         out = self.fresh(spec)
         self.tape.macro("matmul", [self.form.stored(a), self.form.stored(b)], out)
         return self.from_view(spec, out)
+
+    def _sparse(self, spec: Spec, a: Value, b: Value) -> Value | None:
+        """A product with a matrix whose places are known and mostly zero: only the others are multiplied.
+
+        Along the other side's free axis there is one loop, in which all that is left of the product is done.
+        """
+        known, free, right = self._mostly_zero(a), b, False
+        if known is None:
+            known, free, right = self._mostly_zero(b), a, True
+        if known is None:
+            return None
+        out, view = self.fresh(spec), self.form.stored(free)
+        if right:
+            known = known.T
+            view = View(view.buffer, view.shape[::-1], view.offset, view.strides[::-1])
+        step, along = (out.strides[1], out.strides[0]) if right else out.strides
+        space = (view.shape[1],)
+        for i, row in enumerate(known):
+            terms = [
+                self.tape.op(
+                    "multiply",
+                    spec.dtype,
+                    node,
+                    self.form.load(view.buffer, view.offset + k * view.strides[0], (view.strides[1],), space),
+                )
+                for k, node in enumerate(row)
+                if not (node.op == "const" and node.extra[0] == 0)
+            ]
+            total = self.balanced("add", spec.dtype, terms or [self.tape.const(0, spec.dtype)])
+            self.tape.store(out.buffer, i * step, (along,), total, space)
+        return self.from_view(spec, out)
+
+    def _mostly_zero(self, x: Value) -> Any:
+        """The elements of a matrix in memory, if all are known and three in five or more are zero."""
+        view = self.form.stored(x)
+        places = [
+            view.offset + i * view.strides[0] + j * view.strides[1]
+            for i in range(x.shape[0])
+            for j in range(x.shape[1])
+        ]
+        if view.buffer.kind == "work":
+            if any(p not in view.buffer.known for p in places):
+                return None
+        elif view.buffer.kind != "const":
+            return None
+        found = [self.tape.load(view.buffer, p, (), ()) for p in places]
+        zeros = sum(n.op == "const" and n.extra[0] == 0 for n in found)
+        if 5 * zeros < 3 * len(found):
+            return None
+        made = np.empty(x.shape, object)
+        made.ravel()[:] = found
+        return made
 
     def _lanes_fit(self, shape: tuple[int, ...], a: Value, b: Value) -> bool:
         """Whether the lanes of both sides are those of the product, at the same axes."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from flowgraph.c.nodes import Node
 from flowgraph.c.syntax import ctype, number
@@ -60,10 +61,18 @@ class Expressions:
     def __init__(self, real: str) -> None:
         self.real = real
         self.helpers: set[str] = set()
+        self.functions: dict[Any, tuple[str, str]] = {}
 
     def helper(self, name: str) -> str:
         self.helpers.add(name)
         return name
+
+    def function(self, key: Any, kind: str, make: Callable[..., str], *views: Any) -> str:
+        """The name of a function for these sizes, written the first time it is asked for."""
+        if key not in self.functions:
+            name = f"fg_{kind}_{len(self.functions)}"
+            self.functions[key] = name, make(name, *views)
+        return self.functions[key][0]
 
     def libm(self, name: str) -> str:
         return name if self.real == "double" else f"{name}f"

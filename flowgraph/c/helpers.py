@@ -220,7 +220,7 @@ static inline {real} fg_remainder({real} a, {real} b) {{
         "fg_cholesky": (
             (),
             f"""/* lower factor in place, of the lower triangle; NaN where the matrix is not positive definite */
-static inline void fg_cholesky({real} *a, int32_t n) {{
+static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
     for (int32_t j = 0; j < n; j++) {{
         {real} d = a[n * j + j];
         for (int32_t k = 0; k < j; k++) d -= a[n * j + k] * a[n * j + k];
@@ -243,7 +243,7 @@ static inline void fg_cholesky({real} *a, int32_t n) {{
         "fg_solve": (
             (),
             f"""/* a x = b in place of b (n rows, m columns), by elimination with row exchange; NaN where a is singular */
-static inline void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
+static FG_INLINE void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
     for (int32_t j = 0; j < n; j++) {{
         int32_t best = j;
         for (int32_t i = j + 1; i < n; i++) {{

@@ -51,73 +51,99 @@ class _Loops:
             self.w.line("}")
 
 
+def _pointer(w: Writer, view: View, batch: Sequence[str]) -> str:
+    """The address of a view's first element in a batch."""
+    view = View(view.buffer, view.shape[:-2], view.offset, view.strides[:-2])
+    return "&" + element(w, view, list(batch))
+
+
+def _index(strides: Sequence[int], names: Sequence[str]) -> str:
+    """An index into a matrix."""
+    terms = [n if s == 1 else f"{s} * {n}" for s, n in zip(strides, names, strict=True) if s]
+    return " + ".join(terms) or "0"
+
+
+def _call(w: Writer, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
+    """Call the function for these sizes and strides, written once in a file; loops over the batch around it."""
+    views = [*m.inputs, m.output]
+    key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
+    name = w.write.function(key, kind, make, *views)
+    with _Loops(w, m.output.shape[:-2]) as batch:
+        w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
+
+
 def _matmul(w: Writer, m: Macro) -> None:
-    a, b = m.inputs
-    out = m.output
-    rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
-    kind = ctype(out.buffer.dtype, w.write.real)
-    zero = number(0, out.buffer.dtype, w.write.real)
-    steps = b.strides[-1] != 1 and columns > 1
-    with _Loops(w, out.shape[:-2]) as batch:
-        w.line("{")
-        w.depth += 1
-        if steps:
-            w.line(f"{kind} right[{inner * columns}];")
-            with _Loops(w, (inner, columns), "k") as (k, j):
-                w.line(f"right[{columns} * {k} + {j}] = {element(w, b, [*batch, k, j])};")
-        with _Loops(w, (rows,), "r") as (i,):
-            w.line(f"{kind} row[{columns}];")
-            with _Loops(w, (columns,), "c") as (j,):
-                w.line(f"row[{j}] = {zero};")
-            with _Loops(w, (inner,), "k") as (k,):
-                w.line(f"const {kind} left = {element(w, a, [*batch, i, k])};")
-                right = f"right[{columns} * {k} + c0]" if steps else element(w, b, [*batch, k, "c0"])
-                with _Loops(w, (columns,), "c"):
-                    w.line(f"row[c0] += left * {right};")
-            with _Loops(w, (columns,), "c") as (j,):
-                w.line(f"{element(w, out, [*batch, i, j])} = row[{j}];")
-        w.depth -= 1
-        w.line("}")
+    type_ = ctype(m.output.buffer.dtype, w.write.real)
+
+    def text(name: str, a: View, b: View, out: View) -> str:
+        rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
+        left = _index(a.strides[-2:], ("i", "k"))
+        right = _index(b.strides[-2:], ("k", "j"))
+        made = _index(out.strides[-2:], ("i", "j"))
+        turned = b.strides[-1] != 1 and columns > 1
+        copy = f"""    {type_} turned[{inner * columns}];
+    for (int32_t k = 0; k < {inner}; k++)
+        for (int32_t j = 0; j < {columns}; j++) turned[{columns} * k + j] = b[{right}];
+"""
+        factor = f"turned[{columns} * k + j]" if turned else f"b[{right}]"
+        return f"""/* ({rows} x {inner}) ({inner} x {columns}) */
+static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b, {type_} *restrict out)
+{{
+{copy if turned else ""}    for (int32_t i = 0; i < {rows}; i++) {{
+        {type_} row[{columns}];
+        for (int32_t j = 0; j < {columns}; j++) row[j] = 0;
+        for (int32_t k = 0; k < {inner}; k++) {{
+            const {type_} left = a[{left}];
+            for (int32_t j = 0; j < {columns}; j++) row[j] += left * {factor};
+        }}
+        for (int32_t j = 0; j < {columns}; j++) out[{made}] = row[j];
+    }}
+}}
+"""
+
+    _call(w, "matmul", m, text, type_)
 
 
 def _cholesky(w: Writer, m: Macro) -> None:
-    (a,), out = m.inputs, m.output
-    n = out.shape[-1]
-    real = w.write.real
-    name = w.write.helper("fg_cholesky")
-    with _Loops(w, out.shape[:-2]) as batch:
-        w.line("{")
-        w.depth += 1
-        w.line(f"{real} factor[{n * n}];")
-        with _Loops(w, (n, n), "r") as (i, j):
-            w.line(f"factor[{n} * {i} + {j}] = {element(w, a, [*batch, i, j])};")
-        w.line(f"{name}(factor, {n});")
-        with _Loops(w, (n, n), "r") as (i, j):
-            w.line(f"{element(w, out, [*batch, i, j])} = factor[{n} * {i} + {j}];")
-        w.depth -= 1
-        w.line("}")
+    real, helper = w.write.real, w.write.helper("fg_cholesky")
+
+    def text(name: str, a: View, out: View) -> str:
+        n = out.shape[-1]
+        return f"""/* lower factor of ({n} x {n}) */
+static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
+{{
+    {real} factor[{n * n}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) factor[{n} * i + j] = j <= i ? a[{_index(a.strides[-2:], "ij")}] : 0;
+    {helper}(factor, {n});
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) out[{_index(out.strides[-2:], "ij")}] = factor[{n} * i + j];
+}}
+"""
+
+    _call(w, "cholesky", m, text)
 
 
 def _solve(w: Writer, m: Macro) -> None:
-    a, b = m.inputs
-    out = m.output
-    n, columns = out.shape[-2:]
-    real = w.write.real
-    name = w.write.helper("fg_solve")
-    with _Loops(w, out.shape[:-2]) as batch:
-        w.line("{")
-        w.depth += 1
-        w.line(f"{real} matrix[{n * n}];")
-        w.line(f"{real} right[{n * columns}];")
-        with _Loops(w, (n, n), "r") as (i, j):
-            w.line(f"matrix[{n} * {i} + {j}] = {element(w, a, [*batch, i, j])};")
-        with _Loops(w, (n, columns), "r") as (i, j):
-            w.line(f"right[{columns} * {i} + {j}] = {element(w, b, [*batch, i, j])};")
-        w.line(f"{name}(matrix, right, {n}, {columns});")
-        with _Loops(w, (n, columns), "r") as (i, j):
-            w.line(f"{element(w, out, [*batch, i, j])} = right[{columns} * {i} + {j}];")
-        w.depth -= 1
-        w.line("}")
+    real, helper = w.write.real, w.write.helper("fg_solve")
+
+    def text(name: str, a: View, b: View, out: View) -> str:
+        n, columns = out.shape[-2:]
+        return f"""/* ({n} x {n}) x = ({n} x {columns}) */
+static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
+{{
+    {real} matrix[{n * n}], right[{n * columns}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{_index(a.strides[-2:], "ij")}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{_index(b.strides[-2:], "ij")}];
+    {helper}(matrix, right, {n}, {columns});
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {columns}; j++) out[{_index(out.strides[-2:], "ij")}] = right[{columns} * i + j];
+}}
+"""
+
+    _call(w, "solve", m, text)
 
 
 def _reduce(w: Writer, m: Macro) -> None:

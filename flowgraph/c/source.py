@@ -151,6 +151,7 @@ class _File:
             "",
             _MACROS,
             helper_text(self.expressions.helpers, self.real),
+            *(text for _, text in self.expressions.functions.values()),
             *(self._constant(name, b) for name, b in self.constants.values()),
             reset,
             *reactions,
@@ -415,8 +416,10 @@ _HOST = {"real": np.float64, "bool": np.bool_}
 
 _MACROS = """#if defined(__GNUC__)
 #define FG_INLINE inline __attribute__((always_inline))
+#define FG_APART __attribute__((noinline))
 #else
 #define FG_INLINE inline
+#define FG_APART
 #endif
 /* with FLOWGRAPH_SIMD (and -fopenmp-simd) loops say that their turns may be done together */
 #ifdef FLOWGRAPH_SIMD

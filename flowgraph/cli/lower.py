@@ -10,9 +10,13 @@ import typer
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, Data, Name, Seed, Settings, case_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
+from flowgraph.errors import UnknownNameError
 from flowgraph.lowering import lower as lower_graph
 from flowgraph.optimise import PASSES
 from flowgraph.optimise import without as passes_without
+
+TARGETS = ("description", "c")
+"""What can be written."""
 
 
 @app.command()
@@ -23,7 +27,13 @@ def lower(
     data: Data = "sim",
     settings: Settings = None,
     seed: Seed = 0,
-    dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed")] = "float64",
+    target: Annotated[
+        str, typer.Option(metavar="TARGET", help="description, or c for C99 too.")
+    ] = "description",
+    dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed.")] = "float64",
+    events: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="For c: write the data as the csv that it replays.")
+    ] = None,
     report: Annotated[bool, typer.Option("--report", help="Write what it costs, as text and HTML.")] = False,
     without: Annotated[
         list[str] | None,
@@ -34,19 +44,31 @@ def lower(
     clock: Annotated[float, typer.Option(min=1.0, help="In Hz, for the report.")] = 100e6,
     as_json: AsJson = False,
 ) -> None:
-    """Lower a graph to a fixed-size pipeline description."""
+    """Lower a graph to a fixed-size pipeline description, or to C as well."""
+    kinds = ("float64", "float32") if target == "c" else ("float64", "float32", "fixed")
+    for what, given, valid in (("target", target, TARGETS), ("dtype", dtype, kinds)):
+        if given not in valid:
+            raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()))
     case, _ = case_of(graph, data, settings, seed)
     pipeline = lower_graph(case.graph, dtype=dtype)
     pipeline.save(output)
+    if target == "c":
+        from flowgraph.c import write_c, write_events
+
+        for file in write_c(pipeline, output, dtype).values():
+            err_console.print(f"wrote {file}", markup=False)
+        if events is not None:
+            ticks = write_events(pipeline, case.inputs, events)
+            err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:
         from flowgraph.costs import cost_report
 
         costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
         for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):
-            with writing(output / name) as file:
-                file.write_text(text)
+            with writing(output / name) as written:
+                written.write_text(text)
         totals["cost"] = {section.title: list(section.rows) for section in costs.sections}
     if as_json:
         return print_json({**totals, "output": str(output)})
