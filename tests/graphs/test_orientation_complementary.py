@@ -129,7 +129,8 @@ def mean_nees(heading: str, **noise: float) -> float:
     for seed in range(5):
         on = load_flight(
             "sim:thesis", seed=seed,
-            settings={"sensors": "gyro,coordinate_acceleration,thrust", "gyro.oversample": "10", "duration": "10"},
+            settings={"sensors": "gyro,coordinate_acceleration,thrust", "gyro.oversample": "10",
+                      "duration": "10"},
         )  # fmt: skip
         case = orientation_complementary.case(on, heading=heading, covariance=True, settle=2.0, **noise)
         found.append(case.score(simulate(case.graph, case.inputs))["nees_mean"])
