@@ -160,7 +160,8 @@ def pose_spread(
 
     with A = -R [f]x dt, the noise n of a position and m of an attitude, and c = (1 - alpha_v) / (time since
     the last pose), 0 at the first. The velocity is corrected with a difference of two poses, so the noise of
-    the last one comes back: d = p + n after the last correction, three numbers more, whose covariance is carried along.
+    the last one comes back: d = p + n after the last correction, three numbers more, whose covariance is
+    carried along.
 
     State: covariance (12, 12) of (p, v, theta, d), the seconds since the last pose, and whether there was
     one. Fires with its main inputs.

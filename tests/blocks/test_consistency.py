@@ -7,8 +7,9 @@ import pytest
 
 from flowgraph import DataError, Series
 from flowgraph.blocks import consistency as c
+from flowgraph.blocks.chi_square import gate_table
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
-from flowgraph.blocks.kalman import KalmanInnovation
+from flowgraph.blocks.kalman import Gaussian, KalmanInnovation, update_linear
 from flowgraph.blocks.point import PointBelief
 from flowgraph.blocks.signals import Innovation, NavigationState
 
@@ -97,3 +98,14 @@ def test_nis_of_an_innovation_that_is_always_whole():
     found = c.nis_summary(Series(np.arange(200), Innovation(r, S, (r**2).sum(-1))))
     assert found["nis_low"] < found["nis_mean"] < found["nis_high"]
     assert found["nis_rejected"] == 0.0
+
+
+@pytest.mark.parametrize("gate", [0.99, 11.345])
+def test_a_gate_is_as_strict_with_a_part_of_a_measurement(gate):
+    """11.345 is what three numbers stay below with a probability of 0.99."""
+    np.testing.assert_allclose(gate_table(gate, 3), [0.0, 6.635, 9.210, 11.345], atol=1e-3)
+    assert (gate_table(1e6, 3)[1:] == 1e6).all()
+    prior = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+    for z, passes in (([3.0, np.nan, np.nan], False), ([2.5, np.nan, np.nan], True), ([3.0, 0.0, 0.0], True)):
+        _, found = update_linear.step(prior, np.array(z), H=np.eye(3), R=np.eye(3), gate=gate, xp=np)
+        assert bool(found.value.accepted if hasattr(found, "value") else found.accepted) is passes

@@ -10,6 +10,7 @@ from flowgraph.blocks import geometry as g
 from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
 from flowgraph.blocks.flights.worlds import SENSORS
 from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.sensors import as_position
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 
@@ -191,3 +192,52 @@ def test_worlds_refuse_bad_numbers(name, value):
     with pytest.raises(DeclarationError, match=f"setting '{name}' is not usable") as caught:
         load("hover", settings={name: value})
     assert f"{name}=" in str(caught.value)
+
+
+def test_an_oversampled_gyroscope_reads_the_turn_since_its_last_reading():
+    """Also where the rate jumps, at 1 s; and the noise is that of the reading, as before."""
+    quiet: dict[str, str | float] = {"gyro.noise": 0.0, "duration": 2.0}
+    flight = load("thesis", seed=1, settings={**quiet, "imu.oversample": 20})
+    assert flight.truth is not None
+    q = flight.truth["attitude"]
+    turn = g.to_rotation_vector(g.multiply(g.conjugate(q[:-1], xp=np), q[1:], xp=np), xp=np)
+    apart = {n: np.abs(load("thesis", seed=1, settings={**quiet, "imu.oversample": n}).streams["imu"].gyro[1:]
+                       - turn * 200.0).max() for n in (1, 20)}  # fmt: skip
+    assert apart[20] < 0.02 < 1.0 < apart[1]
+    noisy = [load("hover", settings={"imu.oversample": n}).streams["imu"].gyro for n in (1, 20)]
+    np.testing.assert_allclose(*noisy, atol=1e-12)
+    with pytest.raises(DeclarationError, match="'imu.oversample' is not usable"):
+        load("hover", settings={"imu.oversample": 1.5})
+
+
+def test_motion_capture_and_optical_flow_have_biases():
+    for sensor, leaf in (("vicon", "position"), ("optical_flow", "displacement")):
+        plain: dict[str, str | float] = {
+            "sensors": sensor,
+            f"{sensor}.noise": 0.0,
+            f"{sensor}.attitude_noise": 0.0,
+        }
+        a, b = (load("hover", settings={**plain, **more}).streams[sensor][leaf]
+                for more in ({}, {f"{sensor}.bias": 1.0}))  # fmt: skip
+        np.testing.assert_allclose(b - a, np.broadcast_to((b - a)[0], b.shape), atol=1e-12)
+        assert np.abs(b - a).max() > 0.1
+        walks = load("hover", settings={**plain, f"{sensor}.attitude_walk": 0.1}).streams[sensor]
+        assert np.ptp(walks["attitude" if sensor == "vicon" else "turn"], axis=0).max() > 0.01
+
+
+def test_a_gps_gives_geodetic_positions_on_request():
+    given: dict[str, str | float] = {"sensors": "gps", "gps.latitude": 0.8, "gps.longitude": -1.2}
+    enu = load("thesis", settings=given).streams["gps"]
+    flight = load("thesis", settings={**given, "gps.geodetic": 1})
+    assert flight.info["gps_origin"] == (0.8, -1.2, 0.0)
+    back = as_position(flight.streams["gps"], flight.info["gps_origin"])
+    np.testing.assert_allclose(back["position"], enu["position"], atol=1e-6)
+    with pytest.raises(DeclarationError, match="'gps.geodetic' is not usable"):
+        load("thesis", settings={"sensors": "gps", "gps.geodetic": 2})
+
+
+def test_a_late_sensor_is_noted_with_how_far_the_body_has_gone():
+    note = load("thesis", settings={"vicon.latency": 0.05}).notes[1]
+    assert "vicon arrives 50.0 ms late" in note
+    assert " m and " in note
+    assert len(load("thesis").notes) == 1
