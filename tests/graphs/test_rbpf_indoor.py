@@ -232,7 +232,7 @@ def test_a_run_goes_on_from_a_saved_state():
 
 def test_a_flight_without_motion_capture_is_refused():
     flight = a_flight()
-    with pytest.raises(DataError, match=r"lacks what rbpf_indoor needs[\s\S]*imu and vicon[\s\S]*got: +imu"):
+    with pytest.raises(DataError, match=r"lacks what rbpf_indoor needs[\s\S]*imu, vicon[\s\S]*got: +imu"):
         rbpf_indoor.case(Flight(flight.name, {"imu": flight.streams["imu"]}, None, flight.info, ()))
 
 
