@@ -1,0 +1,1 @@
+"""Experiments over the graphs of the library, found by name through `flowgraph.benches`."""
