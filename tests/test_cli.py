@@ -416,3 +416,32 @@ def test_an_unknown_bench_is_refused_by_name():
     done = invoke("bench", "nothing")
     assert done.exit_code == 2
     assert "'nothing'" in done.stderr
+
+
+# -- what a lowered graph costs ------------------------------------------------------------------------
+
+
+def test_lower_writes_what_a_graph_costs(tmp_path):
+    done = invoke("lower", "kalman", "--set", "duration=1", "--report", "--json", "-o", str(tmp_path))
+    assert done.exit_code == 0, done.stderr
+    cost = json.loads(done.stdout)["cost"]
+    assert cost["Ticks"][-1]["operations"] == cost["Operations"][-1]["optimised"]
+    assert "cost of kalman" in (tmp_path / "report.txt").read_text()
+    assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
+
+
+def test_lower_leaves_passes_out_by_name(tmp_path):
+    command = ("lower", "kalman", "--set", "duration=1", "--report", "--json", "-o")
+    full = json.loads(invoke(*command, str(tmp_path / "a")).stdout)["cost"]
+    some = invoke(*command, str(tmp_path / "b"), "--without", "structure", "--without", "unroll")
+    fewer = json.loads(some.stdout)["cost"]
+    assert full["Ticks"][0]["operations"] < fewer["Ticks"][0]["operations"]
+    done = invoke(*command, str(tmp_path / "c"), "--without", "everything")
+    assert done.exit_code == 2
+    assert "no pass is called 'everything'" in done.stderr
+    assert not (tmp_path / "c").exists()
+
+
+def test_lower_without_a_report_writes_none(tmp_path):
+    assert invoke("lower", "kalman", "--set", "duration=1", "-o", str(tmp_path)).exit_code == 0
+    assert not (tmp_path / "report.txt").exists()

@@ -26,7 +26,7 @@ KINDS = (
     "integer add",
     "logic",
 )
-"""What is counted. Minimum, maximum and `where` compare; shifts and truth values are logic; the rest moves."""
+"""What is counted. Minimum, maximum and `where` compare, shifts and truth values are logic."""
 
 _FUNCTIONS = """
 exp expm1 log log1p log2 sin cos tan asin acos atan atan2 sinh cosh tanh pow"""

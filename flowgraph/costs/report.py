@@ -295,8 +295,8 @@ def _timing(c: Costs) -> Section:
     return Section(
         "Timing",
         "Latency: operations that wait for one another. The initiation interval is the larger of the two "
-        "lines above it, a lower bound: a multiplier begins a multiplication each cycle, and quotients, roots and "
-        "functions are multiplications as in the energy table.",
+        "lines above it, a lower bound: a multiplier begins a multiplication each cycle, and quotients, "
+        "roots and functions are multiplications as in the energy table.",
         tuple(rows),
     )
 

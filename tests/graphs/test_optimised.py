@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Case, DataError, Result, find_graph, load_flight, lower, simulate
+from flowgraph import (
+    Case,
+    DataError,
+    DeclarationError,
+    Result,
+    UnknownNameError,
+    find_graph,
+    load_flight,
+    lower,
+    simulate,
+    simulate_many,
+)
 from flowgraph.optimise import DEFAULT, PASSES, optimise, without
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import specialise
@@ -112,3 +123,21 @@ def test_a_run_that_sets_a_covariance_otherwise_goes_without_symmetry():
         simulate(case.graph, first, engine="reference", init=init, passes=p)["belief"] for p in ((), DEFAULT)
     ]
     np.testing.assert_allclose(found[0]["covariance"], found[1]["covariance"], rtol=1e-9, atol=1e-12)
+
+
+def test_the_python_engine_has_no_list_to_optimise():
+    case = case_of("kalman")
+    with pytest.raises(DeclarationError, match="the Python engine runs the blocks themselves"):
+        simulate(case.graph, case.inputs, passes=DEFAULT)
+    with pytest.raises(UnknownNameError, match="no pass is called 'magic'"):
+        simulate(case.graph, case.inputs, engine="reference", passes=["magic"])
+
+
+@pytest.mark.parametrize("engine", ["reference", "xla"])
+def test_many_runs_take_passes_too(engine):
+    case = case_of("kalman")
+    pytest.importorskip("jax")
+    runs = simulate_many(case.graph, case.inputs, [0, 1], engine=engine, passes=without("unroll"))
+    for output, series in plain("kalman").series.items():
+        for leaf, values in series.leaves.items():
+            np.testing.assert_allclose(runs[output][leaf][0], values, rtol=1e-9, atol=1e-9)
