@@ -1,4 +1,4 @@
-"""`batch`, `report` and `tune`: studies over flights, seeds and parameters."""
+"""`batch` and `report`: studies over flights, seeds and parameters, and what they found."""
 
 from __future__ import annotations
 

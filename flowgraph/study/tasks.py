@@ -134,24 +134,19 @@ def _flight(run: RunSpec) -> Flight:
 def run_task(task: Task) -> list[Done]:
     """Do the runs of a task; the rows come in their order."""
     found: dict[str, Done] = {}
-    groups: list[tuple[Any, list[_Lane]]] = []
+    lanes: list[_Lane] = []
     for run in task.runs:
         try:
             lane = _ready(run)
-            if task.engine not in MANY:
-                found[run.key] = _alone(task, lane)
-                continue
-            program, ticks = structure(lower(lane.case.graph)), _ticks(lane.case)
-            for (other, when), lanes in groups:
-                if other == program and _same(when, ticks):
-                    lanes.append(lane)
-                    break
+            if task.engine in MANY:
+                lower(lane.case.graph)  # here, where its error is that of one run
+                lanes.append(lane)
             else:
-                groups.append(((program, ticks), [lane]))
+                found[run.key] = _alone(task, lane)
         except Exception as error:
             found[run.key] = _failed(run, error)
-    for (program, _), lanes in groups:
-        found.update({d.key: d for d in _together(task, program, lanes)})
+    for program, places in grouped([lane.case for lane in lanes]):
+        found.update({d.key: d for d in _together(task, program, [lanes[k] for k in places])})
     return [found[run.key] for run in task.runs]
 
 
@@ -192,15 +187,9 @@ def _program(name: str, program: Any, graph: Graph) -> Graph:
 def _together(task: Task, program: Any, lanes: list[_Lane]) -> list[Done]:
     try:
         start = perf_counter()
-        graph = _program(task.runs[0].graph, program, lanes[0].case.graph)
-        batch = simulate_many(
-            graph,
-            [_streams(lane.case, graph) for lane in lanes],
-            [lane.run.seed for lane in lanes],
-            engine=task.engine,
-            dtype=task.dtype,
-            init=[start_of(lane.case.graph) for lane in lanes],
-            runs_at_once=task.chunk,
+        cases, seeds = [lane.case for lane in lanes], [lane.run.seed for lane in lanes]
+        results = simulate_together(
+            cases, seeds, program=program, engine=task.engine, dtype=task.dtype, chunk=task.chunk
         )
         share = (perf_counter() - start) / len(lanes)
     except Exception as error:
@@ -208,13 +197,44 @@ def _together(task: Task, program: Any, lanes: list[_Lane]) -> list[Done]:
             return [_failed(lanes[0].run, error)]
         return [done for lane in lanes for done in _together(task, program, [lane])]
     found = []
-    for k, lane in enumerate(lanes):
+    for lane, result in zip(lanes, results, strict=True):
         lane.times["run_s"] = share
         try:
-            found.append(_scored(task, lane, _result(lane.case.graph, batch, k)))
+            found.append(_scored(task, lane, result))
         except Exception as error:
             found.append(_failed(lane.run, error))
     return found
+
+
+def simulate_together(
+    cases: Sequence[Case], seeds: Sequence[int], *, program: Any, engine: str, dtype: str, chunk: int
+) -> list[Result]:
+    """Cases of one program and one set of ticks (see `grouped`) in one vectorised call."""
+    graph = _program(cases[0].graph.name, program, cases[0].graph)
+    batch = simulate_many(
+        graph,
+        [_streams(case, graph) for case in cases],
+        seeds,
+        engine=engine,
+        dtype=dtype,
+        init=[start_of(case.graph) for case in cases],
+        runs_at_once=chunk,
+    )
+    return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
+
+
+def grouped(cases: Sequence[Case]) -> list[tuple[Any, list[int]]]:
+    """The places of cases that can go together, with the program that they share."""
+    groups: list[tuple[Any, list[np.ndarray], list[int]]] = []
+    for k, case in enumerate(cases):
+        program, ticks = structure(lower(case.graph)), _ticks(case)
+        for other, when, places in groups:
+            if other == program and _same(when, ticks):
+                places.append(k)
+                break
+        else:
+            groups.append((program, ticks, [k]))
+    return [(program, places) for program, _, places in groups]
 
 
 def _streams(case: Case, graph: Graph) -> dict[str, Any]:

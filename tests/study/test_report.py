@@ -1,0 +1,136 @@
+"""Reports: what is in the page, and how two studies are compared."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowgraph import DataError, UnknownNameError
+from flowgraph.cli import app
+from flowgraph.study import Study, run_study
+from flowgraph.study.report import write_comparison, write_report
+from flowgraph.study.statistics import compared, quantiles, summarised
+
+pytest.importorskip("pyarrow")
+FLIGHT = {"duration": 1.5, "imu.rate": 50}
+
+
+def invoke(*arguments):
+    return CliRunner(env={"COLUMNS": "300", "NO_COLOR": "1"}).invoke(app, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    target = tmp_path_factory.mktemp("study")
+    study = Study(
+        graphs=["ekf", "ins_eskf", "orientation_complementary"], data=["sim"], seeds=3, keep=True,
+        parameters=FLIGHT | {"ekf": {"position_noise": [0.005, 0.01, 0.05]}},
+    )  # fmt: skip
+    run_study(study, target)
+    return target
+
+
+def test_the_page_holds_all_and_needs_nothing_else(folder):
+    found = write_report(folder)
+    page = found.page.read_text()
+    for part in ("Summary by setting", "Worst runs by position_rmse_m", "Failed runs (3)", "ins_eskf"):
+        assert part in page
+    assert "<script" not in page
+    assert not re.findall(r'(?:src|href)="https?:', page)
+    assert page.count('src="data:image/png;base64,') == 2
+    assert [f.name for f in found.figures] == ["boxes.png", "against-position-noise.png"]
+    assert all(f.read_bytes().startswith(b"\x89PNG") for f in found.figures)
+
+
+def test_the_worst_runs_are_linked_and_can_be_run_again(folder):
+    page = write_report(folder, metric="tilt_rmse_deg").page.read_text()
+    assert "Worst runs by tilt_rmse_deg" in page
+    links = re.findall(r'href="(trajectories/[0-9a-f]+\.npz)"', page)
+    assert len(links) == 10
+    assert all((folder / link).exists() for link in links)
+    command = re.search(r"<code>flowgraph (run [^<]*)</code>", page)[1].replace("&#x27;", "'").split()
+    done = invoke(*command, "--json")
+    assert done.exit_code == 0
+    assert f"{json.loads(done.stdout)['tilt_rmse_deg']:.4g}" in page
+
+
+def test_the_summary_is_by_setting(folder):
+    rows = write_report(folder).summary
+    mine = [r for r in rows if r["graph"] == "ekf" and r["metric"] == "position_rmse_m"]
+    assert [r["position_noise"] for r in mine] == [0.005, 0.01, 0.05]
+    assert all(r["runs"] == 3 and r["q25"] <= r["q50"] <= r["q75"] for r in mine)
+
+
+def test_the_commands(folder, tmp_path):
+    done = invoke("report", folder)
+    assert done.exit_code == 0
+    assert "position_rmse_m" in done.stdout
+    assert json.loads(invoke("report", folder, "--json").stdout)["rows"]
+    assert invoke("report").exit_code == 2
+    assert invoke("report", folder, "--metric", "speed").exit_code == 2
+    assert invoke("report", tmp_path).exit_code == 1
+    both = invoke("report", "--compare", folder, folder, "--out", tmp_path, "--json")
+    assert all(r["ratio"] == 1.0 for r in json.loads(both.stdout)["rows"])
+    assert (tmp_path / "comparison.html").exists()
+
+
+def run(graph, seed, error, **more):
+    return {"graph": graph, "data": "sim", "seed": seed, "error": None, "e": error, **more}
+
+
+def test_pairs_are_by_seed_and_flight():
+    draw = np.random.default_rng(1)
+    hard = np.exp(draw.normal(size=60))  # how hard a flight is spreads far more than the filters differ
+    a = [run("x", k, h) for k, h in enumerate(hard)]
+    b = [run("x", k, 0.9 * h * np.exp(0.05 * draw.normal())) for k, h in enumerate(hard)][::-1]
+    (line,) = compared(a, b, ["e"])
+    assert line["pairs"] == 60
+    assert 0.87 < line["low"] < line["ratio"] < line["high"] < 0.93
+    assert line["better"] > 0.9
+
+
+def test_the_interval_covers_the_truth_as_often_as_it_says():
+    draw = np.random.default_rng(2)
+    inside = 0
+    for _ in range(100):
+        a = [run("x", k, 1.0) for k in range(40)]
+        b = [run("x", k, float(np.exp(0.2 * draw.normal()))) for k in range(40)]
+        (line,) = compared(a, b, ["e"])
+        inside += line["low"] <= 1.0 <= line["high"]
+    assert 88 <= inside <= 100
+
+
+def test_grids_are_paired_by_what_both_have():
+    a = [run("x", s, 1.0 + p, p=p) for s in range(3) for p in (1, 2)]
+    b = [run("x", s, 2.0 * (1.0 + p), p=p, q=7) for s in range(3) for p in (1, 2)]
+    (line,) = compared(a, b, ["e"], ["p", "q"])
+    assert (line["pairs"], line["ratio"]) == (6, pytest.approx(2.0))
+
+
+def test_two_filters_that_are_alone_are_compared():
+    (line,) = compared([run("x", 1, 2.0)], [run("y", 1, 1.0)], ["e"])
+    assert (line["graph"], line["ratio"]) == ("y / x", 0.5)
+    failed = {**run("y", 1, 1.0), "error": "no"}
+    with pytest.raises(DataError, match="no runs in common"):
+        compared([run("x", 1, 2.0)], [failed], ["e"])
+
+
+def test_failures_count_and_values_that_are_none_do_not():
+    rows = [run("x", 0, 1.0), run("x", 1, 3.0), {**run("x", 2, 9.0), "error": "no"}]
+    (line,) = quantiles(rows, [])
+    assert (line["q50"], line["runs"], line["failed"]) == (2.0, 2, 1)
+    (short,) = summarised(rows, [])
+    assert (short["runs"], short["failed"], short["e"]) == (3, 1, "2 (1.5 .. 2.5)")
+
+
+def test_unknown_names_and_missing_results_are_errors(folder, tmp_path):
+    with pytest.raises(UnknownNameError, match="speed"):
+        write_report(folder, metric="speed")
+    with pytest.raises(UnknownNameError, match="speed"):
+        write_comparison(folder, folder, tmp_path, metric="speed")
+    with pytest.raises(DataError):
+        write_comparison(folder, tmp_path, tmp_path)

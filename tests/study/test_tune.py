@@ -1,0 +1,145 @@
+"""Tuning: it finds what was put in, judges by what was held out, and refuses what cannot be."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowgraph import DataError, DeclarationError, UnknownNameError, find_graph, load_flight, simulate
+from flowgraph.cli import app
+from flowgraph.study.tune import Fit, Recording, surprise, tune
+
+PERFECT = {
+    "gyro.walk": 0.0, "accelerometer.walk": 0.0, "gyro.bias": 0.0, "accelerometer.bias": 0.0,
+    "duration": 4.0, "imu.rate": 25.0, "vicon.rate": 25.0,
+}  # fmt: skip
+"""A flight without biases, which `ekf` does not know."""
+
+NOISES = [Fit("position_noise", 1e-3, 0.1, 0.05), Fit("attitude_noise", 1e-3, 0.1, 0.002)]
+
+
+def test_likelihood_finds_the_true_noise_of_the_measurement():
+    found = tune(
+        "ekf", NOISES, [Recording("sim", 0), Recording("sim", 1)], [Recording("sim", 2)], most=60,
+        settings={**PERFECT, "position.noise": 0.02, "attitude.noise": 0.005},
+    )  # fmt: skip
+    assert found.parameters["position_noise"] == pytest.approx(0.02, rel=0.2)
+    assert found.parameters["attitude_noise"] == pytest.approx(0.005, rel=0.2)
+    assert found.converged
+    assert found.at_bound == ()
+    assert [j.held_out for j in found.judged] == [False, False, True]
+    before, after = found.mean(held_out=False)
+    assert after <= before + 1e-9  # before are the true values, which the fit can only beat on its own data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_likelihood_finds_all_noises_of_a_longer_flight(factor):
+    pytest.importorskip("jax")
+    fits = [*NOISES, Fit("gyro_factor", 0.1, 30.0), Fit("accelerometer_factor", 0.1, 30.0)]
+    truth = {"gyro.noise": 1e-3 * factor, "accelerometer.noise": 1e-2 * factor}
+    settings = {**PERFECT, **truth, "duration": 10.0, "imu.rate": 100.0, "vicon.rate": 10.0}
+    found = tune("ekf", fits, [Recording("sim", k) for k in range(4)], settings=settings, engine="xla")
+    wanted = {"position_noise": 0.01, "attitude_noise": 0.01, "gyro_factor": 1.0, "accelerometer_factor": 1.0}
+    for name, value in wanted.items():  # the factors are on the flight's own densities
+        assert found.parameters[name] == pytest.approx(value, rel=0.2), name
+
+
+def test_error_against_the_truth_gets_smaller_on_what_is_held_out():
+    found = tune(
+        "ekf", [Fit("position_noise", 1e-3, 1.0, 0.5)], [Recording("sim", 0)], [Recording("sim", 1)],
+        measure="error", metric="position_rmse_m", settings={**PERFECT, "attitude_noise": 0.01}, most=25,
+    )  # fmt: skip
+    assert found.metric == "position_rmse_m"
+    assert found.parameters["position_noise"] < 0.1
+    judged = found.judged[1]
+    assert judged.held_out
+    assert judged.after == pytest.approx(math.log(judged.metrics["position_rmse_m"][1]))
+    start = tune(
+        "ekf", [Fit("position_noise", 1e-3, 1.0, 0.5)], [Recording("sim", 0)], [Recording("sim", 1)],
+        measure="error", settings={**PERFECT, "attitude_noise": 0.01}, most=1,
+    )  # fmt: skip
+    assert judged.after < start.judged[1].after
+
+
+def test_surprise_is_the_negative_logarithm_of_the_density():
+    from scipy.stats import multivariate_normal
+
+    settings = {n: str(v) for n, v in PERFECT.items()}
+    case = find_graph("ekf").case(load_flight("sim", seed=3, settings=settings))
+    result = simulate(case.graph, case.inputs, engine="reference", seed=3)
+    seen = result["innovation"]
+    wanted = [
+        -multivariate_normal.logpdf(r, np.zeros(6), S)
+        for r, S in zip(seen.residual, seen.covariance, strict=True)
+    ]
+    assert surprise(result) == pytest.approx(np.sum(wanted) / (6 * len(wanted)), rel=1e-9)
+
+
+def test_vectorised_evaluation_is_that_of_one_at_a_time():
+    pytest.importorskip("jax")
+    how = {"settings": PERFECT, "most": 1}
+    fits, flights = [Fit("position_noise", 1e-3, 0.1)], [Recording("sim", 0), Recording("sim", 1)]
+    one = tune("ekf", fits, flights, **how)
+    many = tune("ekf", fits, flights, engine="xla", **how)
+    for a, b in zip(one.judged, many.judged, strict=True):
+        assert a.before == pytest.approx(b.before, abs=1e-8)
+
+
+def test_a_parameter_that_ends_at_its_bound_is_said():
+    found = tune("ekf", [Fit("position_noise", 0.1, 0.5)], [Recording("sim")], settings=PERFECT, most=15)
+    assert found.at_bound == ("position_noise",)
+
+
+BAD = [
+    ({"fits": []}, "fit"),
+    ({"recordings": []}, "data"),
+    ({"held_out": [Recording("sim")]}, "held-out"),
+    ({"fits": [Fit("position_noise", 0.1, 0.01)]}, "low"),
+    ({"fits": [Fit("position_noise", 0.0, 0.01)]}, "low"),
+    ({"fits": [Fit("position_noise", 0.01, 0.1, 0.2)]}, "start"),
+    ({"fits": [Fit("position_noise", 0.01, 0.1)] * 2}, "once"),
+    ({"fits": [Fit("duration", 1.0, 2.0)]}, "flight"),
+    ({"fits": [Fit("noize", 1.0, 2.0)]}, "noize"),
+    ({"settings": {"position_noise": 0.1}}, "once"),
+    ({"measure": "guess"}, "guess"),
+    ({"method": "guess"}, "guess"),
+    ({"engine": "guess"}, "guess"),
+    ({"most": 0}, "most"),
+    ({"measure": "error", "metric": "speed"}, "position_rmse_m"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "said"), BAD, ids=[str(k) for k in range(len(BAD))])
+def test_what_cannot_be_tuned_is_refused(wrong, said):
+    how = {"fits": NOISES[:1], "recordings": [Recording("sim")], "settings": {"imu.rate": 50}, **wrong}
+    with pytest.raises((DataError, DeclarationError, UnknownNameError)) as caught:
+        tune("ekf", how.pop("fits"), how.pop("recordings"), how.pop("held_out", ()), **how)
+    assert said in str(caught.value)
+    assert caught.value.fix
+
+
+def test_a_graph_without_innovations_is_refused():
+    with pytest.raises(DataError, match="no innovations"):
+        tune(
+            "rbpf_indoor", [Fit("position_noise", 0.01, 0.1)], [Recording("sim")],
+            settings={"duration": 1.2, "particles": 5}, most=1,
+        )  # fmt: skip
+
+
+def test_the_command_prints_what_it_found(tmp_path):
+    words = ["tune", "ekf", "--data", "sim", "--held-out-seeds", "1", "--fit", "position_noise=0.001:0.1"]
+    words += [w for n, v in PERFECT.items() for w in ("--set", f"{n}={v}")]
+    runner = CliRunner(env={"COLUMNS": "200"})
+    done = runner.invoke(app, [*words, "--most", "9", "--json", "--out", str(tmp_path / "found.json")])
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert 0.001 < found["parameters"]["position_noise"] < 0.1
+    assert [r["held_out"] for r in found["recordings"]] == [False, True]
+    plain = runner.invoke(app, [*words, "--most", "3"])
+    assert "--set position_noise=" in plain.output
+    assert runner.invoke(app, [*words[:-2], "--fit", "x"]).exit_code == 2
