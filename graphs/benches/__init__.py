@@ -1,0 +1,1 @@
+"""Experiments: each a function of keyword settings that returns a `Report`, found by `flowgraph bench`."""
