@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
@@ -30,7 +31,7 @@ def read_mat(file: Path, *names: str) -> dict[str, Any]:
         )
     try:
         content = loadmat(str(file), simplify_cells=True)
-    except (NotImplementedError, ValueError, TypeError, OSError, KeyError) as error:
+    except (MatReadError, NotImplementedError, ValueError, TypeError, OSError, KeyError) as error:
         raise DataError(
             "this cannot be read as a MATLAB file",
             path=str(file),

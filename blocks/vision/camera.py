@@ -20,6 +20,7 @@ from flowgraph.errors import DeclarationError
 __all__ = ["COURSE_CAMERA", "COURSE_MOUNT", "Camera", "Mount"]
 
 MOST_PASSES = 100
+MOST_SLOPE = 4.0  # what no lens of this model sees; a pixel that none maps to would run away
 CLOSE = 1e-14  # of normalised image coordinates, 1e-11 px
 
 
@@ -85,7 +86,7 @@ class Camera:
         ideal = seen
         for _ in range(MOST_PASSES):
             step = seen - self.distort(ideal)
-            ideal = ideal + step
+            ideal = np.clip(ideal + step, -MOST_SLOPE, MOST_SLOPE)
             if not np.abs(step).max(initial=0.0) > CLOSE:
                 break
         return ideal
