@@ -7,9 +7,14 @@ draws, outputs). It is made when a block is wired, which is also how output type
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from flowgraph.block import Block, Port, When
 from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
@@ -80,6 +85,43 @@ class SymbolicDraw:
         return self.sites[found]
 
 
+@contextmanager
+def remembering(memory: OrderedDict[Any, Any]) -> Iterator[None]:
+    """Within it, a step recorded before with the same settings and types is not recorded again.
+
+    For those who build the same graph many times over. Only steps whose settings are plain values, arrays
+    and dataclasses of these are remembered; the oldest are forgotten beyond a few hundred.
+    """
+    token = _memory.set(memory)
+    try:
+        yield
+    finally:
+        _memory.reset(token)
+
+
+_memory: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("recorded steps", default=None)
+_REMEMBERED = 512
+
+
+class _NotPlainError(Exception):
+    """A setting whose value cannot be told from another's."""
+
+
+def _fingerprint(value: Any) -> Any:
+    """What tells plain values apart, to the last bit."""
+    if value is None or isinstance(value, bool | int | str):
+        return type(value), value
+    if isinstance(value, float):
+        return float, value.hex()
+    if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
+        return np.ndarray, value.dtype.str, value.shape, value.tobytes()
+    if type(value) in (tuple, list):
+        return type(value), *map(_fingerprint, value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value), *(_fingerprint(getattr(value, f.name)) for f in fields(value))
+    raise _NotPlainError
+
+
 def record(
     block: Block[Any],
     types: Sequence[Type | None],
@@ -93,6 +135,31 @@ def record(
     Raises:
         LoweringError: where it does something a pipeline cannot hold; names the line.
     """
+    memory = _memory.get()
+    if memory is None:
+        return _record(block, types, settings, state, path, draws)
+    try:
+        plain = tuple((n, _fingerprint(v)) for n, v in settings.items())
+    except _NotPlainError:
+        return _record(block, types, settings, state, path, draws)
+    which = (id(block), tuple(types), plain, state, path, draws)
+    if which not in memory:
+        memory[which] = block, _record(block, types, settings, state, path, draws)  # id is of what is alive
+        while len(memory) > _REMEMBERED:
+            memory.popitem(last=False)
+    memory.move_to_end(which)
+    found: StepTrace = memory[which][1]
+    return found
+
+
+def _record(
+    block: Block[Any],
+    types: Sequence[Type | None],
+    settings: Mapping[str, Any],
+    state: Type | None,
+    path: str,
+    draws: str,
+) -> StepTrace:
     trace = Trace()
 
     def symbolic(type_: Type) -> tuple[Any, tuple[int, ...]]:

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.graph import Graph, RegisterNode
+from flowgraph.graph import CallNode, Graph, RegisterNode
 from flowgraph.lowering import lower
-from flowgraph.pipeline import Cell, Register
+from flowgraph.pipeline import Cell, Pipeline, Register
 from flowgraph.state import join_states
-from flowgraph.types import ArrayType
+from flowgraph.types import ArrayType, flatten
 
 _PREFIX = "constants/"
 
@@ -53,6 +53,50 @@ def start_of(graph: Graph) -> dict[str, Any]:
         if node.role != "stamp" and index not in joins
     }
     found.update({f"{_PREFIX}{n}": a for n, a in _real(lower(graph).constants).items()})
+    return found
+
+
+class Lowered:
+    """Pipelines of graphs that were lowered before, but for where their registers start.
+
+    Graphs that are built alike for one flight after another, out of steps that are remembered (see
+    `recording.remembering`), need lowering only once.
+    """
+
+    def __init__(self, most: int = 8) -> None:
+        self._most = most
+        self._known: list[tuple[Any, Graph]] = []
+
+    def lower(self, graph: Graph) -> Pipeline:
+        """The pipeline of a graph, kept with it; its registers may start as another graph's do."""
+        if "pipeline" not in graph.plans:
+            skeleton = _skeleton(graph)
+            for other, known in self._known:
+                if other == skeleton:
+                    graph.plans["pipeline"] = known.plans["pipeline"]
+                    break
+            else:
+                lower(graph)
+                self._known = [*self._known[1 - self._most :], (skeleton, graph)]
+        found: Pipeline = graph.plans["pipeline"]
+        return found
+
+
+def _skeleton(graph: Graph) -> list[Any]:
+    """All that lowering sees of a graph but initial values; a recorded step counts as itself."""
+    joins = join_states(graph)
+    found: list[Any] = [graph.name, graph.order, graph.collected]
+    for index, node in enumerate(graph.nodes):
+        if isinstance(node, CallNode):
+            steps = tuple((choice, id(step)) for choice, step in node.variants.items())
+            wired = (node.arguments, node.firing, node.outputs, node.dynamic, node.state, node.stamp)
+            found.append((node.path, id(node.block), steps, wired, node.draws))
+        elif isinstance(node, RegisterNode):
+            fixed = index in joins or node.role == "stamp"
+            start = [np.asarray(x).tobytes() for x in flatten(node.initial, node.type)] if fixed else None
+            found.append((node.path, node.role, node.type, node.feed, start))
+        else:
+            found.append((node.path, node.type, node.clock, node.clock.timing))
     return found
 
 

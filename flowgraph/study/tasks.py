@@ -19,14 +19,14 @@ import numpy as np
 
 from flowgraph.errors import DataError, FlowgraphError
 from flowgraph.graph import Graph
-from flowgraph.lowering import lower
 from flowgraph.many import Batch, simulate_many
+from flowgraph.recording import remembering
 from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.result import Result
 from flowgraph.series import Flight, Series
 from flowgraph.simulate import simulate
 from flowgraph.study.keys import structure
-from flowgraph.study.lifting import lifted, start_of
+from flowgraph.study.lifting import Lowered, lifted, start_of
 from flowgraph.study.spec import Value, text
 from flowgraph.study.store import pack_trajectory
 from flowgraph.types import unflatten
@@ -115,6 +115,8 @@ def flight_part(data: str, parameters: Mapping[str, Value]) -> dict[str, Value]:
 
 
 _flights: OrderedDict[Any, Flight] = OrderedDict()
+_steps: OrderedDict[Any, Any] = OrderedDict()
+_lowered = Lowered()
 
 
 def _flight(run: RunSpec) -> Flight:
@@ -139,7 +141,7 @@ def run_task(task: Task) -> list[Done]:
         try:
             lane = _ready(run)
             if task.engine in MANY:
-                lower(lane.case.graph)  # here, where its error is that of one run
+                _lowered.lower(lane.case.graph)  # here, where its error is that of one run
                 lanes.append(lane)
             else:
                 found[run.key] = _alone(task, lane)
@@ -154,7 +156,8 @@ def _ready(run: RunSpec) -> _Lane:
     start = perf_counter()
     flight = _flight(run)
     loaded = perf_counter()
-    case, _ = prepared(run.graph, run.data, run.seed, run.parameters, flight)
+    with remembering(_steps):
+        case, _ = prepared(run.graph, run.data, run.seed, run.parameters, flight)
     return _Lane(run, case, {"load_s": loaded - start, "setup_s": perf_counter() - loaded})
 
 
@@ -227,7 +230,10 @@ def grouped(cases: Sequence[Case]) -> list[tuple[Any, list[int]]]:
     """The places of cases that can go together, with the program that they share."""
     groups: list[tuple[Any, list[np.ndarray], list[int]]] = []
     for k, case in enumerate(cases):
-        program, ticks = structure(lower(case.graph)), _ticks(case)
+        pipeline = _lowered.lower(case.graph)
+        program = pipeline.__dict__.setdefault("_structure", None) or structure(pipeline)
+        pipeline.__dict__["_structure"] = program
+        ticks = _ticks(case)
         for other, when, places in groups:
             if other == program and _same(when, ticks):
                 places.append(k)

@@ -18,6 +18,7 @@ the search; before and after are given for both.
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.recording import remembering
 from flowgraph.registry import Case, find_graph, parsed_settings
 from flowgraph.result import Result
 from flowgraph.series import Flight
@@ -197,6 +199,7 @@ class _Problem:
         self.graph, self.recordings, self.settings = graph, recordings, settings
         self.measure, self.metric, self.engine = measure, metric, engine
         self._flights: list[Flight] = []
+        self._steps: OrderedDict[Any, Any] = OrderedDict()
         for one in recordings:
             _, flight = prepared(graph, one.data, one.seed, settings)
             self._flights.append(flight)
@@ -204,7 +207,8 @@ class _Problem:
     def _case(self, place: int, point: Mapping[str, float]) -> Case:
         one = self.recordings[place]
         flight = self._flights[place]
-        return prepared(self.graph, one.data, one.seed, {**self.settings, **point}, flight)[0]
+        with remembering(self._steps):  # only the blocks whose settings move are recorded anew
+            return prepared(self.graph, one.data, one.seed, {**self.settings, **point}, flight)[0]
 
     def _results(self, cases: Sequence[Case], places: Sequence[int]) -> list[Result | Exception]:
         """A result a case; of one that raises, what it raises."""
