@@ -52,7 +52,12 @@ def tag_pose(
 
 @tag_pose.on_flight
 def for_flight(
-    flight: Flight, *, tags: str = "all", pixel_noise: float = 0.5, least: int = 1, settle: float = 0.0
+    flight: Flight,
+    *,
+    tags: str = "all",
+    pixel_noise: float | None = None,
+    least: int = 1,
+    settle: float = 0.0,
 ) -> Case:
     """Find the poses of a flight with a camera.
 
@@ -60,7 +65,7 @@ def for_flight(
         flight: with the stream `tags`; its info has `camera` and `mount`, and a `tag_map` or the `tag_side` of
             tags, of which a map is made first, from all of them.
         tags: all, even or odd: the ids that are used.
-        pixel_noise: standard deviation of a corner's coordinate, px.
+        pixel_noise: standard deviation of a corner's coordinate, px; the flight's, or 0.5, if left out.
         least: how many tags there must be.
         settle: seconds at the start that the errors leave out.
 
@@ -79,7 +84,7 @@ def for_flight(
         tag_map = tag_map.only(tag_map.ids[tag_map.ids % 2 == (tags == "odd")].tolist())
     built = tag_pose.build(
         sizes={"tags": inputs["tags"]["ids"].shape[1]}, **clocks_of(inputs), tag_map=tag_map, camera=flight.info["camera"], mount=flight.info["mount"],
-        pixel_noise=pixel_noise, least=least,
+        pixel_noise=flight.info.get("pixel_noise", 0.5) if pixel_noise is None else pixel_noise, least=least,
     )  # fmt: skip
     truth = flight.truth
 

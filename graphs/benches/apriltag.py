@@ -122,8 +122,12 @@ def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: An
     from flowgraph.plot_trajectory import plot_ins, plot_space
 
     belief, observed = result["belief"], flight.streams["pose"]
-    figures[f"{flight.name}_space.png"] = lambda file: plot_space(belief, flight.truth, observed, file) and None
-    figures[f"{flight.name}_states.png"] = lambda file: plot_ins(belief, flight.truth, observed, file) and None
+    figures[f"{flight.name}_space.png"] = lambda file: (
+        plot_space(belief, flight.truth, observed, file) and None
+    )
+    figures[f"{flight.name}_states.png"] = lambda file: (
+        plot_ins(belief, flight.truth, observed, file) and None
+    )
 
 
 def _with(flight: Flight, pose: Series) -> Flight:
@@ -241,7 +245,9 @@ def held_out(flight: Flight, tag_map: TagMap) -> tuple[float, float]:
         a, b = (solve(corners[half], places[half], camera) for half in (even, odd))
         if a is None or b is None:
             continue
-        pixels.append(np.linalg.norm(camera.project(places[odd] @ a.R.T + a.t) - corners[odd], axis=-1).ravel())
+        pixels.append(
+            np.linalg.norm(camera.project(places[odd] @ a.R.T + a.t) - corners[odd], axis=-1).ravel()
+        )
         apart.append(np.linalg.norm(a.R.T @ a.t - b.R.T @ b.t))
     if not pixels:
         raise DataError(

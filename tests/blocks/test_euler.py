@@ -94,7 +94,11 @@ def test_at_its_singularity_everything_stays_finite_and_a_warning_names_it(order
 @pytest.mark.parametrize("order", euler.ORDERS)
 def test_beyond_the_singularity_the_nearer_of_two_triples_is_taken(order):
     for e in some_angles(3):
-        e = e + np.array([np.pi, 0.0, 0.0]) * (order == "zxy") + np.array([0.0, np.pi, 0.0]) * (order == "zyx")
+        e = (
+            e
+            + np.array([np.pi, 0.0, 0.0]) * (order == "zxy")
+            + np.array([0.0, np.pi, 0.0]) * (order == "zyx")
+        )
         q = euler.quaternion_from_angles(e, order=order, xp=np)
         found = ins.measured_angles(np.asarray(q), e + 0.05, order=order, xp=np)
         np.testing.assert_allclose(matrix(found, order), matrix(e, order), atol=1e-12)
@@ -205,7 +209,9 @@ def test_the_covariance_in_the_tangent_space(order):
     found = ins.navigation_belief.step(belief, order=order, xp=np)
     draws = np.random.default_rng(2).normal(size=(100_000, 15)) @ A.T
     e = x[3:6] + draws[:, 3:6]
-    turn = (Rotation.from_matrix(matrix(x[3:6], order)).inv() * Rotation.from_matrix(matrix(e, order))).as_rotvec()
+    turn = (
+        Rotation.from_matrix(matrix(x[3:6], order)).inv() * Rotation.from_matrix(matrix(e, order))
+    ).as_rotvec()
     error = np.concatenate([draws[:, :3], draws[:, 6:9], turn, draws[:, 9:]], axis=1)
     deviation = np.sqrt(np.diag(found.covariance))
     scale = deviation[:, None] * deviation

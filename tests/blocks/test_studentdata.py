@@ -140,9 +140,7 @@ def test_stamps_that_repeat_are_left_out_and_named(tmp_path):
 def test_twelve_rows_of_motion_capture_lie_either_way(tmp_path):
     made = content()
     made["vicon"] = made["vicon"].T
-    np.testing.assert_allclose(
-        studentdata.load(written(tmp_path, made)).truth.position, made["vicon"][:, :3]
-    )
+    np.testing.assert_allclose(studentdata.load(written(tmp_path, made)).truth.position, made["vicon"][:, :3])
 
 
 def test_rectified_corners_are_told_from_raw_ones(tmp_path):
@@ -219,7 +217,9 @@ def test_the_parameters_of_the_course_are_read(tmp_path):
 
 def test_other_parameters_are_taken_and_missing_ones_are_said(tmp_path):
     file = tmp_path / "p.txt"
-    file.write_text("Camera: [400 0 320; 0 410 240; 0 0 1]\n\nYaw: -0.5\n\nTags of 0.2 m, 0.1 m apart\n[0 1; 2 3]\n")
+    file.write_text(
+        "Camera: [400 0 320; 0 410 240; 0 0 1]\n\nYaw: -0.5\n\nTags of 0.2 m, 0.1 m apart\n[0 1; 2 3]\n"
+    )
     found = parse_parameters(file)
     assert found.camera.K[1, 1] == 410.0
     np.testing.assert_allclose(found.tag_map.corners[1, 3], [0.0, 0.3, 0.0])
@@ -320,7 +320,9 @@ def small_rob6213(folder: Path, lines: int = 60) -> str:
     table = np.concatenate(
         [s[:, None], np.stack([np.sin(s), np.cos(s), 1.0 + s], axis=1), np.zeros((lines, 9))], axis=1
     )
-    text = "t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz\n" + "\n".join(",".join(map(repr, r.tolist())) for r in table)
+    text = "t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz\n" + "\n".join(
+        ",".join(map(repr, r.tolist())) for r in table
+    )
     (folder / "vicon_dataset7.csv").write_text(text + "\n")
     return str(folder / "proj2_dataset7.mat")
 

@@ -177,7 +177,9 @@ def surveyed(noise: float) -> tuple[TagMap, list[tuple[np.ndarray, np.ndarray]]]
     true = TagMap(ids, corners)
     frames = []
     for _ in range(30):
-        R = (Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(0.25 * rng.normal(size=3))).as_matrix()
+        R = (
+            Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(0.25 * rng.normal(size=3))
+        ).as_matrix()
         centre = np.array([*rng.uniform([0.2, 0.2], [1.4, 1.0]), rng.uniform(0.8, 1.4)])
         pixels = PINHOLE.project((true.corners - centre) @ R.T)
         inside = ((pixels > 0.0) & (pixels < 576.0)).all(axis=(1, 2))
@@ -211,12 +213,15 @@ def test_the_jacobian_of_the_adjustment(flat):
     half = 0.1
     square = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
     root = int(frames[0][0][0])
-    problem = _Problem(frames[:3], *_first_guess(frames[:3], PINHOLE, root, square), PINHOLE, root, square, flat)
+    problem = _Problem(
+        frames[:3], *_first_guess(frames[:3], PINHOLE, root, square), PINHOLE, root, square, flat
+    )
     x = problem.start + 0.01 * np.random.default_rng(0).normal(size=len(problem.start))
     J = problem.jacobian(x)
     h = 1e-6
     numeric = np.stack(
-        [(problem.residuals(x + h * d) - problem.residuals(x - h * d)) / (2 * h) for d in np.eye(len(x))], axis=1
+        [(problem.residuals(x + h * d) - problem.residuals(x - h * d)) / (2 * h) for d in np.eye(len(x))],
+        axis=1,
     )
     np.testing.assert_allclose(J.toarray(), numeric, atol=1e-4 * np.abs(numeric).max())
     assert J.nnz < 0.5 * J.shape[0] * J.shape[1]
