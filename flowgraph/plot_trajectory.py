@@ -170,7 +170,10 @@ def _angles(
     seconds: np.ndarray, sigma: np.ndarray,
 ) -> None:  # fmt: skip
     """Roll, pitch or yaw (Z-Y-X), degrees, without jumps of a turn; the band is that of the body's axis."""
-    drawn = lambda series: np.degrees(np.unwrap(_rotations(series).as_euler("ZYX")[:, 2 - k]))
+
+    def drawn(series: Series) -> np.ndarray:
+        return np.degrees(np.unwrap(_rotations(series).as_euler("ZYX")[:, 2 - k]))
+
     value = drawn(estimate)
     wide = 3.0 * np.degrees(sigma)
     axis.fill_between(seconds, value - wide, value + wide, color=BAND, alpha=0.4, lw=0)

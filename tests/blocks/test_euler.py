@@ -1,4 +1,4 @@
-"""Euler angles: rotations, rate matrices against finite differences, singularities; the step of the filter."""
+"""Euler angles: rotations, rate matrices against differences, singularities; the step of the filter."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_an_unknown_convention_is_refused():
 def a_step(seed: int) -> tuple[np.ndarray, Imu]:
     rng = np.random.default_rng(seed)
     x = np.concatenate([rng.normal(size=3), rng.uniform(-1, 1, 3), 0.3 * rng.normal(size=9)])
-    return x, Imu(gyro=rng.normal(size=3), specific_force=rng.normal(size=3) + [0, 0, 9.8])
+    return x, Imu(gyro=rng.normal(size=3), specific_force=rng.normal(size=3) + np.array([0, 0, 9.8]))
 
 
 @pytest.mark.parametrize("order", euler.ORDERS)
@@ -124,7 +124,7 @@ def test_the_jacobians_of_the_step(order):
     for seed in range(5):
         x, imu = a_step(seed)
 
-        def moved(x, n, imu=imu):
+        def moved(x: Any, n: Any, imu: Imu = imu) -> np.ndarray:
             turn, push = ins.increments(x, imu, DT)
             after = np.asarray(ins.move(x, turn + n[:3], push + n[3:6], DT, order=order, xp=np))
             return after + np.concatenate([np.zeros(9), n[6:]])
@@ -132,7 +132,7 @@ def test_the_jacobians_of_the_step(order):
         turn, push = ins.increments(x, imu, DT)
         F, L = ins.move_jacobians(x, turn, push, DT, order=order, xp=np)
         np.testing.assert_allclose(F, derivative(lambda a: moved(a, np.zeros(12)), x, 1e-3), atol=1e-9)
-        np.testing.assert_allclose(L, derivative(lambda n: moved(x, n), np.zeros(12), 1e-3), atol=1e-9)
+        np.testing.assert_allclose(L, derivative(lambda n, x=x: moved(x, n), np.zeros(12), 1e-3), atol=1e-9)
 
 
 @pytest.mark.parametrize("order", euler.ORDERS)

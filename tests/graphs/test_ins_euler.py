@@ -1,4 +1,4 @@
-"""`tag_pose` and the 15-state filters with Euler angles: engines, lowering, accuracy, recordings, bad input."""
+"""`tag_pose` and the 15-state filters with Euler angles: engines, lowering, accuracy, bad input."""
 
 from __future__ import annotations
 
@@ -10,11 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Case, DataError, DeclarationError, Flight, LoweringError, Series, UnknownNameError
-from flowgraph import find_graph, load_flight, lower, simulate
+from flowgraph import (
+    Case,
+    DataError,
+    DeclarationError,
+    Flight,
+    LoweringError,
+    Series,
+    UnknownNameError,
+    find_graph,
+    load_flight,
+    lower,
+    simulate,
+)
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.vision.pnp import as_measurements
-from flowgraph.errors import UnknownNameError as _Unknown
 from flowgraph.graphs import ins_ekf_pose, ins_particle, ins_ukf_pose, ins_ukf_velocity, tag_pose
 from flowgraph.graphs.benches.apriltag import apriltag, held_out, odd_reprojection, withheld
 from flowgraph.graphs.euler_flight import SingularityWarning
@@ -80,7 +90,7 @@ def test_pnp_stays_on_the_host_and_lowering_says_so():
 
 
 def test_a_whole_flight_of_the_course():
-    """108 tags, 0.5 px, an IMU with biases: below half of PnP's error, in both conventions and both filters."""
+    """108 tags, 0.5 px, an IMU with biases: below half of PnP's error, in both conventions and filters."""
     made = flight(8.0)
     raw = raw_error(made)
     assert 0.003 < raw < 0.01
@@ -92,6 +102,7 @@ def test_a_whole_flight_of_the_course():
     case = ins_ukf_pose.case(made)
     belief = simulate(case.graph, case.inputs)["belief"]
     raw_gyro, assumed = made.streams["imu"], made.truth
+    assert assumed is not None
     at = np.searchsorted(assumed.time, raw_gyro.time)
     bias = (raw_gyro.gyro - assumed["rate"][at]).mean(axis=0)
     np.testing.assert_allclose(belief.gyro_bias[-1], bias, atol=0.004)
@@ -159,7 +170,7 @@ def test_bad_input_is_refused():
         ins_ukf_pose.case(made, order="xyz")
     with pytest.raises(UnknownNameError, match=r"all, even, odd"):
         tag_pose.case(made, tags="some")
-    with pytest.raises(_Unknown, match=r"camera, gyro"):
+    with pytest.raises(UnknownNameError, match=r"camera, gyro"):
         ins_ukf_velocity.case(made, rate="wheel")
     for graph in GRAPHS:
         with pytest.raises(DeclarationError, match=r"gyro_factor"):
@@ -194,7 +205,9 @@ def test_the_pictures(tmp_path):
     (axis,) = figure.axes
     spans = [np.ptp(getattr(axis, f"get_{n}lim")()) for n in "xyz"]  # type: ignore[attr-defined]
     np.testing.assert_allclose(spans, spans[0])
-    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["observed", "truth", "estimate"]
+    legend = axis.get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["observed", "truth", "estimate"]
     figure = plot_ins(belief, made.truth, made.streams["pose"], tmp_path / "states.png")
     titles = [a.get_title(loc="left") for a in figure.axes]
     assert {"roll", "pitch", "yaw", "velocity x", "gyro bias z", "error of position"} <= set(titles)
