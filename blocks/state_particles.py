@@ -1,9 +1,10 @@
 """A particle filter over the fifteen numbers of `euler_ins`: the same model, without a Gaussian.
 
 Each particle is a whole state. It moves with the IMU's reading and noises drawn for it, and a measured pose
-weighs it by how well it explains the pose: the bootstrap filter. Fifteen dimensions are many for particles. Two
-things keep a few thousand of them alive: the noise of the process is drawn larger than the IMU's, and after each
-resampling the copies are shaken apart a little (regularisation).
+weighs it by how well it explains the pose: the bootstrap filter. Fifteen dimensions are many for particles.
+Two
+things keep a few thousand of them alive: the noise of the process is drawn larger than the IMU's, and after
+each resampling the copies are shaken apart a little (regularisation).
 
 Sources: N. Gordon, D. Salmond and A. Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
 estimation", IEE Proc. F 140, 1993 (bootstrap filter, roughening, sec. 3); resampling: `resampling`.
@@ -115,7 +116,8 @@ def resample_states(
     Args:
         cloud: weighted.
         below: resample when 1 / sum(w^2) < below * n.
-        spread: by what part of the weighted deviation of each coordinate the copies are shaken, a normal draw.
+        spread: by what part of the weighted deviation of each coordinate the copies are shaken, a normal
+            draw.
         scheme: as in `resampling`.
 
     Returns:

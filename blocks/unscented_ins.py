@@ -1,15 +1,15 @@
 """The unscented filter of `euler_ins`: sigma points that are augmented with the noises.
 
-State and noises are independent, so a sigma point moves one of them at a time, along a column of its own factor:
-S of P = S S^T for the state, and the square roots of the noises' variances. Points lie in pairs around the
-mean, sqrt(3) deviations away. Everything is taken as deviations from the image of the mean: then a wide
-spread costs no digits, an angle is never averaged as a number, and the covariance is a sum of squares.
+State and noises are independent, so a sigma point moves one of them at a time, along a column of its own
+factor: S of P = S S^T for the state, and the square roots of the noises' variances. Points lie in pairs
+around the mean, sqrt(3) deviations away. Everything is taken as deviations from the image of the mean: then a
+wide spread costs no digits, an angle is never averaged as a number, and the covariance is a sum of squares.
 
     d_i = Y_i minus Y_0        m = sum d_i / 6        x' = Y_0 plus m
     P' = sum d_i d_i^T / 6 + (beta - alpha^2) m m^T        alpha^2 = 3 / L, beta = 2
 
-L is the number of augmented coordinates. Measurements correct in regression form: H is the slope of the pairs,
-and what they leave unexplained adds to the noise, so the Joseph form applies.
+L is the number of augmented coordinates. Measurements correct in regression form: H is the slope of the
+pairs, and what they leave unexplained adds to the noise, so the Joseph form applies.
 
 Sources: S. Julier and J. Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92, 2004; E. Wan
 and R. van der Merwe, 2001 (alpha, beta); the report's sec. on its two filters.
@@ -38,7 +38,7 @@ _FAR = math.sqrt(3.0)
 _BETA = 2.0
 
 RATES = ("gyro", "camera")
-"""Where the camera's velocity takes the body's rate from: gyroscope minus bias (eq. 10), or camera (eq. 9)."""
+"""Whose rate the body's is taken for: the gyroscope's minus its bias (eq. 10), or the camera's (eq. 9)."""
 
 
 def sigma_points(x: Array, P: Array, noise: Array, xp: Any) -> tuple[Array, Array, Array]:
@@ -119,7 +119,8 @@ def update_camera_velocity(
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate that is taken, rad/s.
         rate: "gyro" or "camera".
-        gate: when given, a measurement with a nis above it changes nothing (for three numbers 16.3 is 99.9 %).
+        gate: when given, a measurement with a nis above it changes nothing (for three numbers 16.3 is
+            99.9 %).
 
     Raises:
         UnknownNameError: for another source of the rate.

@@ -50,7 +50,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def graphs() -> Iterator[tuple[str, bytes]]:
     """The diagram of each installed graph."""
-    flights = [load_flight("sim", seed=0), load_flight("sim:thesis", settings={"sensors": "all"})]
+    flights = [
+        load_flight("sim", seed=0),
+        load_flight("sim:thesis", settings={"sensors": "all"}),
+        load_flight("course", settings={"duration": "1"}),
+    ]
     for name in graph_names():
         for flight in flights:
             try:

@@ -144,9 +144,13 @@ def _state(
     seconds: np.ndarray, sigma: np.ndarray,
 ) -> None:  # fmt: skip
     value = estimate[name][:, k]
-    axis.fill_between(seconds, value - 3 * sigma, value + 3 * sigma, color=BAND, alpha=0.4, lw=0, label="3 sigma")
+    axis.fill_between(
+        seconds, value - 3 * sigma, value + 3 * sigma, color=BAND, alpha=0.4, lw=0, label="3 sigma"
+    )
     if observed is not None and name in observed.leaves:
-        axis.plot(_since(observed, estimate), observed[name][:, k], ".", ms=1.5, color=_SEEN, label="observed")
+        axis.plot(
+            _since(observed, estimate), observed[name][:, k], ".", ms=1.5, color=_SEEN, label="observed"
+        )
     if truth is not None and name in truth.leaves:
         inside = _within(truth, estimate)
         axis.plot(_since(truth, estimate)[inside], truth[name][inside, k], color=TRUTH, lw=1, label="truth")
@@ -166,7 +170,10 @@ def _angles(
     seconds: np.ndarray, sigma: np.ndarray,
 ) -> None:  # fmt: skip
     """Roll, pitch or yaw (Z-Y-X), degrees, without jumps of a turn; the band is that of the body's axis."""
-    drawn = lambda series: np.degrees(np.unwrap(_rotations(series).as_euler("ZYX")[:, 2 - k]))
+
+    def drawn(series: Series) -> np.ndarray:
+        return np.degrees(np.unwrap(_rotations(series).as_euler("ZYX")[:, 2 - k]))
+
     value = drawn(estimate)
     wide = 3.0 * np.degrees(sigma)
     axis.fill_between(seconds, value - wide, value + wide, color=BAND, alpha=0.4, lw=0)
@@ -184,6 +191,7 @@ def _errors(axes: Any, estimate: Series, truth: Series, seconds: np.ndarray) -> 
     """Distance in position, geodesic angle, and the distance of velocities where the truth has them."""
     inside = (estimate.time >= truth.time[0]) & (estimate.time <= truth.time[-1])
     time, at = estimate.time[inside], seconds[inside]
+
     def there(name: str) -> np.ndarray:
         columns = [np.interp(time, truth.time, truth[name][:, k]) for k in range(3)]
         return np.stack(columns, axis=1)

@@ -2,8 +2,8 @@
 
     x = (p, e, v, b_g, b_a)      e: Euler angles, Z-X-Y as in the course or Z-Y-X as in the report
 
-Every tick predicts to now, with the Jacobians of the step to state and noises; a tick with a pose also corrects.
-The pose, found by PnP on the host (`tag_pose`), is a source.
+Every tick predicts to now, with the Jacobians of the step to state and noises; a tick with a pose also
+corrects. The pose, found by PnP on the host (`tag_pose`), is a source.
 
 Source: the course's nonlinear Kalman filter. Equations: `blocks/euler_ins.py`.
 """

@@ -2,10 +2,12 @@
 
     x = (p, e, v, b_g, b_a)      each particle is one
 
-The same process and observation model as `ins_ukf_pose`, without a Gaussian: every tick moves the particles with
-the IMU and noises drawn for each; a tick with a pose weighs them, and resamples when few carry the weight.
+The same process and observation model as `ins_ukf_pose`, without a Gaussian: every tick moves the particles
+with the IMU and noises drawn for each; a tick with a pose weighs them, and resamples when few carry the
+weight.
 
-Source: the course's particle filter on AprilTags; equations: `blocks/euler_ins.py`, `blocks/state_particles.py`.
+Source: the course's particle filter on AprilTags; equations: `blocks/euler_ins.py`,
+`blocks/state_particles.py`.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     x = (p, e, v, b_g, b_a)      v_c = R_cb (R(e)^T v + w x r)
 
-The camera sits at r in the body, so its velocity has a part of the body's rate w. That rate is the camera's own
-(rate="camera", the report's eq. 9), or the gyroscope's minus its bias (rate="gyro", eq. 10), which the filter
-estimates. The noises of rate and velocity augment the sigma points. Nothing measures position and heading: both
-drift.
+The camera sits at r in the body, so its velocity has a part of the body's rate w. That rate is the camera's
+own (rate="camera", the report's eq. 9), or the gyroscope's minus its bias (rate="gyro", eq. 10), which the
+filter estimates. The noises of rate and velocity augment the sigma points. Nothing measures position and
+heading: both drift.
 
 Source: the report's second filter. Equations: `blocks/euler_ins.py` and `blocks/unscented_ins.py`.
 """

@@ -1,6 +1,7 @@
 """The pose of a body from the tags that its camera sees: the stage on the host, before any filter.
 
-Finding a pose in an image takes OpenCV, which no pipeline holds. So this graph is one of its own, run in Python,
+Finding a pose in an image takes OpenCV, which no pipeline holds. So this graph is one of its own, run in
+Python,
 and what it gives is a source of the filters: they are lowered, and it is not. Lowering it says so.
 
 Sources: `blocks/vision/pnp.py`; the map of tags that nobody surveyed, `blocks/vision/mapping.py`.
@@ -52,15 +53,20 @@ def tag_pose(
 
 @tag_pose.on_flight
 def for_flight(
-    flight: Flight, *, tags: str = "all", pixel_noise: float = 0.5, least: int = 1, settle: float = 0.0
+    flight: Flight,
+    *,
+    tags: str = "all",
+    pixel_noise: float | None = None,
+    least: int = 1,
+    settle: float = 0.0,
 ) -> Case:
     """Find the poses of a flight with a camera.
 
     Args:
-        flight: with the stream `tags`; its info has `camera` and `mount`, and a `tag_map` or the `tag_side` of
-            tags, of which a map is made first, from all of them.
+        flight: with the stream `tags`; its info has `camera` and `mount`, and a `tag_map` or the `tag_side`
+            of tags, of which a map is made first, from all of them.
         tags: all, even or odd: the ids that are used.
-        pixel_noise: standard deviation of a corner's coordinate, px.
+        pixel_noise: standard deviation of a corner's coordinate, px; the flight's, or 0.5, if left out.
         least: how many tags there must be.
         settle: seconds at the start that the errors leave out.
 
@@ -77,10 +83,16 @@ def for_flight(
     tag_map = map_of(flight)
     if tags != "all":
         tag_map = tag_map.only(tag_map.ids[tag_map.ids % 2 == (tags == "odd")].tolist())
+    noise = flight.info.get("pixel_noise", 0.5) if pixel_noise is None else pixel_noise
     built = tag_pose.build(
-        sizes={"tags": inputs["tags"]["ids"].shape[1]}, **clocks_of(inputs), tag_map=tag_map, camera=flight.info["camera"], mount=flight.info["mount"],
-        pixel_noise=pixel_noise, least=least,
-    )  # fmt: skip
+        **clocks_of(inputs),
+        sizes={"tags": inputs["tags"]["ids"].shape[1]},
+        tag_map=tag_map,
+        camera=flight.info["camera"],
+        mount=flight.info["mount"],
+        pixel_noise=noise,
+        least=least,
+    )
     truth = flight.truth
 
     def score(result: Result) -> dict[str, float]:
@@ -103,7 +115,8 @@ def map_of(flight: Flight) -> TagMap:
 
 
 def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
-    """The measured poses of a flight, for a filter: its stream `pose`, those of its `tags`, or of its `vicon`.
+    """The measured poses of a flight, for a filter: its stream `pose`, those of its `tags`, or of its
+    `vicon`.
 
     Raises:
         DataError: where it has none of them, or no image shows a tag.

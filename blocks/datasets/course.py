@@ -2,9 +2,9 @@
 
     course     seed chooses the flight; what is made is what a studentdataN.mat holds, and is read as one
 
-The body follows sums of sines, tilted so that its thrust explains the acceleration, while it slowly turns. Its
-camera sees every tag whose four corners are in the image, with noise on each coordinate; the IMU has white noise,
-constant biases that walk, and nothing else that real ones have; the motion capture is exact.
+The body follows sums of sines, tilted so that its thrust explains the acceleration, while it slowly turns.
+Its camera sees every tag whose four corners are in the image, with noise on each coordinate; the IMU has
+white noise, constant biases that walk, and nothing else that real ones have; the motion capture is exact.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ DEFAULTS: Mapping[str, float] = {
     "motion.velocity_noise": 0.05,
     "motion.rate_noise": 0.1,
 }
-"""s; Hz of packets; px; continuous densities; standard deviations of the constant biases; their walks; and the
-camera's velocity, as optical flow would give it: Hz, m/s and rad/s."""
+"""s; Hz of packets; px; continuous densities; standard deviations of the constant biases; their walks; and
+the camera's velocity, as optical flow would give it: Hz, m/s and rad/s."""
 
 SETTINGS: Mapping[str, str] = {
     **{name: f"{value:g} if left out" for name, value in DEFAULTS.items()},

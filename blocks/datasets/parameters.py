@@ -1,8 +1,9 @@
-"""`parameters.txt` of the course: tag map, camera matrix, distortion and mount, in MATLAB's notation in prose.
+"""`parameters.txt` of the course: tag map, camera matrix, distortion and mount, in MATLAB's notation in
+prose.
 
 The file is read for what it says, in whatever order: bracketed matrices, each with the words before it, and
-lengths in metres. A 3 x 3 matrix is the camera's, five numbers are its distortion, three after "XYZ" are where
-the IMU sits in the camera, a table of whole numbers is the mat. Nothing of the file is evaluated.
+lengths in metres. A 3 x 3 matrix is the camera's, five numbers are its distortion, three after "XYZ" are
+where the IMU sits in the camera, a table of whole numbers is the mat. Nothing of the file is evaluated.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ from flowgraph.errors import DataError, DeclarationError
 __all__ = ["Parameters", "parse_parameters"]
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_ANGLE = re.compile(rf"yaw\s*[=:]\s*(?P<sign>-?)\s*(?:(?P<pi>pi)\s*(?:/\s*(?P<by>{_NUMBER}))?|(?P<number>{_NUMBER}))",
-                    re.IGNORECASE)  # fmt: skip
+_ANGLE = re.compile(
+    rf"yaw\s*[=:]\s*(?P<sign>-?)\s*"
+    rf"(?:(?P<pi>pi)\s*(?:/\s*(?P<by>{_NUMBER}))?|(?P<number>{_NUMBER}))",
+    re.IGNORECASE,
+)
 _LENGTH = re.compile(rf"(?P<value>{_NUMBER})\s*m\b")
 _COLUMNS = re.compile(r"(\d+)\s*(?:and|-|to|,)\s*(\d+)")
 

@@ -10,10 +10,11 @@ The files hold no IMU. The one given here is derived from the motion capture: lo
 positions and attitudes, differentiated. It has no bias and knows the future a little; a filter fed with it
 shows what its measurement model is worth, not what a flight would have been. The flight's notes say so.
 
-The camera velocity is late, by about 0.07 s, and its stamps are shifted back. The world of the tags and that of
+The camera velocity is late, by about 0.07 s, and its stamps are shifted back. The world of the tags and that
+of
 the motion capture differ by a fixed shift, which no filter could find: `SHIFT` and `TURN` take one into the
-other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw leaves the
-poses as they were recorded.
+other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw leaves
+the poses as they were recorded.
 """
 
 from __future__ import annotations
@@ -192,7 +193,7 @@ def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
     """
     step = round(1e9 / rate)
     time = np.arange(truth.time[0], truth.time[-1] + 1, step)
-    size = max(int(round(window * rate)) | 1, 5)
+    size = max(round(window * rate) | 1, 5)
     position = np.stack([np.interp(time, truth.time, truth["position"][:, k]) for k in range(3)], axis=1)
     acceleration = savgol_filter(position, size, 2, deriv=2, delta=1.0 / rate, axis=0)
     measured = Rotation.from_quat(truth["attitude"][:, [1, 2, 3, 0]])

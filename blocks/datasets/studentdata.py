@@ -2,14 +2,14 @@
 
     studentdata:FILE[:PARAMETERS]     PARAMETERS is a parameters.txt; the course's own if left out
 
-    data   packets: img, id, p1..p4 (2 x n px: bottom-left, bottom-right, top-right, top-left), t, rpy, omg, acc
-    time   stamps of vicon, s
+    data   packets: img, id, p1..p4 (2 x n px: bottom-left, bottom-right, top-right, top-left), t, rpy, omg,
+    acc time   stamps of vicon, s
     vicon  rows x y z roll pitch yaw vx vy vz wx wy wz, one column a stamp, 100 Hz
 
 Files differ, and this is what they do: a file may have `drpy` in place of `omg`; a packet with one tag has a
-plain number as `id` and corners of one axis; a packet without tags has empty arrays, or no such fields; a file
-of one packet holds a struct in place of an array of structs; the first packets may precede the first row of
-vicon; stamps may repeat. The angles of vicon are Z-X-Y, its rates are taken as those of the body.
+plain number as `id` and corners of one axis; a packet without tags has empty arrays, or no such fields; a
+file of one packet holds a struct in place of an array of structs; the first packets may precede the first row
+of vicon; stamps may repeat. The angles of vicon are Z-X-Y, its rates are taken as those of the body.
 """
 
 from __future__ import annotations

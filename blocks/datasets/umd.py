@@ -87,12 +87,15 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             room=room,
         ),
     }
-    info: dict[str, Any] = {"camera": camera, "mount": mount, "tag_side": side, "imu_noise": NOISE}
+    info: dict[str, Any] = {"camera": camera, "mount": mount, "tag_side": side, "imu_noise": NOISE, **PIXELS}
     return Flight(name=file.stem, streams=streams, info=info, notes=(*notes, *more))
 
 
-NOISE = ImuNoise(gyro=0.005, accelerometer=0.05, gyro_bias=2e-4, accelerometer_bias=2e-3)
+NOISE = ImuNoise(gyro=0.02, accelerometer=0.6, gyro_bias=2e-4, accelerometer_bias=2e-3)
 """Densities for a hand-held unit whose readings stand for up to 0.8 s; there is no data sheet."""
+
+PIXELS = {"pixel_noise": 0.25, "position_noise": 1e-4, "attitude_noise": 1e-4}
+"""Standard deviation of a corner's coordinate, px, and of a pose beyond what that gives, m and rad."""
 
 
 def _calibration(file: Path) -> tuple[Camera, Mount, float]:

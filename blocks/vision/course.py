@@ -38,7 +38,8 @@ def estimate_pose(
             explain few tags about equally well.
 
     Returns:
-        position (3, 1), m, world; and angles (3, 1), rad: roll, pitch, yaw with R = Rz(yaw) Rx(roll) Ry(pitch).
+        position (3, 1), m, world; and angles (3, 1), rad: roll, pitch, yaw with R = Rz(yaw) Rx(roll)
+        Ry(pitch).
 
     Raises:
         DataError: when the packet shows no tag of the map.
@@ -70,9 +71,9 @@ def estimate_pose(
 def estimate_covariances(filename: str | Path, *, parameters: str | Path | None = None) -> np.ndarray:
     """R (6, 6): the covariance of measured minus true (x, y, z, roll, pitch, yaw) over a flight, m and rad.
 
-    R = sum of r r^T / (n - 1), about zero and not about the mean: what the measurement is off by always belongs
-    to its error. The motion capture is interpolated at the stamps; packets outside it, and those without tags,
-    are left out. Angles are Z-X-Y, their differences wrapped.
+    R = sum of r r^T / (n - 1), about zero and not about the mean: what the measurement is off by always
+    belongs to its error. The motion capture is interpolated at the stamps; packets outside it, and those
+    without tags, are left out. Angles are Z-X-Y, their differences wrapped.
 
     Raises:
         DataError: when fewer than two packets can be compared.

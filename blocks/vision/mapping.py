@@ -6,7 +6,8 @@ squared distances (robust: Huber) between seen and projected corners become leas
 camera and one tag, so the Jacobian is sparse; it is analytic. What the side of a tag is said to be gives the
 scale.
 
-Source: B. Triggs, P. McLauchlan, R. Hartley and A. Fitzgibbon, "Bundle adjustment - a modern synthesis", 1999.
+Source: B. Triggs, P. McLauchlan, R. Hartley and A. Fitzgibbon, "Bundle adjustment - a modern synthesis",
+1999.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ A camera at place r in the body, turned by R_cb (camera from body), moves with
     v_c = R_cb (R^T v + w x r)        w_c = R_cb w
 
 where v is the body's velocity in the world, R its attitude and w its angular rate in the body. The pair (v_c,
-w_c) is the adjoint of the mount, applied to the body's. The rate w may be had in two ways: from the camera's own
-rate, w = R_cb^T w_c (the report's eq. 9), or from the gyroscope, w = w_m - b_g (eq. 10).
+w_c) is the adjoint of the mount, applied to the body's. The rate w may be had in two ways: from the camera's
+own rate, w = R_cb^T w_c (the report's eq. 9), or from the gyroscope, w = w_m - b_g (eq. 10).
 
 Source: R. Murray, Z. Li and S. Sastry, "A Mathematical Introduction to Robotic Manipulation", 1994, sec. 2.4.
 """

@@ -3,8 +3,8 @@
 SQPNP gives a start without any guess; points on a plane, as those of a mat, also get both of IPPE's answers.
 Each is refined until the squared reprojection error of all visible corners stands still. A plane that is
 small in the image has two poses that explain it about equally well: where the corners cannot tell them apart,
-the one nearer to the previous pose, or to the prior, is taken. Linearised at the answer, the reprojection gives
-the covariance.
+the one nearer to the previous pose, or to the prior, is taken. Linearised at the answer, the reprojection
+gives the covariance.
 
 This runs on the host: OpenCV is no array-API operation. A pipeline reads the poses as a source.
 
@@ -167,7 +167,9 @@ def quaternion_of(R: npt.ArrayLike) -> np.ndarray:
     """The unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True)[..., [3, 0, 1, 2]])
+    return np.asarray(
+        Rotation.from_matrix(np.asarray(R, dtype=float)).as_quat(canonical=True)[..., [3, 0, 1, 2]]
+    )
 
 
 def rotation_of(q: npt.ArrayLike) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""AprilTags and the 15-state filters, on every recording that is there, beside a simulated flight of the course.
+"""AprilTags and the 15-state filters, on every recording that is there, beside a simulated flight of the
+course.
 
-A recording with surveyed truth is scored by position (root mean square, m) and attitude (geodesic, degrees). One
-without, as the hand-held one, is scored by tags that took no part: the filter is given the poses of PnP from the
-even ids only, and the corners of the odd ids are projected through its pose. So the ids that judge are never those
-that were used; the map is made of all.
+A recording with surveyed truth is scored by position (root mean square, m) and attitude (geodesic, degrees).
+One without, as the hand-held one, is scored by tags that took no part: the filter is given the poses of PnP
+from the even ids only, and the corners of the odd ids are projected through its pose. So the ids that judge
+are never those that were used; the map is made of all.
 """
 
 from __future__ import annotations
@@ -122,8 +123,14 @@ def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: An
     from flowgraph.plot_trajectory import plot_ins, plot_space
 
     belief, observed = result["belief"], flight.streams["pose"]
-    figures[f"{flight.name}_space.png"] = lambda file: plot_space(belief, flight.truth, observed, file) and None
-    figures[f"{flight.name}_states.png"] = lambda file: plot_ins(belief, flight.truth, observed, file) and None
+
+    def space(file: Path) -> None:
+        plot_space(belief, flight.truth, observed, file)
+
+    def states(file: Path) -> None:
+        plot_ins(belief, flight.truth, observed, file)
+
+    figures[f"{flight.name}_space.png"], figures[f"{flight.name}_states.png"] = space, states
 
 
 def _with(flight: Flight, pose: Series) -> Flight:
@@ -191,8 +198,8 @@ def _hand_held(flight: Flight, notes: list[str], gap: float) -> Iterator[dict[st
 def withheld(pose: Series, gap: float, every: float = 3.0) -> tuple[Series, list[int]]:
     """The poses with those of the last `gap` of every `every` seconds taken away, and the times of these.
 
-    What stands in their place is the last pose before, with a covariance that makes it say nothing: the filter is
-    asked for its pose at those times, and told none.
+    What stands in their place is the last pose before, with a covariance that makes it say nothing: the
+    filter is asked for its pose at those times, and told none.
     """
     since = pose.seconds
     gone = (np.mod(since, every) >= every - gap) & (since > every)
@@ -241,7 +248,9 @@ def held_out(flight: Flight, tag_map: TagMap) -> tuple[float, float]:
         a, b = (solve(corners[half], places[half], camera) for half in (even, odd))
         if a is None or b is None:
             continue
-        pixels.append(np.linalg.norm(camera.project(places[odd] @ a.R.T + a.t) - corners[odd], axis=-1).ravel())
+        pixels.append(
+            np.linalg.norm(camera.project(places[odd] @ a.R.T + a.t) - corners[odd], axis=-1).ravel()
+        )
         apart.append(np.linalg.norm(a.R.T @ a.t - b.R.T @ b.t))
     if not pixels:
         raise DataError(

@@ -17,7 +17,7 @@ from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.unscented_ins import update_camera_velocity
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount
-from flowgraph.blocks.vision.mapping import _Problem, _first_guess, build_map
+from flowgraph.blocks.vision.mapping import _first_guess, _Problem, build_map
 from flowgraph.blocks.vision.motion import (
     CameraMotion,
     adjoint,
@@ -64,7 +64,8 @@ def test_the_mat_of_the_course():
     corners, known = found.find([0, 1, 12, 36, 72, 107, 108])
     assert known.tolist() == [True] * 6 + [False]
     np.testing.assert_allclose(corners[0, 3], [0.0, 0.0, 0.0])  # top-left of the top-left tag
-    np.testing.assert_allclose(corners[0], [[0.152, 0, 0], [0.152, 0.152, 0], [0, 0.152, 0], [0, 0, 0]])
+    square = np.array([[1.0, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0]]) * 0.152
+    np.testing.assert_allclose(corners[0], square)
     np.testing.assert_allclose(corners[1, 3], [0.304, 0.0, 0.0])  # next below
     np.testing.assert_allclose(corners[2, 3], [0.0, 0.304, 0.0])  # next to the right
     np.testing.assert_allclose(corners[3, 3], [0.0, 3 * 0.304 + 0.026, 0.0])  # beyond one wide gap
@@ -148,13 +149,13 @@ def test_the_flip_of_a_small_plane_is_resolved_by_what_came_before():
         for name, prior in (("alone", None), ("near", near)):
             pose = found_at(every[one], z, near=prior)
             turn = Rotation.from_matrix(R.T @ rotation_of(pose.attitude)).magnitude()
-            wrong[name] += turn > 0.25
+            wrong[name] += int(turn > 0.25)
     assert wrong["alone"] > 2 * wrong["near"]
     assert wrong["near"] <= 3
 
 
 def test_what_gives_no_pose():
-    p, R, ids, corners = a_view(0)
+    _, _, ids, corners = a_view(0)
     assert found_at(ids + 1000, corners) is None
     assert solve(np.zeros((0, 4, 2)), np.zeros((0, 4, 3)), PINHOLE) is None
     line = np.zeros((1, 4, 3))
@@ -177,7 +178,9 @@ def surveyed(noise: float) -> tuple[TagMap, list[tuple[np.ndarray, np.ndarray]]]
     true = TagMap(ids, corners)
     frames = []
     for _ in range(30):
-        R = (Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(0.25 * rng.normal(size=3))).as_matrix()
+        R = (
+            Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(0.25 * rng.normal(size=3))
+        ).as_matrix()
         centre = np.array([*rng.uniform([0.2, 0.2], [1.4, 1.0]), rng.uniform(0.8, 1.4)])
         pixels = PINHOLE.project((true.corners - centre) @ R.T)
         inside = ((pixels > 0.0) & (pixels < 576.0)).all(axis=(1, 2))
@@ -211,12 +214,15 @@ def test_the_jacobian_of_the_adjustment(flat):
     half = 0.1
     square = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
     root = int(frames[0][0][0])
-    problem = _Problem(frames[:3], *_first_guess(frames[:3], PINHOLE, root, square), PINHOLE, root, square, flat)
+    problem = _Problem(
+        frames[:3], *_first_guess(frames[:3], PINHOLE, root, square), PINHOLE, root, square, flat
+    )
     x = problem.start + 0.01 * np.random.default_rng(0).normal(size=len(problem.start))
     J = problem.jacobian(x)
     h = 1e-6
     numeric = np.stack(
-        [(problem.residuals(x + h * d) - problem.residuals(x - h * d)) / (2 * h) for d in np.eye(len(x))], axis=1
+        [(problem.residuals(x + h * d) - problem.residuals(x - h * d)) / (2 * h) for d in np.eye(len(x))],
+        axis=1,
     )
     np.testing.assert_allclose(J.toarray(), numeric, atol=1e-4 * np.abs(numeric).max())
     assert J.nnz < 0.5 * J.shape[0] * J.shape[1]
@@ -274,8 +280,13 @@ def test_a_camera_velocity_corrects_the_velocity(rate):
     wrong[6:9] += 0.3 * rng.normal(size=3)
     P = np.diag(np.repeat([1e-4, 1e-8, 0.1, 1e-8, 1e-4], 3))
     settings: dict[str, Any] = {
-        "order": "zyx", "mount": COURSE_MOUNT, "velocity_noise": 1e-3, "rate_noise": 1e-3, "rate": rate, "xp": np,
-    }  # fmt: skip
+        "order": "zyx",
+        "mount": COURSE_MOUNT,
+        "velocity_noise": 1e-3,
+        "rate_noise": 1e-3,
+        "rate": rate,
+        "xp": np,
+    }
     prior = Gaussian(mean=wrong, covariance=P)
     posterior, innovation = update_camera_velocity.step(prior, motion, imu, **settings)
     np.testing.assert_allclose(posterior.mean[6:9], truth[6:9], atol=1e-4)

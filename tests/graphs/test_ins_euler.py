@@ -1,0 +1,284 @@
+"""`tag_pose` and the 15-state filters with Euler angles: engines, lowering, accuracy, bad input."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import (
+    Case,
+    DataError,
+    DeclarationError,
+    Flight,
+    LoweringError,
+    Series,
+    UnknownNameError,
+    find_graph,
+    load_flight,
+    lower,
+    simulate,
+)
+from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.vision.pnp import as_measurements
+from flowgraph.graphs import ins_ekf_pose, ins_particle, ins_ukf_pose, ins_ukf_velocity, tag_pose
+from flowgraph.graphs.benches.apriltag import apriltag, held_out, odd_reprojection, withheld
+from flowgraph.graphs.euler_flight import SingularityWarning
+from flowgraph.graphs.tag_pose import map_of, poses_of
+from flowgraph.plot_trajectory import plot_ins, plot_space
+from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("FLOWGRAPH_DATA", ROOT.parent / "shared" / "datasets"))
+VICON = pytest.mark.skipif(not (DATA / "nyu_rob6213").is_dir(), reason="no nyu_rob6213 under $FLOWGRAPH_DATA")
+MAT = pytest.mark.skipif(not (DATA / "apriltag_umd").is_dir(), reason="no apriltag_umd under $FLOWGRAPH_DATA")
+GRAPHS = [ins_ekf_pose, ins_ukf_pose, ins_ukf_velocity, ins_particle]
+FEW: dict[str, Any] = {"ins_particle": {"particles": 50}}
+
+
+@cache
+def flight(seconds: float = 1.0, seed: int = 1) -> Flight:
+    """A simulated flight of the course, with the poses of PnP as a stream."""
+    made = load_flight("course", seed=seed, settings={"duration": str(seconds)})
+    return Flight(made.name, {**made.streams, "pose": poses_of("test", made)}, made.truth, made.info)
+
+
+@cache
+def recorded(number: int) -> Flight:
+    return load_flight(f"rob6213:{DATA / 'nyu_rob6213' / f'proj2_dataset{number}.mat'}")
+
+
+def case_of(graph: Any, made: Flight, **settings: Any) -> Case:
+    found: Case = graph.case(made, **{**FEW.get(graph.name, {}), **settings})
+    return found
+
+
+def run(graph: Any, made: Flight, **settings: Any) -> dict[str, float]:
+    case = case_of(graph, made, **settings)
+    return case.score(simulate(case.graph, case.inputs))
+
+
+def raw_error(made: Flight) -> float:
+    assert made.truth is not None
+    return pose_errors(made.streams["pose"], made.truth, settle=1.0)["position_rmse_m"]
+
+
+@pytest.mark.parametrize("graph", GRAPHS, ids=lambda g: g.name)
+def test_the_engines_agree(graph):
+    pytest.importorskip("jax")
+    case = case_of(graph, flight(0.3), settle=0.0)
+    engines_agree(case.graph, case.inputs)
+
+
+@pytest.mark.parametrize("graph", GRAPHS, ids=lambda g: g.name)
+def test_it_is_lowered_and_drawn(graph):
+    is_lowered_and_drawn(case_of(graph, flight(0.3)), "predict", "update", "navigation_belief")
+
+
+def test_pnp_stays_on_the_host_and_lowering_says_so():
+    """The filter's pipeline begins at the pose, and holds nothing of the host."""
+    case = tag_pose.case(flight(0.3))
+    assert "on the host" in case.graph.text()
+    with pytest.raises(LoweringError, match=r"pnp[\s\S]*host"):
+        lower(case.graph)
+    pipeline = lower(ins_ukf_pose.case(flight(0.3)).graph)
+    assert not any("pnp" in stage.path for stage in pipeline.stages)
+
+
+def test_a_whole_flight_of_the_course():
+    """108 tags, 0.5 px, an IMU with biases: below half of PnP's error, in both conventions and filters."""
+    made = flight(8.0)
+    raw = raw_error(made)
+    assert 0.003 < raw < 0.01
+    for graph, order in ((ins_ukf_pose, "zxy"), (ins_ukf_pose, "zyx"), (ins_ekf_pose, "zxy")):
+        score = run(graph, made, order=order)
+        assert score["position_rmse_m"] < 0.5 * raw
+        assert score["attitude_rmse_deg"] < 0.12
+        assert min(score["position_3sigma"], score["tilt_3sigma"], score["heading_3sigma"]) > 0.97
+    case = ins_ukf_pose.case(made)
+    belief = simulate(case.graph, case.inputs)["belief"]
+    raw_gyro, assumed = made.streams["imu"], made.truth
+    assert assumed is not None
+    at = np.searchsorted(assumed.time, raw_gyro.time)
+    bias = (raw_gyro.gyro - assumed["rate"][at]).mean(axis=0)
+    np.testing.assert_allclose(belief.gyro_bias[-1], bias, atol=0.004)
+
+
+@pytest.mark.slow
+def test_5000_particles_are_better_than_pnp():
+    made = flight(20.0)
+    case = case_of(ins_particle, made, particles=5000)
+    pytest.importorskip("jax")
+    score = case.score(simulate(case.graph, case.inputs, engine="xla"))
+    assert score["position_rmse_m"] < raw_error(made)
+
+
+def test_a_camera_velocity_bounds_the_drift():
+    """The same flight without it goes astray by an order of magnitude."""
+    made = flight(8.0)
+    for rate in ("gyro", "camera"):
+        assert run(ins_ukf_velocity, made, rate=rate)["position_rmse_m"] < 0.1
+    without = run(ins_ukf_velocity, made, velocity_noise=1e3)["position_rmse_m"]
+    assert without > 1.0
+
+
+def test_a_roll_through_its_singularity_warns_and_the_other_convention_does_not():
+    """A full turn about x, at 1 rad/s: phi passes +-90 degrees in both; only zxy fails there."""
+    time = np.arange(0, 500) * 10_000_000
+    angle = time * 1e-9
+    from flowgraph.blocks.signals import Imu
+
+    none = np.zeros_like(angle)
+    q = np.stack([np.cos(angle / 2), np.sin(angle / 2), none, none], axis=1)
+    force = 9.81 * np.stack([none, np.sin(angle), np.cos(angle)], axis=1)
+    gyro = np.stack([none + 1.0, none, none], axis=1)
+    position = np.zeros((500, 3))
+    base = flight(0.3)
+    streams = {
+        "imu": Series(time, Imu(gyro=gyro, specific_force=force)),
+        "pose": Series(time[::5], as_measurements(position[::5], q[::5])),
+    }
+    truth = Series(
+        time,
+        type(base.streams["pose"].values)(position, q, np.zeros((500, 6, 6)), none, none.astype(np.int32)),
+    )
+    rolling = Flight("rolling", streams, truth, base.info)
+    for graph in (ins_ekf_pose, ins_ukf_pose):
+        with pytest.warns(SingularityWarning, match=r"zxy, phi \(roll\) = \+-90 degrees"):
+            score = run(graph, rolling, order="zxy")
+        assert np.isfinite(list(score.values())).all()
+        score = run(graph, rolling, order="zyx")
+        assert score["attitude_rmse_deg"] < 0.5
+
+
+@pytest.mark.parametrize("graph", [ins_ekf_pose, ins_ukf_pose], ids=lambda g: g.name)
+def test_it_takes_a_motion_capture_too(graph):
+    score = run(graph, load_flight("sim", seed=1, settings={"duration": "3"}))
+    assert score["position_rmse_m"] < 0.05
+
+
+# Bad input
+
+
+def test_bad_input_is_refused():
+    made = flight(0.3)
+    with pytest.raises(UnknownNameError, match=r"zxy, zyx"):
+        ins_ukf_pose.case(made, order="xyz")
+    with pytest.raises(UnknownNameError, match=r"all, even, odd"):
+        tag_pose.case(made, tags="some")
+    with pytest.raises(UnknownNameError, match=r"camera, gyro"):
+        ins_ukf_velocity.case(made, rate="wheel")
+    for graph in GRAPHS:
+        with pytest.raises(DeclarationError, match=r"gyro_factor"):
+            graph.case(made, gyro_factor=-1.0)
+    with pytest.raises(DeclarationError, match=r"particles"):
+        ins_particle.case(made, particles=0)
+    blind = Flight("blind", {"imu": made.streams["imu"]}, made.truth, made.info)
+    with pytest.raises(DataError, match=r"lacks what ins_ukf_pose needs[\s\S]*pose, tags and vicon"):
+        ins_ukf_pose.case(blind)
+    with pytest.raises(DataError, match=r"lacks what ins_ukf_velocity needs"):
+        ins_ukf_velocity.case(blind)
+    lost = Flight("lost", {k: made.streams[k] for k in ("imu", "motion")}, None, made.info)
+    with pytest.raises(DataError, match=r"does not tell where ins_ukf_velocity starts"):
+        ins_ukf_velocity.case(lost)
+    tags = made.streams["tags"]
+    values = tags.values.replace(ids=tags["ids"] + 1000)
+    strange = Flight(
+        "strange", {"imu": made.streams["imu"], "tags": Series(tags.time, values)}, None, made.info
+    )
+    with pytest.raises(DataError, match=r"no image of this flight gives a pose"):
+        ins_ukf_pose.case(strange)
+
+
+# Pictures
+
+
+def test_the_pictures(tmp_path):
+    made = flight(1.0)
+    case = ins_ukf_pose.case(made)
+    belief = simulate(case.graph, case.inputs)["belief"]
+    figure = plot_space(belief, made.truth, made.streams["pose"], tmp_path / "space.png")
+    (axis,) = figure.axes
+    spans = [np.ptp(getattr(axis, f"get_{n}lim")()) for n in "xyz"]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(spans, spans[0])
+    legend = axis.get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["observed", "truth", "estimate"]
+    figure = plot_ins(belief, made.truth, made.streams["pose"], tmp_path / "states.png")
+    titles = [a.get_title(loc="left") for a in figure.axes]
+    assert {"roll", "pitch", "yaw", "velocity x", "gyro bias z", "error of position"} <= set(titles)
+    assert (tmp_path / "space.png").stat().st_size > 10_000
+    assert len(plot_ins(belief).axes) == 15
+    with pytest.raises(DataError, match=r"there is nothing to plot"):
+        plot_space(belief[:0])
+
+
+# Recordings
+
+
+@VICON
+@pytest.mark.parametrize("number", [1, 4])
+def test_recorded_poses_are_bettered(number):
+    """At most 0.7 of the recorded vision's error, which is that of poses in the tags' own frame."""
+    made = recorded(number)
+    assert "imu: derived from the motion capture, not recorded" in made.notes
+    raw = load_flight(
+        f"rob6213:{DATA / 'nyu_rob6213' / f'proj2_dataset{number}.mat'}", settings={"frame": "raw"}
+    )
+    score = run(ins_ukf_pose, made, order="zyx")
+    assert score["position_rmse_m"] <= 0.7 * raw_error(raw)
+    assert score["attitude_rmse_deg"] < 0.6
+
+
+@VICON
+@pytest.mark.parametrize("number", [1, 4])
+def test_recorded_velocities_do_not_diverge(number):
+    for rate in ("gyro", "camera"):
+        score = run(ins_ukf_velocity, recorded(number), rate=rate)
+        assert score["position_rmse_m"] < 0.3
+        assert score["tilt_rmse_deg"] < 1.0
+
+
+@MAT
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Square", "Mapping"])
+def test_tags_that_took_no_part_are_where_the_filter_puts_them(name):
+    made = load_flight(f"umd:{DATA / 'apriltag_umd' / f'Data{name}New.mat'}")
+    tag_map = map_of(made)
+    made = Flight(made.name, made.streams, None, {**made.info, "tag_map": tag_map})
+    pixels, apart = held_out(made, tag_map)
+    assert pixels <= 1.2
+    assert apart <= 6.6e-3
+    even = poses_of("test", made, tags="even")
+    blind, hidden = withheld(even, 0.5)
+    used = Flight(made.name, {**made.streams, "pose": blind}, None, made.info)
+    case = ins_ukf_pose.case(used)
+    belief = simulate(case.graph, case.inputs)["belief"]
+    of = lambda s: odd_reprojection(
+        made, tag_map, dict(zip(s.time.tolist(), zip(s["position"], _matrices(s), strict=True), strict=True))
+    )
+    ours, held = of(belief), of(blind)
+    middle = lambda found, times: np.median(np.concatenate([found[t] for t in times if t in found]))
+    assert middle(ours, list(held)) < middle(held, list(held))
+    assert middle(ours, hidden) < 0.6 * middle(held, hidden)
+
+
+def _matrices(series: Series) -> np.ndarray:
+    from flowgraph.blocks.vision.pnp import rotation_of
+
+    return rotation_of(series["attitude"])
+
+
+def test_the_bench_gives_a_table_without_recordings(tmp_path):
+    report = apriltag(data=str(tmp_path), seconds=2.0)
+    assert [r["what"] for r in report.rows] == ["PnP", "ins_ekf_pose", "ins_ukf_pose"]
+    assert report.rows[2]["of_raw"] < 1.0
+    assert any("no recordings under" in n for n in report.notes)
+    for name, draw in report.figures.items():
+        draw(tmp_path / name)
+        assert (tmp_path / name).is_file()
+    assert find_graph("ins_particle") is ins_particle
