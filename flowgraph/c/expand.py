@@ -21,11 +21,7 @@ from flowgraph.symbolic import Instruction
 MOST_PRODUCTS = 600
 """A product of matrices with more scalar products than this is a loop."""
 
-_ELEMENTWISE = """add subtract multiply divide maximum minimum abs remainder floor_divide pow negative sign
-positive atan2 hypot copysign sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh floor ceil
-round trunc equal not_equal less less_equal greater greater_equal logical_and logical_or logical_xor logical_not
-isfinite isnan bitwise_and bitwise_or bitwise_xor bitwise_invert bitwise_left_shift bitwise_right_shift where
-float32_bits astype square""".split()
+_ELEMENTWISE = ["add", "subtract", "multiply", "divide", "maximum", "minimum", "abs", "remainder", "floor_divide", "pow", "negative", "sign", "positive", "atan2", "hypot", "copysign", "sqrt", "exp", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "floor", "ceil", "round", "trunc", "equal", "not_equal", "less", "less_equal", "greater", "greater_equal", "logical_and", "logical_or", "logical_xor", "logical_not", "isfinite", "isnan", "bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_invert", "bitwise_left_shift", "bitwise_right_shift", "where", "float32_bits", "astype", "square"]
 
 
 class Expander:
@@ -72,7 +68,7 @@ class Expander:
     def combine(self, op: str, spec: Spec, *parts: Any) -> Any:
         """An operation on element arrays that broadcast to the elements of a shape."""
         made = np.empty(unrolled(spec.shape), object)
-        wide = [np.broadcast_to(p, made.shape) for p in parts]
+        wide: list[Any] = [np.broadcast_to(p, made.shape) for p in parts]
         for index in np.ndindex(made.shape):
             made[index] = self.tape.op(op, spec.dtype, *(p[index] for p in wide))
         return made
@@ -235,8 +231,8 @@ class Expander:
             rest[index] = self.tape.reduce(kind, found, space) if gone else found
         plain = Spec(tuple(n for k, n in enumerate(x.shape) if k not in axes), spec.dtype)
         left = tuple(f for k, f in enumerate(flags) if k not in axes)
-        made = Value(plain, rest) if left == lanes(plain.shape) else self.relaned(plain, rest, left)
-        return self.reshape(spec, made)
+        whole = Value(plain, rest) if left == lanes(plain.shape) else self.relaned(plain, rest, left)
+        return self.reshape(spec, whole)
 
     def relaned(self, spec: Spec, elements: Any, flags: tuple[bool, ...]) -> Value:
         """Elements made in other lanes than their shape asks for, taken through memory."""
@@ -437,7 +433,7 @@ class Expander:
         rank = len(at.shape)
         before, after = x.shape[:axis], x.shape[axis + 1 :]
         where = self.reshape(Spec((*at.shape, *(1,) * len(after)), at.spec.dtype), at)
-        index = self.form.aligned(where, spec.shape)
+        index: Any = self.form.aligned(where, spec.shape)
         index = index.reshape((1,) * (len(spec.shape) - index.ndim) + index.shape)
         index = np.broadcast_to(index, unrolled(spec.shape))
         flags, space = lanes(spec.shape), space_of(spec.shape)

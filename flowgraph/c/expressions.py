@@ -23,9 +23,7 @@ _INFIX = {
     "bitwise_or": "|",
     "bitwise_xor": "^",
 }
-_LIBM = (
-    "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh floor ceil trunc atan2 hypot copysign"
-).split()
+_LIBM = ["sqrt", "exp", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "floor", "ceil", "trunc", "atan2", "hypot", "copysign"]
 _IN_LANES = ("exp", "log", "sin", "cos", "atan2")
 """Functions that have a form without branches, which vectorises (double only)."""
 _ARITHMETIC = {"add": "+", "subtract": "-", "multiply": "*"}

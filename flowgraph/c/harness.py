@@ -257,10 +257,7 @@ def _texts(port: Port, series: Any) -> list[str]:
     """For each event its numbers, each after a comma."""
     leaves = [np.asarray(a).reshape(len(series.time), -1) for a in series.leaves.values()]
     parts = [
-        [
-            "".join(f",{x!r}" if a.dtype.kind == "f" else f",{int(x)}" for x in row)
-            for row in a.tolist()
-        ]
+        ["".join(f",{x!r}" if a.dtype.kind == "f" else f",{int(x)}" for x in row) for row in a.tolist()]
         for a in leaves
     ]
     return ["".join(p) for p in zip(*parts, strict=True)] if parts else [""] * len(series.time)

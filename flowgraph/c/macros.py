@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from flowgraph.c.nodes import Macro, View
-from flowgraph.c.syntax import ctype, number
+from flowgraph.c.syntax import ctype
 
 if TYPE_CHECKING:
     from flowgraph.c.statements import Writer

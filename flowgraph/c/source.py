@@ -23,7 +23,7 @@ from flowgraph.c.syntax import comment, ctype, identifier, number, unique
 from flowgraph.c.values import Value, row_major
 from flowgraph.errors import LoweringError
 from flowgraph.ops import Spec
-from flowgraph.pipeline import Cell, Leaf, Pipeline, Port
+from flowgraph.pipeline import Cell, Leaf, Pipeline
 from flowgraph.program import Program, specialise
 
 MOST_PATTERNS = 8

@@ -163,7 +163,11 @@ class Values:
         return View(self.constants[key], array.shape, 0, row_major(array.shape))
 
 
-_HOST = {"real": float, "bool": bool, **{k: np.dtype(k) for k in ("int32", "int64", "uint32", "uint64")}}
+_HOST: dict[str, Any] = {
+    "real": float,
+    "bool": bool,
+    **{k: np.dtype(k) for k in ("int32", "int64", "uint32", "uint64")},
+}
 
 
 def _same_strides(view: View, wanted: tuple[int, ...]) -> bool:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from flowgraph import simulate
 from flowgraph.cli.options import case_of
-from flowgraph.registry import graph_names
 from tests.support import same
 
-SPECIAL = {"orientation_complementary": "sim:sensors=gyro,coordinate_acceleration,thrust"}
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+GRAPHS = sorted(PROJECT["entry-points"]["flowgraph.graphs"])
+"""The graphs of the library; each must have a line below for single precision."""
+
 SINGLE = {
     "kalman": 1e-4,
     "async_kalman": 1e-4,
@@ -28,12 +33,13 @@ def case(name: str):
     settings = ["duration=1"]
     if name == "orientation_complementary":
         settings.append("sensors=gyro,coordinate_acceleration,thrust")
+        return case_of(name, "sim:thesis", settings, 0)[0]
     if name.startswith("rbpf"):
         settings.append("particles=60")
     return case_of(name, "sim", settings, 0)[0]
 
 
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", GRAPHS)
 def test_all_engines_agree(name):
     given = case(name)
     wanted = simulate(given.graph, given.inputs)
@@ -41,7 +47,7 @@ def test_all_engines_agree(name):
         same(wanted, simulate(given.graph, given.inputs, engine=engine), exact=False)
 
 
-@pytest.mark.parametrize("name", sorted(SINGLE))
+@pytest.mark.parametrize("name", GRAPHS)
 def test_single_precision_stays_near(name):
     given = case(name)
     double = simulate(given.graph, given.inputs, engine="c")[given.estimate]
