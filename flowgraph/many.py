@@ -1,7 +1,7 @@
 """Many runs of one graph at once: a leading batch of runs, in chunks of fixed size.
 
-In XLA a chunk of runs goes through one compiled scan under `vmap`, in C each run on one of several threads; the
-other engines run them one by one.
+In XLA a chunk of runs goes through one compiled scan under `vmap`, in C each run on one of several threads;
+the other engines run them one by one.
 The size of a chunk is fixed and the last one is filled up, so memory is bounded and the result of a run does
 not depend on how many others are asked for.
 """
@@ -232,11 +232,13 @@ def _threaded(
             times = events.time[done : done + part.ticks]
             for port, (mask, leaves) in zip(pipeline.outputs, part.outputs, strict=True):
                 if port.name in kept:
-                    wanted = [x for leaf, x in zip(port.leaves, leaves, strict=True) if leaf.name in kept[port.name]]
+                    pairs = zip(port.leaves, leaves, strict=True)
+                    wanted = [x for leaf, x in pairs if leaf.name in kept[port.name]]
                     found[port.name].append((times[mask], wanted))
             done += part.ticks
         check_faults(pipeline, cells)
-        return {p.name: _series(p, kept[p.name], found[p.name]) for p in pipeline.outputs if p.name in kept}, done
+        ports = [p for p in pipeline.outputs if p.name in kept]
+        return {p.name: _series(p, kept[p.name], found[p.name]) for p in ports}, done
 
     if shared is None:  # made here, so that threads do not compile the same thing at once
         first = tape(prepare(graph, inputs(seeds[0])), graph)
@@ -245,7 +247,8 @@ def _threaded(
     ticks = 0
     start = perf_counter()
     with ThreadPoolExecutor(min(len(seeds), os.cpu_count() or 1)) as pool:
-        for n, (series, ticks) in enumerate(pool.map(run, seeds)):
+        for n, (series, done) in enumerate(pool.map(run, seeds)):
+            ticks = done
             for name in kept:
                 parts[name].append(series[name])
             if progress is not None:

@@ -1,7 +1,7 @@
 """Compiling generated C with the system's compiler, once for each content.
 
-Libraries are kept in a folder of the user's, under a hash of the text, the flags and the compiler's version; the
-same filter is compiled once on a machine.
+Libraries are kept in a folder of the user's, under a hash of the text, the flags and the compiler's
+version; the same filter is compiled once on a machine.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flowgraph.errors import FlowgraphError, MissingDependencyError, writes
 FLAGS = (
     "-std=c99",
     "-O3",
-    "--param=max-completely-peeled-insns=64",  # loops of larger matrices stay loops: compiling takes half as long
+    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",

@@ -21,7 +21,65 @@ from flowgraph.symbolic import Instruction
 MOST_PRODUCTS = 600
 """A product of matrices with more scalar products than this is a loop."""
 
-_ELEMENTWISE = ["add", "subtract", "multiply", "divide", "maximum", "minimum", "abs", "remainder", "floor_divide", "pow", "negative", "sign", "positive", "atan2", "hypot", "copysign", "sqrt", "exp", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "floor", "ceil", "round", "trunc", "equal", "not_equal", "less", "less_equal", "greater", "greater_equal", "logical_and", "logical_or", "logical_xor", "logical_not", "isfinite", "isnan", "bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_invert", "bitwise_left_shift", "bitwise_right_shift", "where", "float32_bits", "astype", "square"]
+_ELEMENTWISE = [
+    "add",
+    "subtract",
+    "multiply",
+    "divide",
+    "maximum",
+    "minimum",
+    "abs",
+    "remainder",
+    "floor_divide",
+    "pow",
+    "negative",
+    "sign",
+    "positive",
+    "atan2",
+    "hypot",
+    "copysign",
+    "sqrt",
+    "exp",
+    "expm1",
+    "log",
+    "log1p",
+    "log2",
+    "sin",
+    "cos",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "floor",
+    "ceil",
+    "round",
+    "trunc",
+    "equal",
+    "not_equal",
+    "less",
+    "less_equal",
+    "greater",
+    "greater_equal",
+    "logical_and",
+    "logical_or",
+    "logical_xor",
+    "logical_not",
+    "isfinite",
+    "isnan",
+    "bitwise_and",
+    "bitwise_or",
+    "bitwise_xor",
+    "bitwise_invert",
+    "bitwise_left_shift",
+    "bitwise_right_shift",
+    "where",
+    "float32_bits",
+    "astype",
+    "square",
+]
 
 
 class Expander:
@@ -96,12 +154,12 @@ class Expander:
             isinstance(e, slice) and e.indices(n) == (0, n, 1) for e, n in zip(entries, x.shape, strict=True)
         ]
         left = tuple(f for f, e in zip(flags, entries, strict=True) if isinstance(e, slice))
-        if all(w or not f for w, f in zip(whole, flags, strict=True)) and left == lanes(spec.shape):
-            if x.elements is not None or x.view is None:
-                at = tuple(slice(None) if f else e for e, f in zip(entries, flags, strict=True))
-                picked = np.empty(unrolled(spec.shape), object)
-                picked[...] = self.form.elements(x)[at]
-                return Value(spec, picked)
+        inside = all(w or not f for w, f in zip(whole, flags, strict=True))
+        if inside and left == lanes(spec.shape) and x.elements is not None:
+            at = tuple(slice(None) if f else e for e, f in zip(entries, flags, strict=True))
+            picked = np.empty(unrolled(spec.shape), object)
+            picked[...] = x.elements[at]
+            return Value(spec, picked)
         view = self.form.stored(x)
         offset, strides = view.offset, []
         for e, n, s in zip(entries, x.shape, view.strides, strict=True):

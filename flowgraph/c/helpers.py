@@ -1,9 +1,9 @@
 """Functions that generated C calls, each written out only where it is needed.
 
-`exp`, `log`, `sin`, `cos` and `atan2` are here a second time, without branches and library calls, for loops: a
-compiler turns them into vector instructions. They are Taylor series after a reduction of the argument, good to
-about two units in the last place. Sine and cosine are for arguments up to 1.6e6, and NaN beyond: in straight code
-they are those of math.h.
+`exp`, `log`, `sin`, `cos` and `atan2` are here a second time, without branches and library calls, for
+loops: a compiler turns them into vector instructions. They are Taylor series after a reduction of the
+argument, good to about two units in the last place. Sine and cosine are for arguments up to 1.6e6, and NaN
+beyond: in straight code they are those of math.h.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ static inline {real} fg_remainder({real} a, {real} b) {{
         ),
         "fg_cholesky": (
             (),
-            f"""/* lower factor in place, of the lower triangle; NaN where the matrix is not positive definite */
+            f"""/* lower factor in place, of the lower triangle; NaN where that is not positive definite */
 static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
     for (int32_t j = 0; j < n; j++) {{
         {real} d = a[n * j + j];
@@ -243,7 +243,7 @@ static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
         ),
         "fg_solve": (
             (),
-            f"""/* a x = b in place of b (n rows, m columns), by elimination with row exchange; NaN where a is singular */
+            f"""/* a x = b in place of b (n x m), by elimination with row exchange; NaN where a is singular */
 static FG_INLINE void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
     for (int32_t j = 0; j < n; j++) {{
         int32_t best = j;

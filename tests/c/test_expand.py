@@ -141,7 +141,7 @@ def test_instructions_agree_with_the_reference(shape):
     assert len(names) > 80
     for name, leaf in zip(names, wanted.output.leaves, strict=True):
         a, b = wanted.output.leaves[leaf], got.output.leaves[leaf]
-        assert a.dtype == b.dtype and a.shape == b.shape, name
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), name
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
