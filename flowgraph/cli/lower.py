@@ -25,7 +25,7 @@ def lower(
     data: Data = "sim",
     settings: Settings = None,
     seed: Seed = 0,
-    target: Annotated[str, typer.Option(metavar="TARGET", help="description, or c: C99 too.")] = "description",
+    target: Annotated[str, typer.Option(metavar="TARGET", help="description, or c: C99.")] = "description",
     dtype: Annotated[str, typer.Option(metavar="DTYPE", help="For c: float64 or float32.")] = "float64",
     events: Annotated[
         Path | None, typer.Option(metavar="FILE", help="For c: write the data as the csv that it replays.")
