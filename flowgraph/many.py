@@ -1,13 +1,16 @@
 """Many runs of one graph at once: a leading batch of runs, in chunks of fixed size.
 
-In XLA a chunk of runs goes through one compiled scan under `vmap`; the other engines run them one by one.
+In XLA a chunk of runs goes through one compiled scan under `vmap`, in C each run on one of several threads;
+the other engines run them one by one.
 The size of a chunk is fixed and the last one is filled up, so memory is bounded and the result of a run does
 not depend on how many others are asked for.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -25,7 +28,7 @@ from flowgraph.random import seed_words
 from flowgraph.run import Meter
 from flowgraph.series import Series
 from flowgraph.state import initial_registers
-from flowgraph.types import ArrayType, StructType, Type, dtype_name, flatten, leaves_of
+from flowgraph.types import DTYPES, ArrayType, StructType, Type, dtype_name, flatten, leaves_of
 
 if TYPE_CHECKING:
     from flowgraph.xla import Chunk
@@ -169,6 +172,8 @@ def simulate_many(
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
+    if engine == "c":
+        return _threaded(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
     return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
 
 
@@ -222,6 +227,80 @@ def _one_by_one(
     return Batch(
         graph.name, engine, seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall
     )
+
+
+def _threaded(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
+    kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
+) -> Batch:  # fmt: skip
+    """Runs in C, as many at once as there are processors: a call into C lets other threads go on."""
+    from flowgraph.c.engine import compiled
+
+    pipeline, real = lower(graph, dtype=dtype), np.dtype(dtype)
+    chosen = for_engine("c", passes)
+    if init is not None:
+        chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
+    shared = tape(prepare(graph, inputs), graph) if _shared(inputs) else None
+    library = None if shared is None else compiled(pipeline, real, shared.patterns, chosen)
+    shared_rows = None if library is None or shared is None else library.rows(_reals(shared, real))
+
+    def run(n: int) -> tuple[dict[str, Series], int]:
+        events = shared or tape(prepare(graph, _of_run(inputs, n, seeds[n])), graph)
+        c = library if library is not None else compiled(pipeline, real, events.patterns, chosen)
+        rows = shared_rows if shared_rows is not None else c.rows(_reals(events, real))
+        cells = [cell[0] for cell in _cells(graph, init, seeds, (n,))]
+        found: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {name: [] for name in kept}
+        done = 0
+        for part, after in c.play(cells, seed_words(seeds[n]), events.time, events.key, rows):
+            cells = after
+            times = events.time[done : done + part.ticks]
+            for port, (mask, leaves) in zip(pipeline.outputs, part.outputs, strict=True):
+                if port.name in kept:
+                    pairs = zip(port.leaves, leaves, strict=True)
+                    wanted = [x for leaf, x in pairs if leaf.name in kept[port.name]]
+                    found[port.name].append((times[mask], wanted))
+            done += part.ticks
+        check_faults(pipeline, cells)
+        ports = [p for p in pipeline.outputs if p.name in kept]
+        return {p.name: _series(p, kept[p.name], found[p.name]) for p in ports}, done
+
+    if shared is None:  # made here, so that threads do not compile the same thing at once
+        first = tape(prepare(graph, _of_run(inputs, 0, seeds[0])), graph)
+        compiled(pipeline, real, first.patterns, chosen)
+    parts: dict[str, list[Series]] = {name: [] for name in kept}
+    ticks = 0
+    start = perf_counter()
+    with ThreadPoolExecutor(min(len(seeds), os.cpu_count() or 1)) as pool:
+        for n, (series, done) in enumerate(pool.map(run, range(len(seeds)))):
+            ticks = done
+            for name in kept:
+                parts[name].append(series[name])
+            if progress is not None:
+                progress.update(n + 1, 0)
+    wall = perf_counter() - start
+    return Batch(
+        graph.name, "c", seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall
+    )
+
+
+def _reals(events: Tape, real: Any) -> list[list[np.ndarray]]:
+    return [real_leaves(s, real) for s in events.series]
+
+
+def _series(port: Port, names: list[str], parts: list[tuple[np.ndarray, list[np.ndarray]]]) -> Series:
+    """Stretches of one output in one, with the leaves of these names."""
+    leaves = [leaf for leaf in port.leaves if leaf.name in names]
+    time = np.concatenate([t for t, _ in parts]) if parts else np.zeros(0, np.int64)
+    fields = {
+        leaf.name: np.concatenate([x[k] for _, x in parts])
+        if parts
+        else np.zeros((0, *leaf.shape), DTYPES[leaf.dtype])
+        for k, leaf in enumerate(leaves)
+    }
+    if list(fields) == ["value"]:
+        return Series(time, fields["value"], name=port.name)
+    type_ = StructType(port.name, tuple((n, _leaf_type(a)) for n, a in fields.items()), dict)
+    return Series(time, fields, type=type_, name=port.name)
 
 
 def _joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:

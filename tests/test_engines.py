@@ -172,6 +172,13 @@ def test_xla_agrees_on_random_graphs(recipe, times_x, times_y, seed):
     same(simulate(built, data), simulate(built, data, engine="xla"), exact=False)
 
 
+@settings(RANDOM, max_examples=10, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(RECIPES, TIMES, TIMES, st.integers(0, 1000))
+def test_c_agrees_on_random_graphs(recipe, times_x, times_y, seed):
+    built, data = random_graph(recipe), random_data(times_x, times_y, seed)
+    same(simulate(built, data), simulate(built, data, engine="c"), exact=False)
+
+
 @settings(RANDOM, max_examples=40)
 @given(RECIPES, TIMES, TIMES, st.integers(0, 26), st.permutations(["python", "reference"]))
 def test_a_run_resumes_in_another_engine(recipe, times_x, times_y, cut, engines):
@@ -346,7 +353,7 @@ def test_declared_clocks_change_no_result():
 # -- float32 --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["reference", "xla"])
+@pytest.mark.parametrize("engine", ["reference", "xla", "c"])
 def test_float32_stays_float32(engine):
     @block
     def update(P, x, *, dt, xp):
@@ -388,7 +395,7 @@ def test_an_overflow_is_the_same_error_in_every_engine():
     assert "t = 20 ns" in messages.pop()
 
 
-@pytest.mark.parametrize("pair", [("python", "xla"), ("xla", "python"), ("xla", "reference")])
+@pytest.mark.parametrize("pair", [("python", "xla"), ("xla", "python"), ("xla", "reference"), ("python", "c"), ("c", "python")])
 def test_a_run_resumes_from_and_to_xla(pair):
     recipe = [(kind, n, n + 1, 2) for n, kind in enumerate(("loop", "match", "dt", "zip", "state"))]
     built, data = random_graph(recipe), random_data(list(range(0, 24, 2)), list(range(1, 24, 3)), 3)

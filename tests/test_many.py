@@ -42,7 +42,7 @@ def built():
     return walker.build(start=0.0)
 
 
-@pytest.mark.parametrize("engine", ["python", "reference", "xla"])
+@pytest.mark.parametrize("engine", ["python", "reference", "xla", "c"])
 def test_each_run_is_what_a_single_run_gives(built, engine):
     batch = simulate_many(built, inputs, range(5), engine=engine, runs_at_once=2)
     for k in range(5):

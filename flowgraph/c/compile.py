@@ -1,7 +1,7 @@
 """Compiling generated C with the system's compiler, once for each content.
 
-Libraries are kept in a folder of the user's, under a hash of the text, the flags and the compiler's version; the
-same filter is compiled once on a machine.
+Libraries are kept in a folder of the user's, under a hash of the text, the flags and the compiler's
+version; the same filter is compiled once on a machine.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flowgraph.errors import FlowgraphError, MissingDependencyError, writes
 FLAGS = (
     "-std=c99",
     "-O3",
-    "--param=max-completely-peeled-insns=64",  # loops of larger matrices stay loops: compiling takes half as long
+    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -70,6 +70,11 @@ def _version(path: str) -> str:
     return "\n".join(said)
 
 
+def _first_error(said: str) -> str:
+    lines = said.strip().splitlines()
+    return next((line for line in lines if "error:" in line), lines[0] if lines else "")
+
+
 def build(files: dict[str, str], flags: tuple[str, ...] = FLAGS) -> Path:
     """A shared library of C files (name -> text), from the cache or compiled now.
 
@@ -98,7 +103,7 @@ def build(files: dict[str, str], flags: tuple[str, ...] = FLAGS) -> Path:
                 "the C compiler refuses the generated code",
                 path=cc,
                 expected="code that compiles",
-                got=(done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[0],
+                got=_first_error(done.stderr) or f"exit status {done.returncode}",
                 fix="pass other flags; if the default ones fail, please report the graph",
             )
         os.replace(work / "made.so", target)  # whole or not at all, whoever else compiles the same

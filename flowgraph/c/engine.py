@@ -1,7 +1,7 @@
 """The C engine: a pipeline compiled by the system's compiler and called in this process.
 
-Events and outputs are arrays of the structs that the generated header declares, so nothing is converted a tick.
-A call plays a stretch of ticks and lets other threads run meanwhile: many runs go on as many threads.
+Events and outputs are arrays of the structs that the generated header declares, so nothing is converted a
+tick. A call plays a stretch of ticks and lets other threads run meanwhile: many runs go on as many threads.
 """
 
 from __future__ import annotations

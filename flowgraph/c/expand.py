@@ -126,7 +126,7 @@ class Expander:
     def combine(self, op: str, spec: Spec, *parts: Any) -> Any:
         """An operation on element arrays that broadcast to the elements of a shape."""
         made = np.empty(unrolled(spec.shape), object)
-        wide = [np.broadcast_to(p, made.shape) for p in parts]
+        wide: list[Any] = [np.broadcast_to(p, made.shape) for p in parts]
         for index in np.ndindex(made.shape):
             made[index] = self.tape.op(op, spec.dtype, *(p[index] for p in wide))
         return made
@@ -154,12 +154,12 @@ class Expander:
             isinstance(e, slice) and e.indices(n) == (0, n, 1) for e, n in zip(entries, x.shape, strict=True)
         ]
         left = tuple(f for f, e in zip(flags, entries, strict=True) if isinstance(e, slice))
-        if all(w or not f for w, f in zip(whole, flags, strict=True)) and left == lanes(spec.shape):
-            if x.elements is not None or x.view is None:
-                at = tuple(slice(None) if f else e for e, f in zip(entries, flags, strict=True))
-                picked = np.empty(unrolled(spec.shape), object)
-                picked[...] = self.form.elements(x)[at]
-                return Value(spec, picked)
+        inside = all(w or not f for w, f in zip(whole, flags, strict=True))
+        if inside and left == lanes(spec.shape) and x.elements is not None:
+            at = tuple(slice(None) if f else e for e, f in zip(entries, flags, strict=True))
+            picked = np.empty(unrolled(spec.shape), object)
+            picked[...] = x.elements[at]
+            return Value(spec, picked)
         view = self.form.stored(x)
         offset, strides = view.offset, []
         for e, n, s in zip(entries, x.shape, view.strides, strict=True):
@@ -289,8 +289,8 @@ class Expander:
             rest[index] = self.tape.reduce(kind, found, space) if gone else found
         plain = Spec(tuple(n for k, n in enumerate(x.shape) if k not in axes), spec.dtype)
         left = tuple(f for k, f in enumerate(flags) if k not in axes)
-        made = Value(plain, rest) if left == lanes(plain.shape) else self.relaned(plain, rest, left)
-        return self.reshape(spec, made)
+        whole = Value(plain, rest) if left == lanes(plain.shape) else self.relaned(plain, rest, left)
+        return self.reshape(spec, whole)
 
     def relaned(self, spec: Spec, elements: Any, flags: tuple[bool, ...]) -> Value:
         """Elements made in other lanes than their shape asks for, taken through memory."""
@@ -491,7 +491,7 @@ class Expander:
         rank = len(at.shape)
         before, after = x.shape[:axis], x.shape[axis + 1 :]
         where = self.reshape(Spec((*at.shape, *(1,) * len(after)), at.spec.dtype), at)
-        index = self.form.aligned(where, spec.shape)
+        index: Any = self.form.aligned(where, spec.shape)
         index = index.reshape((1,) * (len(spec.shape) - index.ndim) + index.shape)
         index = np.broadcast_to(index, unrolled(spec.shape))
         flags, space = lanes(spec.shape), space_of(spec.shape)

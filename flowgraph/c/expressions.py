@@ -119,7 +119,8 @@ class Expressions:
         if op in ("floor", "ceil", "trunc", "round"):
             return args[0] if dtype != "real" else f"{self.libm('rint')}({args[0]})"
         if op == "sign":
-            sign = f"{self._cast('bool', dtype, f'({args[0]} > 0)')} - {self._cast('bool', dtype, f'({args[0]} < 0)')}"
+            up, down = (self._cast("bool", dtype, f"({args[0]} {s} 0)") for s in "><")
+            sign = f"{up} - {down}"
             return f"{args[0]} != {args[0]} ? {args[0]} : ({sign})" if dtype == "real" else sign
         if op in ("remainder", "floor_divide", "pow"):
             return self._division(op, dtype, node, args)

@@ -1,8 +1,8 @@
 """A folder with a filter in C: header, source, a program that replays recorded events, and a Makefile.
 
-A recording is a csv file, one event a line: time in ns, name of the input, and its numbers in the order of the
-header, matrices row by row. Events of one time follow one another and make one tick. The program prints what
-comes out in the same form, with as many digits as bring every number back.
+A recording is a csv file, one event a line: time in ns, name of the input, and its numbers in the order of
+the header, matrices row by row. Events of one time follow one another and make one tick. The program prints
+what comes out in the same form, with as many digits as bring every number back.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def main_text(pipeline: Pipeline, source: Source) -> str:
     m = names.module
     longest = max([1, *(_count(p.leaves) for p in pipeline.inputs)])
     lines = [
-        f"/* Replays recorded events through {comment(pipeline.name)}: replay EVENTS.csv [SEED] > OUTPUTS.csv */",
+        f"/* Replays events through {comment(pipeline.name)}: replay EVENTS.csv [SEED] > OUTPUTS.csv */",
         f'#include "{m}.h"',
         "",
         "#include <inttypes.h>",
@@ -257,10 +257,7 @@ def _texts(port: Port, series: Any) -> list[str]:
     """For each event its numbers, each after a comma."""
     leaves = [np.asarray(a).reshape(len(series.time), -1) for a in series.leaves.values()]
     parts = [
-        [
-            "".join(f",{x!r}" if a.dtype.kind == "f" else f",{int(x)}" for x in row)
-            for row in a.tolist()
-        ]
+        ["".join(f",{x!r}" if a.dtype.kind == "f" else f",{int(x)}" for x in row) for row in a.tolist()]
         for a in leaves
     ]
     return ["".join(p) for p in zip(*parts, strict=True)] if parts else [""] * len(series.time)

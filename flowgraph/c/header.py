@@ -83,7 +83,7 @@ def header(
     if patterns is not None:
         lines.append(f" *            (one of {', '.join(map(str, patterns))}; others do nothing)")
     lines += [
-        " * then a pointer for each input (NULL where it is absent) and for each output, where it is written.",
+        " * then a pointer for each input (NULL where it is absent) and for each output, to be written.",
         " * Returns the bits of the outputs that are there; others hold nothing of use.",
         " */",
         react_signature(pipeline, names, None) + ";",

@@ -1,8 +1,9 @@
 """Functions that generated C calls, each written out only where it is needed.
 
-`exp`, `log`, `sin`, `cos` and `atan2` are here a second time, without branches and library calls, for loops: a
-compiler turns them into vector instructions. They are Taylor series after a reduction of the argument, good to
-about two units in the last place; sine and cosine up to an argument of 1e6.
+`exp`, `log`, `sin`, `cos` and `atan2` are here a second time, without branches and library calls, for
+loops: a compiler turns them into vector instructions. They are Taylor series after a reduction of the
+argument, good to about two units in the last place. Sine and cosine are for arguments up to 1.6e6, and NaN
+beyond: in straight code they are those of math.h.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ static FG_INLINE double fg_log(double x) {{
         ),
         "fg_sincos": (
             ("fg_bits",),
-            f"""/* sine and cosine on the quarter turn nearest to x */
+            f"""/* sine and cosine on the quarter turn nearest to x; NaN where that cannot be told exactly */
 static FG_INLINE double fg_sine(double r) {{
     const double z = r * r;
     return r * ({sine});
@@ -115,23 +116,23 @@ static FG_INLINE double fg_cosine(double r) {{
     const double z = r * r;
     return {cosine};
 }}
-static FG_INLINE double fg_quarter(double x, double turn, uint64_t more) {{
+static FG_INLINE double fg_quarter(double x, uint64_t more) {{
     const double t = x * {2 / math.pi!r} + 6755399441055744.0;
     const double k = t - 6755399441055744.0;
     const double r = ((x - k * {half_pi[0]}) - k * {half_pi[1]}) - k * {half_pi[2]};
     const uint64_t q = fg_bits(t) + more;
     const double y = (q & 1u) ? fg_cosine(r) : fg_sine(r);
-    return turn * ((q & 2u) ? -y : y);
+    return fabs(x) <= 1.6e6 ? ((q & 2u) ? -y : y) : NAN;
 }}
 """,
         ),
         "fg_sin": (
             ("fg_sincos",),
-            "static FG_INLINE double fg_sin(double x) { return fg_quarter(x, 1.0, 0u); }\n",
+            "static FG_INLINE double fg_sin(double x) { return fg_quarter(x, 0u); }\n",
         ),
         "fg_cos": (
             ("fg_sincos",),
-            "static FG_INLINE double fg_cos(double x) { return fg_quarter(x, 1.0, 1u); }\n",
+            "static FG_INLINE double fg_cos(double x) { return fg_quarter(x, 1u); }\n",
         ),
         "fg_atan2": (
             (),
@@ -219,7 +220,7 @@ static inline {real} fg_remainder({real} a, {real} b) {{
         ),
         "fg_cholesky": (
             (),
-            f"""/* lower factor in place, of the lower triangle; NaN where the matrix is not positive definite */
+            f"""/* lower factor in place, of the lower triangle; NaN where that is not positive definite */
 static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
     for (int32_t j = 0; j < n; j++) {{
         {real} d = a[n * j + j];
@@ -242,7 +243,7 @@ static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
         ),
         "fg_solve": (
             (),
-            f"""/* a x = b in place of b (n rows, m columns), by elimination with row exchange; NaN where a is singular */
+            f"""/* a x = b in place of b (n x m), by elimination with row exchange; NaN where a is singular */
 static FG_INLINE void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
     for (int32_t j = 0; j < n; j++) {{
         int32_t best = j;

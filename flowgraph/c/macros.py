@@ -1,4 +1,4 @@
-"""Operations with loops of their own: products and factorizations of larger matrices, sorts, random numbers."""
+"""Operations with loops of their own: larger products and factorizations, sorts, random numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from flowgraph.c.nodes import Macro, View
-from flowgraph.c.syntax import ctype, number
+from flowgraph.c.syntax import ctype
 
 if TYPE_CHECKING:
     from flowgraph.c.statements import Writer
@@ -64,7 +64,7 @@ def _index(strides: Sequence[int], names: Sequence[str]) -> str:
 
 
 def _call(w: Writer, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
-    """Call the function for these sizes and strides, written once in a file; loops over the batch around it."""
+    """Call the function for these sizes and strides, which a file has once, for each of the batch."""
     views = [*m.inputs, m.output]
     key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
     name = w.write.function(key, kind, make, *views)
@@ -108,13 +108,13 @@ def _cholesky(w: Writer, m: Macro) -> None:
     real, helper = w.write.real, w.write.helper("fg_cholesky")
 
     def text(name: str, a: View, out: View) -> str:
-        n = out.shape[-1]
+        n, at = out.shape[-1], _index(a.strides[-2:], "ij")
         return f"""/* lower factor of ({n} x {n}) */
 static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
 {{
     {real} factor[{n * n}];
     for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {n}; j++) factor[{n} * i + j] = j <= i ? a[{_index(a.strides[-2:], "ij")}] : 0;
+        for (int32_t j = 0; j < {n}; j++) factor[{n} * i + j] = j <= i ? a[{at}] : 0;
     {helper}(factor, {n});
     for (int32_t i = 0; i < {n}; i++)
         for (int32_t j = 0; j < {n}; j++) out[{_index(out.strides[-2:], "ij")}] = factor[{n} * i + j];
@@ -129,6 +129,7 @@ def _solve(w: Writer, m: Macro) -> None:
 
     def text(name: str, a: View, b: View, out: View) -> str:
         n, columns = out.shape[-2:]
+        made = _index(out.strides[-2:], "ij")
         return f"""/* ({n} x {n}) x = ({n} x {columns}) */
 static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
 {{
@@ -139,7 +140,7 @@ static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, 
         for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{_index(b.strides[-2:], "ij")}];
     {helper}(matrix, right, {n}, {columns});
     for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {columns}; j++) out[{_index(out.strides[-2:], "ij")}] = right[{columns} * i + j];
+        for (int32_t j = 0; j < {columns}; j++) out[{made}] = right[{columns} * i + j];
 }}
 """
 
@@ -249,7 +250,7 @@ def _sort(w: Writer, m: Macro) -> None:
         w.line("int32_t item;")
         w.line("if (top > 0) { item = order[--top]; }")
         w.line(
-            "else { end--; item = order[end]; order[end] = order[0]; if (end == 1) { order[0] = item; break; } }"
+            "else { item = order[--end]; order[end] = order[0]; if (end == 1) { order[0] = item; break; } }"
         )
         w.line("int32_t hole = top;")
         w.line("for (int32_t child; (child = 2 * hole + 1) < end; hole = child) {")

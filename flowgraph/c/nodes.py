@@ -1,8 +1,9 @@
 """Scalar operations in the order of their making: what an array instruction comes apart into before it is C.
 
-A `Node` is one scalar operation; equal ones are made once, and what is known is folded. It is uniform, or it
-varies over a `space`: the sizes of the loops in which it is computed. A `Buffer` is memory, a `Store` writes a
-node into one, and a `Macro` is an operation with loops of its own (a factorization, a sort, random numbers).
+A `Node` is one scalar operation; equal ones are made once, and what is known is folded. It is uniform, or
+it varies over a `space`: the sizes of the loops in which it is computed. A `Buffer` is memory, a `Store`
+writes a node into one, and a `Macro` is an operation with loops of its own (a factorization, a sort, random
+numbers).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """When everything is computed: straight code and loops in turn.
 
-Level by level there is straight code, then one loop for each space. An operation belongs to the first level at
-which all it needs is there; what a loop sums up, or stores for a look-up, is there at the next level. So a chain
-of operations over the particles is one loop up to where it needs a sum over all of them. What one loop computes
-and a later one needs is kept in memory in between.
+Level by level there is straight code, then one loop for each space. An operation belongs to the first level
+at which all it needs is there; what a loop sums up, or stores for a look-up, is there at the next level. So
+a chain of operations over the particles is one loop up to where it needs a sum over all of them. What one
+loop computes and a later one needs is kept in memory in between.
 """
 
 from __future__ import annotations

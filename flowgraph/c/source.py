@@ -1,7 +1,7 @@
 """A pipeline as C: one header, one source file, and nothing else.
 
-Each pattern of present inputs has a reaction of its own, in which everything that depends on presence is folded
-away. Beyond `MOST_PATTERNS` there is one reaction in which presence is data.
+Each pattern of present inputs has a reaction of its own, in which everything that depends on presence is
+folded away. Beyond `MOST_PATTERNS` there is one reaction in which presence is data.
 """
 
 from __future__ import annotations

@@ -79,9 +79,8 @@ class Writer:
                 write_macro(self, item)
             elif isinstance(item, Store):
                 self.line(f"{self.at(item.buffer, str(item.offset))} = {self.ref(item.node)};")
-            elif item.op not in ("const", "given"):
-                if item.op != "reduce":
-                    self._compute(item, self.uniform)
+            elif item.op not in ("const", "given", "reduce"):
+                self._compute(item, self.uniform)
 
     def _compute(self, node: Node, names: dict[Node, str]) -> None:
         text = self.expression(node)

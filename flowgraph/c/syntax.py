@@ -1,7 +1,8 @@
 """How things are written in C: names, comments, numbers, kinds of number.
 
-Names and texts of a graph are a user's, so nothing of them reaches C as it stands: an identifier keeps letters,
-digits and underscores only, and a comment plain characters that can neither end it nor continue a line.
+Names and texts of a graph are a user's, so nothing of them reaches C as it stands: an identifier keeps
+letters, digits and underscores only, and a comment plain characters that can neither end it nor continue a
+line.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Array values in the making of C: elements that are scalar operations, or a view of memory, or both.
 
-Small axes are unrolled: each element along them is an operation of its own. Long axes are lanes: one operation
-stands for all places along them, and becomes the body of a loop. So an array of particles (3, 3, 1000) is nine
-operations in one loop over 1000, its chain of operations is fused, and a compiler finds one stream for each of
-the nine (a structure of arrays). Which axes are lanes depends on the shape alone.
+Small axes are unrolled: each element along them is an operation of its own. Long axes are lanes: one
+operation stands for all places along them, and becomes the body of a loop. So an array of particles (3, 3,
+1000) is nine operations in one loop over 1000, its chain of operations is fused, and a compiler finds one
+stream for each of the nine (a structure of arrays). Which axes are lanes depends on the shape alone.
 """
 
 from __future__ import annotations
@@ -163,7 +163,11 @@ class Values:
         return View(self.constants[key], array.shape, 0, row_major(array.shape))
 
 
-_HOST = {"real": float, "bool": bool, **{k: np.dtype(k) for k in ("int32", "int64", "uint32", "uint64")}}
+_HOST: dict[str, Any] = {
+    "real": float,
+    "bool": bool,
+    **{k: np.dtype(k) for k in ("int32", "int64", "uint32", "uint64")},
+}
 
 
 def _same_strides(view: View, wanted: tuple[int, ...]) -> bool:

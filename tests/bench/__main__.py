@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import imports, inertial, many, particles, random, studies, toy
+from tests.bench import generated_c, imports, inertial, many, particles, random, studies, toy
 from tests.bench.rows import Row
 
 Bench = Callable[..., list[Row]]
@@ -25,6 +25,8 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "toy-xla": (toy.xla_engine, {"ticks": 200, "repeats": 1}),
     "eskf-python": (inertial.against_numpy, {"duration": 0.5, "repeats": 1}),
     "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
+    "kalman-c": (generated_c.kalman, {"ticks": 200, "repeats": 1}),
+    "eskf-c": (generated_c.eskf, {"duration": 0.5, "repeats": 1}),
     "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),
     "rbpf-libraries": (particles.libraries, {"sizes": (1000,), "steps": 10, "repeats": 1}),
     "resampling": (particles.resampling, {"sizes": (100,), "repeats": 1}),

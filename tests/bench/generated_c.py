@@ -1,0 +1,133 @@
+"""Generated C beside hand-written code of the same work: Eigen for the Kalman step, our Python for `ins_eskf`.
+
+Only the loop over the ticks is timed, in the engine's own library and in the floor's, on data that lies ready in
+memory. What both compute must be equal before anything is timed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
+from flowgraph.c.engine import Compiled
+from flowgraph.inputs import prepare, tape
+from flowgraph.playback import real_leaves
+from flowgraph.random import seed_words
+from flowgraph.series import Series
+from tests.bench import inertial
+from tests.bench.rows import Row, interleaved, missing, seconds
+
+FLOOR = Path(__file__).parent / "floor"
+FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffast-math", "-I/usr/include/eigen3", "-fPIC", "-shared")
+
+
+def floor(name: str) -> ctypes.CDLL:
+    """A hand-written peer, compiled.
+
+    Raises:
+        ImportError: without a C++ compiler or Eigen.
+    """
+    compiler = shutil.which("c++")
+    if compiler is None or not Path("/usr/include/eigen3/Eigen/Dense").exists():
+        raise ImportError("a C++ compiler and Eigen are needed")
+    folder = Path(tempfile.mkdtemp(prefix="flowgraph-floor-"))
+    try:
+        made = folder / f"{name}.so"
+        subprocess.run([compiler, *FLAGS, "-o", made, FLOOR / f"{name}.cpp"], check=True)
+        return ctypes.CDLL(str(made))
+    finally:
+        shutil.rmtree(folder)
+
+
+def loop(built: Graph, inputs: dict[str, Series]) -> Callable[[], float]:
+    """A call that plays the inputs once in C and returns the seconds spent there."""
+    pipeline = lower(built)
+    events = tape(prepare(built, inputs), built)
+    library = Compiled(pipeline, np.float64, events.patterns)
+    rows = library.rows([real_leaves(s, np.float64) for s in events.series])
+    cells = [c.reset for r in pipeline.registers for c in r.cells]
+    play, spent = library._play, [0.0]
+
+    def timed(*arguments: Any) -> None:
+        spent[0] += seconds(lambda: play(*arguments))
+
+    library._play = timed
+
+    def once() -> float:
+        spent[0] = 0.0
+        for _ in library.play(cells, seed_words(0), events.time, events.key, rows):
+            pass
+        return spent[0]
+
+    return once
+
+
+class Estimate(Signal):
+    mean: Array = real(6)
+    covariance: Array = real(6, 6)
+
+
+@block
+def kalman_step(before: Estimate, z: real(3), *, model: Any, xp: Any) -> Estimate:  # type: ignore[valid-type]
+    """Predict and update, Joseph form."""
+    F, Q, H, R = model
+    mean, prior = F @ before.mean, F @ before.covariance @ F.T + Q
+    HP = H @ prior
+    K = xp.linalg.solve(HP @ H.T + R, HP).mT
+    left = np.eye(6) - K @ H
+    after = left @ prior @ left.mT + K @ R @ K.mT
+    return Estimate(mean=mean + K @ (z - H @ mean), covariance=0.5 * (after + after.mT))
+
+
+def kalman(*, ticks: int = 20_000, repeats: int = 15) -> list[Row]:
+    """Nanoseconds a step of six states and three measurements."""
+    step = 0.01
+    F = np.eye(6) + step * np.eye(6, k=3)
+    model = F, 1e-3 * np.eye(6), np.eye(3, 6), 1e-2 * np.eye(3)
+    measured = np.random.default_rng(0).normal(size=(ticks, 3))
+    start = Estimate(mean=np.zeros(6), covariance=np.eye(6))
+
+    @graph
+    def g(z: Stream[real(3)]):  # type: ignore[valid-type]
+        memory = delay(start, name="estimate")
+        now = kalman_step(memory, z, model=model)
+        memory.feed(now)
+        return now
+
+    built, inputs = g.build(), {"z": Series(np.arange(ticks) * 10_000_000, measured)}
+    ours = loop(built, inputs)
+    scale = 1e9 / ticks
+    try:
+        peer = floor("kalman").floor_kalman
+    except ImportError as error:
+        return [missing("Kalman step 6/3, C", ours() * scale, "ns", "Eigen", error)]
+    flat = np.concatenate([a.ravel() for a in (*model, start.mean, start.covariance)])
+    mean, covariance = np.empty((ticks, 6)), np.empty((ticks, 6, 6))
+    peer.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 4]
+    pointers = [a.ctypes.data for a in (flat, measured, mean, covariance)]
+    peer(ticks, *pointers)
+    found = simulate(built, inputs, engine="c").output
+    np.testing.assert_allclose(found.mean, mean, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=0.0, atol=1e-9)
+    a, b, ratio = interleaved(
+        lambda: ours() * scale, lambda: seconds(lambda: peer(ticks, *pointers)) * scale, repeats
+    )
+    return [Row("Kalman step 6/3, C", a, b, "ns", "Eigen -O3", ratio, "ratio <= 1.5", ratio <= 1.5)]
+
+
+def eskf(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
+    """Microseconds a tick of `ins_eskf`, against our Python engine."""
+    built, inputs, direct = inertial.case(duration)
+    inertial.check(simulate(built, inputs, engine="c"), *inertial.direct_eskf.run(**direct)[:2])
+    ours = loop(built, inputs)
+    scale = 1e6 / len(direct["time"])
+    a, b, ratio = interleaved(lambda: ours() * scale, lambda: simulate(built, inputs).wall_s * scale, repeats)
+    return [Row("ins_eskf, c", a, b, "us/tick", "our Python engine", ratio, "ratio <= 1/50", ratio <= 0.02)]
