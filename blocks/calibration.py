@@ -13,7 +13,7 @@ import numpy as np
 from flowgraph import block
 from flowgraph.blocks.signals import Imu
 
-__all__ = ["subtract_rest_bias"]
+__all__ = ["silence_frozen_gyro", "subtract_rest_bias"]
 
 _NEVER = np.int64(-(2**62))
 
@@ -63,3 +63,43 @@ def subtract_rest_bias(
 @subtract_rest_bias.init
 def _(imu: Any, **_: Any) -> dict[str, Any]:
     return {"first": _NEVER, "count": np.float64(0.0), "bias": np.zeros(6)}
+
+
+@block
+def silence_frozen_gyro(
+    state,  # type: ignore[no-untyped-def]
+    imu: Imu,
+    *,
+    seconds: float,
+    tolerance: float = 0.04,
+    least: float = 0.1,
+    dt: float,
+    xp: Any,
+) -> tuple[Any, Imu]:
+    """Take a gyroscope that has frozen for one that reads nothing: its rate becomes zero.
+
+    Some units stop measuring when they are knocked, and for a second or two give one level on each axis. A
+    reading is frozen when for `seconds` none has been further than `tolerance` from the first of them on any
+    axis, and on every axis it is at least `least`: no body that is held or flies turns so steadily about an
+    axis oblique to all three of its own.
+
+    Fires with each reading. The specific force passes through.
+
+    Args:
+        imu: rad/s and m/s^2, body; without its bias at rest.
+        seconds: how long; longer than any steady turn.
+        tolerance, least: rad/s.
+
+    State: the first of the readings that are alike (rad/s), and for how long they have been (s).
+    """
+    near = xp.all(xp.abs(imu.gyro - state["level"]) <= tolerance)
+    alike = xp.where(near, state["alike"] + dt, 0.0)
+    level = xp.where(near, state["level"], imu.gyro)
+    frozen = (alike >= seconds) & xp.all(xp.abs(level) >= least)
+    rate = xp.where(frozen, 0.0 * imu.gyro, imu.gyro)
+    return {"level": level, "alike": alike}, Imu(gyro=rate, specific_force=imu.specific_force)
+
+
+@silence_frozen_gyro.init
+def _(imu: Any, **_: Any) -> dict[str, Any]:
+    return {"level": np.zeros(3), "alike": np.float64(0.0)}

@@ -31,9 +31,11 @@ from flowgraph.errors import DataError
 __all__ = [
     "attitude_errors",
     "error_summary",
+    "euler_angles",
     "interpolate_pose",
     "nees",
     "nees_summary",
+    "orientation_errors",
     "pose_errors",
     "state_error",
     "within_truth",
@@ -230,3 +232,62 @@ def _true_velocity(truth: Series, time: np.ndarray) -> np.ndarray:
     """The truth's velocity (n, 3), interpolated."""
     seconds, at = (truth.time - time[0]) * 1e-9, (time - time[0]) * 1e-9
     return np.stack([np.interp(at, seconds, column) for column in truth["velocity"].T], axis=-1)
+
+
+def euler_angles(attitude: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (..., 3) in rad of attitudes (..., 4): R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = np.asarray(to_matrix(attitude, xp=np))
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
+    return np.stack([roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])], axis=-1)
+
+
+def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare attitudes with the truth, at the estimate's times that it covers.
+
+    Args:
+        estimate: with the field `attitude`.
+        truth: with the field `attitude`; where an attitude is NaN, or one of the two on both sides of a time
+            is, there is no truth.
+        settle: seconds after the estimate's first tick that are left out.
+
+    Returns:
+        roll_rmse_rad, pitch_rmse_rad and yaw_rmse_rad, of the differences of Euler angles, each wrapped into
+        (-pi, pi]; total_rmse_deg, heading_rmse_deg and inclination_rmse_deg, of the geodesic angle and its
+        parts (`tilt_and_heading`); compared_ticks.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
+    if len(truth):
+        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
+        right = np.clip(np.searchsorted(truth.time, chosen.time), 1, max(len(truth) - 1, 1))
+        left = right - 1
+        right = np.minimum(right, len(truth) - 1)
+        part = (chosen.time - truth.time[left]) / np.maximum(truth.time[right] - truth.time[left], 1)
+        q = slerp(truth["attitude"][left], truth["attitude"][right], part)
+        known = np.isfinite(q).all(axis=-1)
+        chosen, q = chosen[known], q[known]
+    if not len(truth) or not len(chosen):
+        raise DataError(
+            "no tick of the estimate lies within the truth",
+            path=estimate.name,
+            expected=f"ticks {settle} s or more after the first, where the truth knows the attitude",
+            got=f"{estimate!r}, {truth!r}",
+            fix="check the time offsets, or make settle smaller",
+        )
+    apart = euler_angles(chosen["attitude"]) - euler_angles(q)
+    wrapped = np.pi - np.remainder(np.pi - apart, 2.0 * np.pi)
+    tilt, heading = tilt_and_heading(chosen["attitude"], q)
+    return {
+        **{f"{n}_rmse_rad": _rms(wrapped[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
+        "total_rmse_deg": _rms(geodesic_angle(chosen["attitude"], q)),
+        "heading_rmse_deg": _rms(heading),
+        "inclination_rmse_deg": _rms(tilt),
+        "compared_ticks": float(len(chosen)),
+    }
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))

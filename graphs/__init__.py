@@ -4,6 +4,7 @@ from flowgraph.graphs.async_kalman import async_kalman
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
+from flowgraph.graphs.gyro_integration import gyro_integration
 from flowgraph.graphs.ins_ekf_pose import ins_ekf_pose
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.ins_particle import ins_particle
@@ -11,7 +12,9 @@ from flowgraph.graphs.ins_ukf_pose import ins_ukf_pose
 from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
 from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.orientation_complementary import orientation_complementary
+from flowgraph.graphs.quaternion_ukf import quaternion_ukf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.roll_pitch import roll_pitch
 from flowgraph.graphs.tag_pose import tag_pose
 from flowgraph.graphs.ukf import ukf
 
@@ -30,4 +33,7 @@ __all__ = [
     "ins_ukf_pose",
     "ins_ukf_velocity",
     "ins_particle",
+    "quaternion_ukf",
+    "roll_pitch",
+    "gyro_integration",
 ]

@@ -8,7 +8,7 @@ import pytest
 from flowgraph import load_flight
 from flowgraph.blocks import geometry as g
 from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
-from flowgraph.blocks.flights.worlds import SENSORS
+from flowgraph.blocks.flights.worlds import SENSORS, TRIP
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.sensors import as_position
 from flowgraph.errors import DeclarationError, UnknownNameError
@@ -101,7 +101,8 @@ def test_worlds_give_a_flight_with_the_usual_streams(kind):
     assert len(flight.streams["vicon"]) == 33
     assert flight.truth is not None
     assert (flight.truth.time == flight.streams["imu"].time).all()
-    np.testing.assert_allclose(flight.info["imu_noise"].gyro, np.sqrt(0.1 / 200.0))
+    density = TRIP["gyro.noise"] if kind == "roundtrip" else np.sqrt(0.1 / 200.0)
+    np.testing.assert_allclose(flight.info["imu_noise"].gyro, density)
     assert flight.info["position_noise"] == flight.info["attitude_noise"] == 0.1
     assert "RMS acceleration" in flight.notes[0]
     errors = pose_errors(flight.streams["vicon"], flight.truth, settle=0.0)

@@ -49,7 +49,7 @@ FLIGHTS: dict[str, Any] = {
 
 @pytest.mark.parametrize("family", FLIGHTS)
 def test_it_is_as_good_as_the_extended_filter(family):
-    """Position and attitude within 2 %, the NEES within 5 %. Over fifty smooth flights: -0.2, 0.0 and +0.1 %."""
+    """Position and attitude within 2 %, the NEES within 5 %; over 50 smooth flights -0.2, 0.0 and 0.1 %."""
     total = {}
     for which in (ekf, ukf):
         scores = []

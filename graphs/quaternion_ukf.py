@@ -1,0 +1,153 @@
+"""The quaternion-based unscented Kalman filter: attitude and body rate from an inertial unit alone.
+
+State: quaternion and body rate; six errors, so twelve sigma points and the centre. Every reading predicts to
+now and corrects.
+
+    predict   q' = q * Exp(w dt)     w' = w         the points are drawn from P + Q dt, at sqrt(n) deviations
+    correct   gyroscope: w           accelerometer: gravity turned into the body
+
+Kraft prints points at sqrt(2 n) deviations with weights 1/(2 n), which doubles the covariance at each step;
+they are at sqrt(n) here, and the centre has no weight. With weighted=True it is the scaled set of Wan and van
+der Merwe instead. Noise, process and correction all multiply from the right, in the body.
+
+Source: E. Kraft, "A quaternion-based unscented Kalman filter for orientation tracking", Fusion 2003, sec. 3.
+The equations stand in `blocks/orientation.py`, `blocks/unscented.py` and `blocks/sigma_points.py`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowgraph import Case, Flight, Result, Stream, clocks_of, collect, delay, graph
+from flowgraph.blocks.calibration import silence_frozen_gyro, subtract_rest_bias
+from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.metrics import orientation_errors
+from flowgraph.blocks.orientation import (
+    STATE,
+    named_orientation,
+    orientation_start,
+    see_rate_and_gravity,
+    stacked_imu,
+    start_orientation,
+    turn_by_rate,
+)
+from flowgraph.blocks.sigma_points import SigmaPoints
+from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.unscented import predict_unscented, update_unscented
+from flowgraph.checks import need_numbers
+
+KRAFT = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0, mean="kraft")
+"""2 n points at sqrt(n) deviations, of weight 1/(2 n)."""
+
+
+@graph
+def quaternion_ukf(
+    imu: Stream[Imu],
+    *,
+    start: Gaussian,
+    attitude_walk: float,
+    rate_walk: float,
+    gyro_noise: float,
+    force_noise: float,
+    points: SigmaPoints = KRAFT,
+    still: float = 0.0,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    frozen: float = 0.0,
+    gate: float | None = None,
+):
+    """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
+
+    `attitude_walk` (rad/sqrt(s)) and `rate_walk` (rad/s/sqrt(s)) drive the state; `gyro_noise` (rad/s) and
+    `force_noise` (m/s^2) are standard deviations of a reading, the latter with all that accelerates the body.
+    When the body stands `still` for some seconds at first, with its vertical along `up`, what the unit reads
+    then is its bias. A gyroscope that is `frozen` for so many seconds is taken to read nothing.
+    Collected: `belief` and `innovation` at every reading.
+    """
+    if still > 0.0:
+        imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
+    if frozen > 0.0:
+        imu = silence_frozen_gyro(imu, seconds=frozen, name="thaw")
+    belief = delay(start, name="belief")
+    prior = predict_unscented(
+        belief,
+        imu,
+        move=turn_by_rate,
+        Q=np.diag(np.repeat([attitude_walk, rate_walk], 3) ** 2),
+        Q_first=True,
+        space=STATE,
+        points=points,
+    )
+    posterior, innovation = update_unscented(
+        prior,
+        stacked_imu(imu, name="reading"),
+        observe=see_rate_and_gravity,
+        R=np.diag(np.repeat([gyro_noise, force_noise], 3) ** 2),
+        space=STATE,
+        points=points,
+        gate=gate,
+    )
+    belief.feed(posterior)
+    collect(innovation, "innovation")
+    return {"belief": named_orientation(posterior)}
+
+
+@quaternion_ukf.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    attitude_walk: float = 0.02,
+    rate_walk: float = 10.0,
+    gyro_noise: float = 0.02,
+    force_noise: float = 2.5,
+    weighted: bool = False,
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+    mean: str = "kraft",
+    still: float | None = None,
+    frozen: float = 0.15,
+    gate: float | None = None,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on a flight with an inertial unit, level, with the heading of the truth if it has one.
+
+    Args:
+        flight: with the stream `imu`.
+        attitude_walk, rate_walk: densities of the random walks, rad/sqrt(s) and rad/s/sqrt(s).
+        gyro_noise, force_noise: standard deviations of one reading, rad/s and m/s^2.
+        weighted: whether the sigma points are the scaled set of alpha, beta and kappa.
+        alpha, beta, kappa: of that set.
+        mean: of quaternions, "kraft" or "markley".
+        still: seconds at the start in which the body rests; told by the flight or its readings if left out.
+        frozen: after so many seconds of one level a gyroscope is taken to read nothing; 0 for never.
+        gate: a reading with a larger normalised innovation squared changes nothing.
+        settle: seconds at the start that the errors leave out.
+    """
+    numbers = {"attitude_walk": attitude_walk, "rate_walk": rate_walk, "gyro_noise": gyro_noise}
+    numbers.update(force_noise=force_noise, alpha=alpha)
+    need_numbers(
+        "quaternion_ukf",
+        positive={**numbers, "gate": gate},
+        not_negative={"still": still, "frozen": frozen, "settle": settle},
+    )
+    inputs = flight.need("quaternion_ukf", "imu")
+    begin = orientation_start(flight, inputs["imu"], still)
+    built = quaternion_ukf.build(
+        **clocks_of(inputs),
+        start=start_orientation(begin.attitude),
+        attitude_walk=attitude_walk,
+        rate_walk=rate_walk,
+        gyro_noise=gyro_noise,
+        force_noise=force_noise,
+        points=SigmaPoints(alpha, beta, kappa, mean) if weighted else SigmaPoints(1.0, 0.0, 0.0, mean),
+        still=begin.still,
+        up=begin.up,
+        frozen=frozen,
+        gate=gate,
+    )
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        return {} if truth is None else orientation_errors(result["belief"], truth, settle=settle)
+
+    return Case(built, inputs, score)
