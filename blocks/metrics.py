@@ -12,7 +12,7 @@ from flowgraph import Series
 from flowgraph.blocks.geometry import geodesic_angle, slerp, tilt_and_heading, to_matrix, world_error
 from flowgraph.errors import DataError
 
-__all__ = ["interpolate_pose", "pose_errors"]
+__all__ = ["euler_angles", "interpolate_pose", "orientation_errors", "pose_errors"]
 
 
 def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +35,7 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
 
     Args:
         estimate: with fields `position` and `attitude`, and perhaps the `covariance` of a `Belief`.
-        truth: with fields `position` and `attitude`.
+        truth: with fields `position` and `attitude`; where they are NaN, nothing is compared.
         settle: seconds after the estimate's first tick that are left out.
 
     Returns:
@@ -58,6 +58,9 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
             fix="check the time offsets, or make settle smaller",
         )
     position, attitude = interpolate_pose(truth, chosen.time)
+    known = np.isfinite(position).all(axis=-1) & np.isfinite(attitude).all(axis=-1)
+    if not known.all():  # the truth has gaps
+        chosen, position, attitude = chosen[known], position[known], attitude[known]
     error = chosen["position"] - position
     tilt, heading = tilt_and_heading(chosen["attitude"], attitude)
     found = {
@@ -79,6 +82,61 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
         found["tilt_3sigma"] = float(np.mean(inside[:, :2]))
         found["heading_3sigma"] = float(np.mean(inside[:, 2]))
     return found
+
+
+def euler_angles(attitude: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (..., 3) in rad of attitudes (..., 4): R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = np.asarray(to_matrix(attitude, xp=np))
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
+    return np.stack([roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])], axis=-1)
+
+
+def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare attitudes with the truth, at the estimate's times that it covers.
+
+    Args:
+        estimate: with the field `attitude`.
+        truth: with the field `attitude`; where an attitude is NaN, or one of the two on both sides of a time
+            is, there is no truth.
+        settle: seconds after the estimate's first tick that are left out.
+
+    Returns:
+        roll_rmse_rad, pitch_rmse_rad and yaw_rmse_rad, of the differences of Euler angles, each wrapped into
+        (-pi, pi]; total_rmse_deg, heading_rmse_deg and inclination_rmse_deg, of the geodesic angle and its
+        parts (`tilt_and_heading`); compared_ticks.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
+    if len(truth):
+        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
+        right = np.clip(np.searchsorted(truth.time, chosen.time), 1, max(len(truth) - 1, 1))
+        left = right - 1
+        right = np.minimum(right, len(truth) - 1)
+        part = (chosen.time - truth.time[left]) / np.maximum(truth.time[right] - truth.time[left], 1)
+        q = slerp(truth["attitude"][left], truth["attitude"][right], part)
+        known = np.isfinite(q).all(axis=-1)
+        chosen, q = chosen[known], q[known]
+    if not len(truth) or not len(chosen):
+        raise DataError(
+            "no tick of the estimate lies within the truth",
+            path=estimate.name,
+            expected=f"ticks {settle} s or more after the first, where the truth knows the attitude",
+            got=f"{estimate!r}, {truth!r}",
+            fix="check the time offsets, or make settle smaller",
+        )
+    apart = euler_angles(chosen["attitude"]) - euler_angles(q)
+    wrapped = np.pi - np.remainder(np.pi - apart, 2.0 * np.pi)
+    tilt, heading = tilt_and_heading(chosen["attitude"], q)
+    return {
+        **{f"{n}_rmse_rad": _rms(wrapped[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
+        "total_rmse_deg": _rms(geodesic_angle(chosen["attitude"], q)),
+        "heading_rmse_deg": _rms(heading),
+        "inclination_rmse_deg": _rms(tilt),
+        "compared_ticks": float(len(chosen)),
+    }
 
 
 def _rms(x: np.ndarray) -> float:
