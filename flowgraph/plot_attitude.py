@@ -92,7 +92,7 @@ def _angle_sigmas(q: np.ndarray, spread: np.ndarray) -> np.ndarray:
     )
     J = np.moveaxis(J, 2, 0)
     variance = np.einsum("nij,njk,nik->ni", J, spread, J)
-    return np.rad2deg(np.sqrt(np.maximum(variance, 0.0)))
+    return np.asarray(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))))
 
 
 def _draw_angles(
@@ -120,6 +120,14 @@ def _draw_angles(
                 (truth.time - start) * 1e-9, _broken(angle), color=TRUTH, lw=0.9, ls="--", label="truth"
             )
             axis.legend(fontsize=7, frameon=False, loc="upper right")
+        shown = drawn[np.isfinite(drawn)]
+        room = max(0.08 * float(np.ptp(shown)), 1.0) if len(shown) else 1.0
+        if (
+            sigmas is not None
+        ):  # near the pole the band of roll and yaw has no bounds; it must not set the scale
+            room = max(room, min(3.3 * float(np.median(sigmas[:, k])), 60.0))
+        if len(shown):
+            axis.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
         _name(axis, NAMES[k] + (", with 3σ" if sigmas is not None else ""), "[deg]")
 
 
