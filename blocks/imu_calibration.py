@@ -51,7 +51,14 @@ G = 9.81
 LONGEST = 0.3
 """The longest window, s: one in which the motion capture lost the body does not count."""
 
-RIDGE = 1e-6
+RIDGE = 1e-4
+CENTRE, SPAN = 512.0, 100.0
+"""Counts are shifted and scaled by these before they are squared, so that the equations stay well
+conditioned."""
+
+LEAST = 50
+"""The fewest windows that a fit is made of."""
+
 SAMPLES = 5
 """Motion capture samples on either side of a window's middle; at 100 Hz the window lasts 0.1 s."""
 
@@ -85,9 +92,9 @@ class Window(Signal):
 
 
 class NormalEquations(Signal):
-    """A^T A and A^T y of both fits, so far.
+    """A^T A and A^T y of both fits, so far, with a = [(c - CENTRE) / SPAN, 1].
 
-    The unknowns of each are 3 x 3 per count and a constant. used: how many windows counted.
+    The unknowns of each are 3 x 3 and a constant. used: how many windows counted.
     """
 
     gyro_square: Array = real(4, 4)
@@ -234,7 +241,7 @@ def collect_equations(
     gate: tuple[float, float] | None = None,
     xp: Any,
 ) -> NormalEquations:
-    """Add a window to A^T A and A^T y, with a = [c, 1]: a a^T and a y^T.
+    """Add a window to A^T A and A^T y, with a = [(c - CENTRE) / SPAN, 1]: a a^T and a y^T.
 
     Args:
         prior, gate: when both are given, a window whose rate or force differs by more than `gate` (rad/s,
@@ -254,7 +261,7 @@ def collect_equations(
             expected = part @ xp.asarray(np.array(scale).T, dtype=kind) + xp.asarray(constant, dtype=kind)
             off = xp.linalg.vecdot(y - expected, y - expected)
             weight = xp.astype(off <= gate[k] ** 2, kind)
-        a = xp.concat([part, one], axis=0)
+        a = xp.concat([(part - CENTRE) / SPAN, one], axis=0)
         added.append((a[:, None] * a[None, :] * weight, a[:, None] * y[None, :] * weight, weight))
     (gg, gy, gw), (ff, fy, fw) = added
     return NormalEquations(
@@ -267,16 +274,20 @@ def collect_equations(
 
 
 @block
-def solve_equations(equations: NormalEquations, *, xp: Any) -> tuple[Array, Array]:
+def solve_equations(equations: NormalEquations, *, xp: Any) -> tuple[Array | None, Array | None]:
     """beta = (A^T A)^-1 A^T y of gyroscope and accelerometer, (4, 3) each: three rows per count, a constant.
 
-    A small multiple of the unit matrix (`RIDGE`) stands in for what has not been seen yet; it is lost in the
-    rounding once there are a few windows.
+    Each is present once `LEAST` windows counted in it. A small multiple of the unit matrix (`RIDGE`) stands
+    in for what has not been seen; it is lost in the rounding once the body has turned about all axes.
     """
-    small = xp.eye(4, dtype=equations.gyro_square.dtype) * RIDGE
-    gyro = xp.linalg.solve(equations.gyro_square + small, equations.gyro_right)
-    force = xp.linalg.solve(equations.force_square + small, equations.force_right)
-    return gyro, force
+    kind = equations.gyro_square.dtype
+    small = xp.eye(4, dtype=kind) * RIDGE
+    back = np.vstack([np.hstack([np.eye(3) / SPAN, np.zeros((3, 1))]), [[-CENTRE / SPAN] * 3 + [1.0]]])
+    per_count = xp.asarray(back, dtype=kind)
+    gyro = per_count @ xp.linalg.solve(equations.gyro_square + small, equations.gyro_right)
+    force = per_count @ xp.linalg.solve(equations.force_square + small, equations.force_right)
+    enough = equations.used >= float(LEAST)
+    return when(enough[0], gyro), when(enough[1], force)
 
 
 def windows_of(

@@ -58,8 +58,8 @@ def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
-    """The ticks of an estimate that can be compared: covered by the truth, `settle` seconds or more after the
-    first.
+    """The ticks of an estimate that can be compared: `settle` seconds or more after the first, and covered by
+    a truth that is not NaN there.
 
     Raises:
         DataError: when there is none.
@@ -67,11 +67,14 @@ def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
     chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
     if len(truth):
         chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
+        p, q = interpolate_pose(truth, chosen.time)
+        known = np.isfinite(p).all(axis=-1) & np.isfinite(q).all(axis=-1)
+        chosen = chosen if known.all() else chosen[known]
     if not len(truth) or not len(chosen):
         raise DataError(
             "no tick of the estimate lies within the truth",
             path=estimate.name,
-            expected=f"ticks {settle} s or more after the first, between the truth's first and last time",
+            expected=f"ticks {settle} s or more after the first, where the truth is known",
             got=f"{estimate!r}, {truth!r}",
             fix="check the time offsets, or make settle smaller",
         )
@@ -259,24 +262,8 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
-    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
-    if len(truth):
-        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
-        right = np.clip(np.searchsorted(truth.time, chosen.time), 1, max(len(truth) - 1, 1))
-        left = right - 1
-        right = np.minimum(right, len(truth) - 1)
-        part = (chosen.time - truth.time[left]) / np.maximum(truth.time[right] - truth.time[left], 1)
-        q = slerp(truth["attitude"][left], truth["attitude"][right], part)
-        known = np.isfinite(q).all(axis=-1)
-        chosen, q = chosen[known], q[known]
-    if not len(truth) or not len(chosen):
-        raise DataError(
-            "no tick of the estimate lies within the truth",
-            path=estimate.name,
-            expected=f"ticks {settle} s or more after the first, where the truth knows the attitude",
-            got=f"{estimate!r}, {truth!r}",
-            fix="check the time offsets, or make settle smaller",
-        )
+    chosen = within_truth(estimate, truth, settle)
+    q = interpolate_pose(truth, chosen.time)[1]
     apart = euler_angles(chosen["attitude"]) - euler_angles(q)
     wrapped = np.pi - np.remainder(np.pi - apart, 2.0 * np.pi)
     tilt, heading = tilt_and_heading(chosen["attitude"], q)

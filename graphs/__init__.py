@@ -5,12 +5,14 @@ from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.gyro_integration import gyro_integration
+from flowgraph.graphs.imu_calibration import imu_calibration
 from flowgraph.graphs.ins_ekf_pose import ins_ekf_pose
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.ins_particle import ins_particle
 from flowgraph.graphs.ins_ukf_pose import ins_ukf_pose
 from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
 from flowgraph.graphs.kalman import kalman
+from flowgraph.graphs.marg import marg
 from flowgraph.graphs.orientation_complementary import orientation_complementary
 from flowgraph.graphs.quaternion_ukf import quaternion_ukf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
@@ -25,7 +27,9 @@ __all__ = [
     "async_kalman",
     "ekf",
     "kalman",
+    "imu_calibration",
     "ins_eskf",
+    "marg",
     "rbpf_indoor",
     "ukf",
     "tag_pose",

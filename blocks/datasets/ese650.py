@@ -150,6 +150,7 @@ def _calibration(
         other = _set(folder, m, late, bad_time)
         counts, truth = other.streams["counts"], other.truth
         assert truth is not None
+        truth = truth[np.isfinite(truth["attitude"]).all(axis=1)]
         readings = np.concatenate([counts["gyro"], counts["force"]], axis=1)
         windows.append(windows_of(counts.time, readings, truth.time, truth["attitude"]))
     return fit_counts(windows), tuple(by)

@@ -145,10 +145,10 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             gyro_bias=x[:, 10:13],
             accelerometer_bias=x[:, 13:16],
         )
-        truth = Series(time, state, name="truth")
+        truth = Series(time, state, name="truth", gaps=True)
     elif tum is not None:
         time, x = table("truth", tum, 7, delimiter=None, seconds=True, quaternion=3)
-        truth = Series(time, Pose(position=x[:, :3], attitude=x[:, [6, 3, 4, 5]]), name="truth")
+        truth = Series(time, Pose(position=x[:, :3], attitude=x[:, [6, 3, 4, 5]]), name="truth", gaps=True)
     else:
         notes.append("no ground truth: no state_groundtruth_estimate0/data.csv and no groundtruth.tum")
     name = mav.parent.name if mav.name == "mav0" else mav.name

@@ -148,6 +148,9 @@ def present(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rows (n, ...) without a NaN, and their times; what is left out is counted in `notes` and `absent`.
 
+    Of the truth, rows with a NaN stay where they lie between others, all NaN: they say that nothing is known
+    there, and keep errors from being measured against what would be interpolated.
+
     Raises:
         DataError: when no row is left.
     """
@@ -164,6 +167,10 @@ def present(
             got=f"{len(time)} rows" + (", all with NaN" if len(time) else ""),
             fix="choose another recording",
         )
+    if name == "truth":
+        known = np.flatnonzero(~broken)
+        table = np.where(broken[:, None], np.nan, table)[known[0] : known[-1] + 1]
+        return time[known[0] : known[-1] + 1], table
     return time[~broken], table[~broken]
 
 
@@ -274,7 +281,7 @@ class Recording:
         if checked:
             for field, part in parts.items():
                 plausible(field, part, f"{place}: {name}.{field}")
-        series = Series(time, signal(**parts), name=name)
+        series = Series(time, signal(**parts), name=name, gaps=name == "truth")
         if name == "truth":
             self.truth = series
         else:
@@ -295,7 +302,7 @@ def plausible(field: str, values: np.ndarray, place: str, fix: str = "convert th
     if field not in PLAUSIBLE or not len(values):
         return
     least, most, unit, why = PLAUSIBLE[field]
-    middle = float(np.median(np.linalg.norm(values, axis=-1)))
+    middle = float(np.nanmedian(np.linalg.norm(values, axis=-1)))
     if not least <= middle <= most:
         raise DataError(
             "these values are not in the unit they should be in",

@@ -150,6 +150,7 @@ def _measure(
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
     from flowgraph.plot import plot_navigation, plot_result
+    from flowgraph.plot_attitude import plot_orientation
 
     with writes(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -163,9 +164,12 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
     if "attitude" in estimate.leaves and len(estimate):
         with writing(out / "estimate.tum") as file:
             write_tum(estimate, file)
-    if "position" in result[case.estimate].leaves:
+    if "position" in estimate.leaves:
         with writing(out / "navigation.png") as file:
-            plot_navigation(result[case.estimate], flight.truth, file)
-    else:  # such as an attitude alone
+            plot_navigation(estimate, flight.truth, file)
+    elif "attitude" in estimate.leaves:
+        with writing(out / "orientation.png") as file:
+            plot_orientation(estimate, flight.truth, file)
+    else:
         with writing(out / "outputs.png") as file:
             plot_result(result, file)

@@ -1,0 +1,145 @@
+"""Orientation from gyroscope, accelerometer and magnetometer (MARG), with the gyroscope's bias.
+
+Two error-state filters, of the tilt and of the heading, so that a magnet cannot tilt the estimate:
+
+    level     predict   v' = v + (R f + g) dt,  q' = q * Exp((w - b) dt)      every reading of the IMU
+              correct   0 = v + noise;  at rest also  w = b + noise
+    heading   predict   var' = var + drift^2 dt
+              correct   north - atan2(m_y, m_x),  m = R field                 every reading of the field
+
+An acceleration is told from a tilt by the velocity, which must stay small; a disturbed field by its strength
+and its dip. The equations stand in `blocks/marg.py`.
+
+Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, secs.
+5-7; D. Laidig and T. Seel, "VQF", Information Fusion 91, 2023.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph, latest
+from flowgraph.blocks.alignment import static_alignment
+from flowgraph.blocks.datasets.scores import scored_errors
+from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.marg import (
+    UNIT,
+    FieldTrust,
+    HeadingBelief,
+    LevelBelief,
+    RestRule,
+    detect_rest,
+    hold_velocity,
+    join_orientation,
+    predict_heading,
+    predict_level,
+    start_heading,
+    start_level,
+    update_heading,
+)
+from flowgraph.blocks.signals import Imu, MagneticField
+from flowgraph.checks import need_numbers
+
+_REST, _TRUST = RestRule(), FieldTrust()
+
+
+@graph
+def marg(
+    imu: Stream[Imu],
+    magnetometer: Stream[MagneticField],
+    *,
+    start: LevelBelief,
+    heading: HeadingBelief,
+    noise: ImuNoise,
+    speed: float = 0.6,
+    speed_memory: float = 0.3,
+    drift: float = 5e-3,
+    scale: float = 0.01,
+    rest: RestRule = _REST,
+    trust: FieldTrust = _TRUST,
+    north: float = np.pi / 2.0,
+):
+    """Orientation and gyroscope bias from nine axes, tilt and heading apart.
+
+    Collected: `belief` at every reading, and `rest` and `heading` beside it.
+    """
+    ticks = imu | magnetometer
+    tilt, angle = delay(start, name="tilt"), delay(heading, name="angle")
+    reading = latest(imu, init=Imu.at_rest(), at=ticks, name="reading")
+    still = detect_rest(reading, rule=rest, name="rest")
+    moved = predict_level(tilt, reading, noise=noise, scale=scale)
+    level = hold_velocity(
+        moved, reading, still, noise=noise, speed=speed, speed_memory=speed_memory, name="level"
+    )
+    wandered = predict_heading(angle, level, reading, still, drift=drift, scale=scale)
+    found = update_heading(wandered, level, magnetometer, trust=trust, north=north, name="heading")
+    tilt.feed(level)
+    angle.feed(found)
+    return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}
+
+
+@marg.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    speed: float = 0.6,
+    speed_memory: float = 0.3,
+    drift: float = 5e-3,
+    scale: float = 0.01,
+    heading_density: float = 0.2,
+    align: float = 2.0,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on a flight with an IMU and a magnetometer, aligned by its first readings.
+
+    Where the body rests at the start, the alignment is the mean of up to `align` seconds, and gives the
+    gyroscope's bias; otherwise it is that of one reading. No truth is used.
+
+    Args:
+        flight: with the streams `imu` and `magnetometer` (MagneticField).
+        speed: m/s, how fast the body usually moves; speed_memory: s, for how long one way.
+        drift: rad/s/sqrt(Hz), of the heading without a field.
+        scale: s^(1/2), how fast an error of the gyroscope's scale adds up.
+        heading_density: rad/sqrt(Hz), of the heading that an undisturbed field shows.
+        align: s, the longest alignment.
+        settle: seconds at the start that the errors leave out, unless the flight says which times count.
+
+    Raises:
+        DataError: where the flight lacks a stream. DeclarationError: for a setting that is out of range.
+    """
+    need_numbers(
+        "marg",
+        positive={
+            "speed": speed,
+            "speed_memory": speed_memory,
+            "heading_density": heading_density,
+            "align": align,
+        },
+        not_negative={"drift": drift, "scale": scale, "settle": settle},
+    )
+    inputs = flight.need("marg", "imu", "magnetometer")
+    imu, field = inputs["imu"], inputs["magnetometer"]
+    earth = flight.info.get("magnetic_field", (0.0, 1.0, -1.0))
+    north = math.atan2(earth[1], earth[0])
+    found = static_alignment(imu, field, seconds=align, north=north)
+    start, heading = start_level(found), start_heading(found, field["field"][0])
+    noise = flight.info.get("imu_noise", UNIT)
+    built = marg.build(
+        **clocks_of(inputs),
+        start=start,
+        heading=heading,
+        noise=noise,
+        speed=speed,
+        speed_memory=speed_memory,
+        drift=drift,
+        scale=scale,
+        trust=FieldTrust(density=heading_density),
+        north=north,
+    )
+
+    def score(result: Result) -> dict[str, float]:
+        return scored_errors(result["belief"], flight, settle=settle)
+
+    return Case(built, inputs, score)
