@@ -7,7 +7,10 @@ from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.orientation_complementary import orientation_complementary
+from flowgraph.graphs.outdoor_eskf import outdoor_eskf
+from flowgraph.graphs.particle import particle
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 
 __all__ = [
     "complementary",
@@ -17,5 +20,8 @@ __all__ = [
     "ekf",
     "kalman",
     "ins_eskf",
+    "particle",
     "rbpf_indoor",
+    "outdoor_eskf",
+    "rbpf_outdoor",
 ]
