@@ -154,7 +154,7 @@ def test_a_gap_in_optical_flow_is_refused():
     f = flight()
     flow: Series = f.streams["optical_flow"]
     some = flow[np.arange(len(flow)) != 3]
-    with pytest.raises(DataError, match=r"optical flow has a gap[\s\S]*row 3"):
+    with pytest.raises(DataError, match="row 3: optical flow has a gap"):
         rbpf_outdoor.case(dataclasses.replace(f, streams={**f.streams, "optical_flow": some}))
 
 
