@@ -7,12 +7,14 @@ given the very same knowledge, and be compared.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.errors import DataError, DeclarationError
 
@@ -67,10 +69,14 @@ class OutdoorSensors:
 
 @dataclass(frozen=True)
 class OutdoorStart:
-    """Where a filter starts: position (3,) m, attitude (4,) body to world; it is taken to be at rest."""
+    """Where a filter starts: position (3,) m, attitude (4,) body to world; it is taken to be at rest.
+
+    spread: how sure that is.
+    """
 
     position: np.ndarray
     attitude: np.ndarray
+    spread: StartSpread
 
 
 def attitude_of_two(force: npt.ArrayLike, field: npt.ArrayLike, *, earth: npt.ArrayLike) -> np.ndarray:
@@ -136,7 +142,21 @@ def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], Outdo
     )
     force, field = streams["imu"]["specific_force"][0], streams["magnetometer"]["field"][0]
     turn = attitude_of_two(force, field, earth=sensors.field)
-    return streams, sensors, OutdoorStart(streams["gps"]["position"][0], turn)
+    return (
+        streams,
+        sensors,
+        OutdoorStart(streams["gps"]["position"][0], turn, _spread(sensors, streams["imu"])),
+    )
+
+
+def _spread(sensors: OutdoorSensors, imu: Series) -> StartSpread:
+    """How wrong an attitude of one force and one field is; what tilts the field turns the heading too."""
+    period = float(np.median(np.diff(imu.time))) * 1e-9 if len(imu) > 1 else 1.0
+    tilt = max(sensors.imu.accelerometer / math.sqrt(period) / 9.81, 0.01)
+    x, y, z = sensors.field
+    level = max(math.hypot(x, y), 1e-12)
+    heading = math.hypot(sensors.magnetometer / level, tilt * z / level)
+    return StartSpread(tilt=tilt, heading=min(heading, math.pi))
 
 
 def _three(values: npt.ArrayLike) -> Vector:

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, block
-from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.extended import PoseBelief
 from flowgraph.blocks.geometry import (
     conjugate,
@@ -35,13 +34,13 @@ from flowgraph.blocks.signals import Imu, OpticalFlow
 
 __all__ = [
     "FLOW",
+    "FieldObserver",
     "OUTDOOR",
+    "PositionObserver",
     "flow_vector",
     "new_picture",
     "observe_distance",
-    "observe_field",
     "observe_flow",
-    "observe_position",
     "outdoor_pose",
     "predict_clone",
     "start_outdoor",
@@ -116,7 +115,7 @@ def predict_clone(
     )
 
 
-class observe_position:
+class PositionObserver:
     """h(x) = p + R(q) lever, in m, world.
 
     Args:
@@ -134,7 +133,7 @@ class observe_position:
         return p + _times(R, arm), H
 
 
-class observe_field:
+class FieldObserver:
     """h(x) = R(q)^T earth / noise: a magnetic field in units of its noise, body.
 
     Args:
@@ -201,11 +200,11 @@ def outdoor_pose(belief: Gaussian) -> PoseBelief:
     return PoseBelief(position=p, velocity=v, attitude=q, covariance=belief.covariance[..., :9, :9])
 
 
-def start_outdoor(start: OutdoorStart, *, spread: StartSpread) -> Gaussian:
+def start_outdoor(start: OutdoorStart) -> Gaussian:
     """A belief to start from, at rest, with a picture taken. Tilt and heading are about world axes."""
     R = np.asarray(to_matrix(start.attitude, xp=np))
     P = np.zeros((15, 15))
-    P[:3, :3], P[3:6, 3:6] = np.eye(3) * spread.position**2, np.eye(3) * spread.velocity**2
-    P[6:9, 6:9] = R.T @ np.diag(np.square([spread.tilt, spread.tilt, spread.heading])) @ R
+    P[:3, :3], P[3:6, 3:6] = np.eye(3) * start.spread.position**2, np.eye(3) * start.spread.velocity**2
+    P[6:9, 6:9] = R.T @ np.diag(np.square([start.spread.tilt, start.spread.tilt, start.spread.heading])) @ R
     pose = [start.position, np.zeros(3), start.attitude, start.position, start.attitude]
     return Gaussian(mean=np.concatenate(pose), covariance=_TAKEN @ P @ _TAKEN.T)

@@ -24,7 +24,6 @@ import numpy as np
 
 from flowgraph import Array, Signal, block, real
 from flowgraph.blocks import lanes
-from flowgraph.blocks.alignment import StartSpread
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor import OutdoorStart
 from flowgraph.blocks.particles import log_sum_exp, start_cloud
@@ -95,8 +94,8 @@ def predict_outdoor(
 ) -> OutdoorCloud:
     """Carry the cloud over `dt` seconds: each attitude by a drawn turn, the rest by a Kalman prediction.
 
-        q' = q * Exp(gyro dt + noise.gyro sqrt(dt) e),  e ~ N(0, I) for each particle
-        a = R(q') specific_force + gravity
+        turn = gyro dt + noise.gyro sqrt(dt) e,  e ~ N(0, I) for each particle
+        q' = q * Exp(turn)      a = R(q * Exp(turn/2)) specific_force + gravity
         v' = v + a dt      p' = p + v dt + a dt^2/2      s' = s + v dt + a dt^2/2      P' = F P F^T + Q
 
     s is the displacement since the last picture. Q is white noise on the acceleration, noise.accelerometer^2
@@ -111,10 +110,11 @@ def predict_outdoor(
     kind, n = cloud.motion.dtype, cloud.log_weight.shape[-1]
     errors = xp.asarray(draw.normal("gyro", (3, n)), dtype=kind)
     turn = imu.gyro[:, None] * dt + errors * (noise.gyro * xp.sqrt(dt))
-    attitude = lanes.multiply(cloud.attitude, lanes.exponential(turn, xp=xp), xp=xp)
-    attitude = lanes.normalize(attitude, xp=xp)
+    half = lanes.exponential(0.5 * turn, xp=xp)
+    middle = lanes.multiply(cloud.attitude, half, xp=xp)
+    attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
     down = xp.asarray(gravity, dtype=kind)[:, None]
-    step = (lanes.rotate(attitude, imu.specific_force, xp=xp) + down) * dt
+    step = (lanes.rotate(middle, imu.specific_force, xp=xp) + down) * dt
     path = (cloud.motion[_VELOCITY, :] + 0.5 * step) * dt
     F = xp.eye(9, dtype=kind) + xp.asarray(_DRIFT, dtype=kind) * dt
     W, W2, W3 = (xp.asarray(table * noise.accelerometer**2, dtype=kind) for table in _WHITE)
@@ -160,9 +160,7 @@ def correct_position(
 
 
 @block
-def correct_distance(
-    cloud: OutdoorCloud, distance: Range | None, *, noise: float, xp: Any
-) -> OutdoorCloud:
+def correct_distance(cloud: OutdoorCloud, distance: Range | None, *, noise: float, xp: Any) -> OutdoorCloud:
     """A partial Kalman update of each particle with a distance to the ground (world z = 0) along body -z.
 
     z = p_z / R_33(q) + N(0, noise^2): given the attitude, linear in the position.
@@ -308,14 +306,12 @@ def take_outdoor_ancestors(cloud: OutdoorCloud, ancestors: Ancestors, *, xp: Any
     )
 
 
-def start_outdoor_cloud(
-    particles: int, start: OutdoorStart, *, seed: int = 0, spread: StartSpread
-) -> OutdoorCloud:
+def start_outdoor_cloud(particles: int, start: OutdoorStart, *, seed: int = 0) -> OutdoorCloud:
     """A cloud to start from, equally weighted and at rest, with a picture taken."""
     plain = start_cloud(
-        particles, seed=seed, position=start.position, attitude=start.attitude, spread=spread
+        particles, seed=seed, position=start.position, attitude=start.attitude, spread=start.spread
     )
-    variance = np.repeat([spread.velocity**2, spread.position**2, 0.0], 3)
+    variance = np.repeat([start.spread.velocity**2, start.spread.position**2, 0.0], 3)
     return OutdoorCloud(
         log_weight=plain.log_weight,
         attitude=plain.attitude,

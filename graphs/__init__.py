@@ -14,8 +14,11 @@ from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
 from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.marg import marg
 from flowgraph.graphs.orientation_complementary import orientation_complementary
+from flowgraph.graphs.outdoor_eskf import outdoor_eskf
+from flowgraph.graphs.particle import particle
 from flowgraph.graphs.quaternion_ukf import quaternion_ukf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
+from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.graphs.roll_pitch import roll_pitch
 from flowgraph.graphs.tag_pose import tag_pose
 from flowgraph.graphs.ukf import ukf
@@ -40,4 +43,7 @@ __all__ = [
     "quaternion_ukf",
     "roll_pitch",
     "gyro_integration",
+    "particle",
+    "outdoor_eskf",
+    "rbpf_outdoor",
 ]

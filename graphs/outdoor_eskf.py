@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Flight, Result, Stream, collect, delay, graph, latest, timing_of
-from flowgraph.blocks.alignment import StartSpread
+from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.kalman import Gaussian, update_extended
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.outdoor_belief import (
     FLOW,
     OUTDOOR,
+    FieldObserver,
+    PositionObserver,
     flow_vector,
     new_picture,
     observe_distance,
-    observe_field,
     observe_flow,
-    observe_position,
     outdoor_pose,
     predict_clone,
     start_outdoor,
@@ -55,19 +55,22 @@ def outdoor_eskf(
     """
     s = sensors
     belief = delay(start, name="belief")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    last = delay(Imu.at_rest(), name="last_control")
     ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
-    now = predict_clone(belief, control, noise=s.imu, at=ticks, name="predict")
+    control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
+    now = predict_clone(belief, between_imu(last, control), noise=s.imu, name="predict")
     readings: dict[str, tuple[Stream, Any, float]] = {
-        "gps": (gps.map(lambda z: z.position), observe_position(s.gps_lever), s.gps),
-        "gps2": (gps2.map(lambda z: z.position), observe_position(s.gps2_lever), s.gps2),
+        "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),
+        "gps2": (gps2.map(lambda z: z.position), PositionObserver(s.gps2_lever), s.gps2),
         "magnetometer": (
-            magnetometer.map(lambda z: z.field / s.magnetometer), observe_field(s.field, s.magnetometer), 1.0,
+            magnetometer.map(lambda z: z.field / s.magnetometer), FieldObserver(s.field, s.magnetometer), 1.0,
         ),
     }  # fmt: skip
     for name, (reading, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
-        now, innovation = update_extended(now, reading, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}")
+        now, innovation = update_extended(
+            now, reading, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}"
+        )
         collect(innovation, f"{name}_innovation")
     now, innovation = update_extended(
         now, altimeter.map(lambda z: z.distance[..., None]),
@@ -80,6 +83,7 @@ def outdoor_eskf(
     )  # fmt: skip
     collect(innovation, "optical_flow_innovation")
     now = new_picture(now, optical_flow, name="picture")
+    last.feed(control)
     belief.feed(now)
     return {"belief": outdoor_pose(now)}
 
@@ -95,7 +99,7 @@ def for_flight(flight: Flight, *, settle: float = 1.0) -> Case:
     need_numbers("outdoor_eskf", not_negative={"settle": settle})
     inputs, sensors, first = outdoor_flight(flight, "outdoor_eskf")
     clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    start = start_outdoor(first, spread=StartSpread())
+    start = start_outdoor(first)
     built = outdoor_eskf.build(**clocks, start=start, sensors=sensors)
     truth = flight.truth
 

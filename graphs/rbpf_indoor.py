@@ -132,9 +132,7 @@ def rbpf_indoor(
         imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
     cloud = delay(start, name="cloud")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = predict(
-        cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon
-    )
+    prior = predict(cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
     posterior = update(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
     )

@@ -27,7 +27,7 @@ from flowgraph import (
     merge,
     timing_of,
 )  # fmt: skip
-from flowgraph.blocks.alignment import StartSpread
+from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.outdoor_cloud import (
@@ -79,9 +79,12 @@ def rbpf_outdoor(
     """
     s = sensors
     cloud = delay(start, name="cloud")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    last = delay(Imu.at_rest(), name="last_control")
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
-    now = predict_outdoor(cloud, control, noise=s.imu, draws=f"{draws}.attitude", at=imu | seen, name="predict")
+    control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
+    now = predict_outdoor(
+        cloud, between_imu(last, control), noise=s.imu, draws=f"{draws}.attitude", name="predict"
+    )
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
@@ -94,6 +97,7 @@ def rbpf_outdoor(
         plain, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", at=seen, name="ancestors"
     )
     fresh = take_outdoor_ancestors(now, ancestors, at=seen, name="resample")
+    last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
     return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
 
@@ -137,7 +141,7 @@ def for_flight(
     clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
     built = rbpf_outdoor.build(
         **clocks,
-        start=start_outdoor_cloud(particles, first, seed=seed, spread=StartSpread()),
+        start=start_outdoor_cloud(particles, first, seed=seed),
         sensors=sensors,
         resample_below=resample_below,
         scheme=scheme,

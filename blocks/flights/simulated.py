@@ -1,7 +1,7 @@
 """Simulated flights. `sim`: 1 s at rest, then a smooth figure in space, with an IMU and a motion capture.
 
 `sim:thesis`, `sim:roundtrip` and `sim:hover` go through the simulated world with sensors of choice: see
-`worlds`. What follows is the figure of `sim`.
+`worlds`; `sim:plane` is a point in the plane: see `plane`. What follows is the figure of `sim`.
 
 Position and yaw are sums of sinusoids of a phase that starts slowly, so every derivative is exact. Thrust
 must carry gravity and the acceleration, which fixes the body's z axis; with the yaw that fixes the attitude,
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights import worlds
+from flowgraph.blocks.flights import plane, worlds
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
@@ -43,7 +43,7 @@ DEFAULTS: Mapping[str, float] = {
 """Settings: seconds, Hz, continuous densities, standard deviations of the constant biases, and of the motion
 capture in m and rad."""
 
-SETTINGS: Mapping[str, str | float] = {**worlds.SETTINGS, **DEFAULTS}
+SETTINGS: Mapping[str, str | float] = {**worlds.SETTINGS, **plane.DEFAULTS, **DEFAULTS}
 """All settings that `load` understands: `DEFAULTS` for the figure, `worlds.SETTINGS` for the worlds, whose
 values when left out are their own."""
 
@@ -54,7 +54,8 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
     """Make a flight with the streams `imu` (`Imu`) and `vicon` (`Pose`), or one through a world.
 
     Args:
-        argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`).
+        argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`);
+            plane for a point in the plane (see `plane`).
         seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
             change of one setting does not change the draws of another.
         settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
@@ -69,8 +70,12 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
     """
     if argument in worlds.WORLDS:
         return worlds.load_world(argument, seed=seed, settings=settings)
+    if argument == "plane":
+        return plane.load_plane(seed=seed, settings=settings)
     if argument not in ("", "quadrotor"):
-        raise UnknownNameError("simulated flight", argument, ["quadrotor", *worlds.WORLDS], path="sim")
+        raise UnknownNameError(
+            "simulated flight", argument, ["quadrotor", "plane", *worlds.WORLDS], path="sim"
+        )
     s = _settings(settings or {})
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
     end = round(s["duration"] * 1e9)

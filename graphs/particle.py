@@ -1,0 +1,140 @@
+"""particle: the thesis's "mini" particle filter, of a point in the plane.
+
+A cloud of weighted points moves by a noisy velocity; a measured position weighs it; where the weights have
+become too uneven, it is resampled. Nothing is linearised, and nothing need be Gaussian: that it is here lets
+the filter be compared with the exact answer.
+
+    move        x_i' = x_i + v dt + s sqrt(dt) e_i
+    weigh       w_i' ~ w_i p(z | x_i)
+    resample    where 1 / sum(w_i^2) is below a fraction of the number of points
+
+Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the particle filter; N.
+Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stand in `blocks/plane.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import (
+    Case,
+    DeclarationError,
+    Flight,
+    Result,
+    Stream,
+    delay,
+    graph,
+    latest,
+    merge,
+    timing_of,
+)  # fmt: skip
+from flowgraph.blocks.plane import (
+    PlaneCloud,
+    PlanePosition,
+    PlaneVelocity,
+    average_plane,
+    move_plane,
+    plane_sample_size,
+    resample_plane,
+    start_plane,
+    weigh_plane,
+)
+from flowgraph.checks import need_count, need_numbers
+
+
+@graph
+def particle(
+    velocity: Stream[PlaneVelocity],
+    position: Stream[PlanePosition],
+    *,
+    start: PlaneCloud,
+    velocity_noise: float,
+    position_noise: float,
+    resample_below: float = 0.5,
+    scheme: str = "systematic",
+    draws: str = "particle",
+):
+    """Bootstrap particle filter of a point in the plane.
+
+    Every tick moves the cloud to now; a tick with a position also weighs it and may resample it. Collected:
+    `belief` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at every
+    position.
+    """
+    cloud = delay(start, name="cloud")
+    control = latest(velocity, init=PlaneVelocity(velocity=np.zeros(2)), name="control")
+    moved = move_plane(
+        cloud, control, noise=velocity_noise, draws=f"{draws}.move", at=velocity | position, name="move"
+    )
+    weighed = weigh_plane(moved, position, noise=position_noise, at=position, name="weigh")
+    size = plane_sample_size(weighed, name="size")
+    fresh, ancestors = resample_plane(
+        weighed, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", name="resample"
+    )
+    cloud.feed(merge(fresh, moved, tie="left", name="next"))
+    belief = average_plane(merge(weighed, moved, tie="left", name="now"), name="average")
+    return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
+
+
+@particle.on_flight
+def for_flight(
+    flight: Flight,
+    *,
+    particles: int = 1000,
+    seed: int = 0,
+    resample_below: float = 0.5,
+    scheme: str = "systematic",
+    spread: float = 1.0,
+    settle: float = 1.0,
+) -> Case:
+    """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
+
+    Args:
+        flight: with the streams `velocity` and `position`; info: `velocity_noise`, `position_noise`.
+        particles: how many.
+        seed: of the start's draws; that of the run is given to `simulate`.
+        resample_below: resample when the effective sample size is below this fraction of the particles.
+        scheme: systematic, stratified, residual or multinomial.
+        spread: standard deviation of the start, m.
+        settle: seconds at the start that the error leaves out.
+
+    Raises:
+        DataError: where the flight lacks a stream; DeclarationError: for a setting that is out of range.
+    """
+    need_numbers(
+        "particle",
+        positive={"spread": spread},
+        not_negative={"resample_below": resample_below, "settle": settle},
+    )
+    need_count("particle", "particles", particles, least=1)
+    inputs = flight.need("particle", "velocity", "position")
+    if not {"velocity_noise", "position_noise"} <= set(flight.info):
+        raise DeclarationError(
+            "this flight does not say how noisy it is",
+            path=flight.name,
+            expected="info with velocity_noise and position_noise",
+            got=", ".join(flight.info) or "nothing",
+            fix="choose sim:plane, or build particle with your own sources",
+        )
+    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
+    built = particle.build(
+        **clocks,
+        start=start_plane(particles, seed=seed, spread=spread),
+        velocity_noise=flight.info["velocity_noise"],
+        position_noise=flight.info["position_noise"],
+        resample_below=resample_below,
+        scheme=scheme,
+    )
+    truth = flight.truth
+
+    def score(result: Result) -> dict[str, float]:
+        if truth is None:
+            return {}
+        belief = result["belief"]
+        late = belief.time - belief.time[0] >= round(settle * 1e9)
+        there = truth["position"][np.searchsorted(truth.time, belief.time[late])]
+        apart = np.sum((belief["position"][late] - there) ** 2, axis=-1)
+        return {"position_rmse_m": float(np.sqrt(np.mean(apart)))}
+
+    return Case(built, inputs, score)
