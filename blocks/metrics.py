@@ -47,14 +47,20 @@ def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.nd
 
     A time outside the truth gets its first or last value.
     """
+    return _between(truth, "position", time), _between(truth, "attitude", time)
+
+
+def _between(truth: Series, name: str, time: np.ndarray) -> np.ndarray:
+    """A field of the truth at `time` (n,): linear, and slerp for the attitude."""
     right = np.clip(np.searchsorted(truth.time, time), 1, max(len(truth) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(truth) - 1)
     span = np.maximum(truth.time[right] - truth.time[left], 1)
     part = np.clip((time - truth.time[left]) / span, 0.0, 1.0)  # integer differences: exact before dividing
-    p, q = truth["position"], truth["attitude"]
-    position = p[left] + (p[right] - p[left]) * part[:, None]
-    return position, slerp(q[left], q[right], part)
+    x = truth[name]
+    if name == "attitude":
+        return slerp(x[left], x[right], part)
+    return np.asarray(x[left] + (x[right] - x[left]) * part[:, None])
 
 
 def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
@@ -67,8 +73,9 @@ def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
     chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
     if len(truth):
         chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
-        p, q = interpolate_pose(truth, chosen.time)
-        known = np.isfinite(p).all(axis=-1) & np.isfinite(q).all(axis=-1)
+        known = np.ones(len(chosen), dtype=bool)
+        for name in {"position", "attitude"} & set(truth.leaves):
+            known &= np.isfinite(_between(truth, name, chosen.time)).all(axis=-1)
         chosen = chosen if known.all() else chosen[known]
     if not len(truth) or not len(chosen):
         raise DataError(
@@ -196,7 +203,7 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
         DataError: when no tick of the estimate lies within the truth.
     """
     chosen = within_truth(estimate, truth, settle)
-    q, attitude = chosen["attitude"], interpolate_pose(truth, chosen.time)[1]
+    q, attitude = chosen["attitude"], _between(truth, "attitude", chosen.time)
     found = {
         **_angles(q, attitude),
         "attitude_end_deg": float(geodesic_angle(q[-1:], attitude[-1:])[0]),
@@ -263,7 +270,7 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
         DataError: when no tick of the estimate lies within the truth.
     """
     chosen = within_truth(estimate, truth, settle)
-    q = interpolate_pose(truth, chosen.time)[1]
+    q = _between(truth, "attitude", chosen.time)
     apart = euler_angles(chosen["attitude"]) - euler_angles(q)
     wrapped = np.pi - np.remainder(np.pi - apart, 2.0 * np.pi)
     tilt, heading = tilt_and_heading(chosen["attitude"], q)

@@ -7,14 +7,30 @@ taken for the truth and divided by. That is refused here, by the name of what wo
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from flowgraph import Flight
-from flowgraph.blocks.inertial import ImuNoise
+import numpy as np
+
+from flowgraph import Flight, Series
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.signals import Imu
 from flowgraph.checks import need_numbers
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["check_choice", "check_settings", "given", "imu_noise_of", "noise_of", "reading_of"]
+__all__ = [
+    "check_choice",
+    "check_settings",
+    "given",
+    "gravity_of",
+    "imu_noise_of",
+    "noise_of",
+    "reading_of",
+    "with_imu",
+]
+
+
+WEIGHTLESS = (0.0, 0.0, 0.0)
 
 
 def given(value: Any, otherwise: Any) -> Any:
@@ -78,6 +94,29 @@ def imu_noise_of(
 def reading_of(flight: Flight) -> str:
     """Whether the flight's imu reads an "instant" or, oversampling, the "mean" since its last reading."""
     return "mean" if flight.info.get("imu_oversample", 1) > 1 else "instant"
+
+
+def with_imu(flight: Flight) -> Flight:
+    """The flight, with an `imu` of the thesis's unit, `gyro` and `coordinate_acceleration`, if it has none.
+
+    A coordinate acceleration is the specific force of a world without gravity, and the flight then says so.
+    """
+    parts = ("gyro", "coordinate_acceleration")
+    if "imu" in flight.streams or not set(parts) <= set(flight.streams):
+        return flight
+    gyro, push = (flight.streams[name] for name in parts)
+    kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
+    values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
+    streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
+    told = [flight.info["noise"][name] for name in parts]
+    noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
+    return replace(flight, streams=streams, info={**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS})
+
+
+def gravity_of(flight: Flight) -> tuple[float, float, float]:
+    """The gravity, m/s^2, world, that the flight's imu does not feel."""
+    found: tuple[float, float, float] = flight.info.get("gravity", GRAVITY)
+    return found
 
 
 def check_settings(

@@ -30,7 +30,15 @@ from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.blocks.smoothing import pose_steps
-from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
+from flowgraph.blocks.tuning import (
+    check_settings,
+    given,
+    gravity_of,
+    imu_noise_of,
+    noise_of,
+    reading_of,
+    with_imu,
+)  # fmt: skip
 
 
 @graph
@@ -85,7 +93,8 @@ def for_flight(
     """Start the filter on a flight with an IMU and a motion capture, at the capture's first pose and at rest.
 
     Args:
-        flight: with the streams `imu` and `vicon` (Pose).
+        flight: with the streams `imu` and `vicon` (Pose). In place of `imu` it may have the thesis's unit:
+            `gyro` and `coordinate_acceleration`, with the same times.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
@@ -97,6 +106,7 @@ def for_flight(
     factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
     noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
     check_settings("ekf", {**factors, **noises, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
+    flight = with_imu(flight)
     inputs = flight.need("ekf", "imu", "vicon")
     first, unit = inputs["vicon"][0], imu_noise_of("ekf", flight)
     otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
@@ -111,6 +121,7 @@ def for_flight(
         lever=tuple(flight.info.get("vicon_lever", (0.0, 0.0, 0.0))),
         reading=reading_of(flight),
         gate=gate,
+        gravity=gravity_of(flight),
     )
     score = scorer(flight, pose_errors, settle=settle, steps=pose_steps, smooth=smooth, lag=lag)
     return Case(built, inputs, score)

@@ -27,8 +27,6 @@ from flowgraph import (
     Array,
     Case,
     Flight,
-    Result,
-    Series,
     Stream,
     clocks_of,
     collect,
@@ -41,10 +39,19 @@ from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.pose_model import STATE, carry_pose, imu_density, named_pose, see_pose, start_state
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.tuning import (
+    check_settings,
+    given,
+    gravity_of,
+    imu_noise_of,
+    noise_of,
+    reading_of,
+    with_imu,
+)  # fmt: skip
 from flowgraph.blocks.unscented import predict_unscented, update_unscented
-from flowgraph.checks import need_numbers
 
 _NONE = (0.0, 0.0, 0.0)
 
@@ -65,6 +72,7 @@ def ukf(
     attitude_noise: float,
     lever: tuple[float, float, float] = _NONE,
     gravity: tuple[float, float, float] = GRAVITY,
+    reading: str = "instant",
     points: SigmaPoints = GAUSSIAN,
     gate: float | None = None,
 ):
@@ -75,9 +83,10 @@ def ukf(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(-gravity[2]), name="last_control")
     control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | vicon, name="control")
+    drive = control if reading == "mean" else between_imu(last, control)
     prior = predict_unscented(
         belief,
-        between_imu(last, control),
+        drive,
         move=carry_pose(gravity),
         noise=imu_density(noise),
         space=STATE,
@@ -124,61 +133,28 @@ def for_flight(
         position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
         alpha, beta, kappa: of the sigma points; in float32 or fixed point alpha must be at least 0.1.
         mean: of quaternions, "markley" or "kraft".
-        gate: a measurement with a larger normalised innovation squared changes nothing.
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
         settle: seconds at the start that the errors leave out.
     """
-    need_numbers(
-        "ukf",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-            "alpha": alpha,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
-    imu, unit, gravity = inertial_unit(flight)
-    inputs = {"imu": imu, **flight.need("ukf", "vicon")}
-    truth, first, info = flight.truth, inputs["vicon"][0], flight.info
+    factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
+    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
+    check_settings("ukf", {**factors, **noises, "alpha": alpha, "gate": gate}, settle=settle)
+    flight = with_imu(flight)
+    inputs = flight.need("ukf", "imu", "vicon")
+    first, unit = inputs["vicon"][0], imu_noise_of("ukf", flight)
     otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
     built = ukf.build(
         **clocks_of(inputs),
         start=start_state(first.position, first.attitude),
         noise=unit.scaled(
-            gyro=otherwise if gyro_factor is None else gyro_factor,
-            accelerometer=otherwise if accelerometer_factor is None else accelerometer_factor,
+            gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
         ),
-        position_noise=info.get("position_noise", 0.004) if position_noise is None else position_noise,
-        attitude_noise=info.get("attitude_noise", 0.01) if attitude_noise is None else attitude_noise,
-        lever=tuple(info.get("vicon_lever", _NONE)),
-        gravity=gravity,
+        position_noise=noise_of("ukf", flight, "position_noise", position_noise, 0.004),
+        attitude_noise=noise_of("ukf", flight, "attitude_noise", attitude_noise, 0.01),
+        lever=tuple(flight.info.get("vicon_lever", _NONE)),
+        reading=reading_of(flight),
+        gravity=gravity_of(flight),
         points=SigmaPoints(alpha, beta, kappa, mean),
         gate=gate,
     )
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
-
-    return Case(built, inputs, score)
-
-
-def inertial_unit(flight: Flight) -> tuple[Series, ImuNoise, tuple[float, float, float]]:
-    """The flight's IMU, its noise, and the gravity that its specific force is without.
-
-    The thesis's accelerometer reads the coordinate acceleration, which is a specific force where there is no
-    gravity.
-
-    Raises:
-        DataError: without either unit.
-    """
-    thesis = ("gyro", "coordinate_acceleration")
-    if "imu" in flight.streams or not set(thesis) <= set(flight.streams):
-        return flight.need("ukf", "imu", "vicon")["imu"], flight.info["imu_noise"], GRAVITY
-    gyro, push = (flight.need("ukf", *thesis)[name] for name in thesis)
-    kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
-    values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
-    of_gyro, of_push = (flight.info["noise"][name] for name in thesis)
-    noise = ImuNoise(of_gyro["noise"], of_push["noise"], of_gyro["walk"], of_push["walk"])
-    return Series(kept, values, name="imu"), noise, _NONE
+    return Case(built, inputs, scorer(flight, pose_errors, settle=settle))

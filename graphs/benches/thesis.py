@@ -32,6 +32,7 @@ from flowgraph.blocks.particles import start_cloud
 from flowgraph.blocks.point import start_point
 from flowgraph.blocks.pose_model import start_state
 from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate, Position
+from flowgraph.blocks.tuning import WEIGHTLESS, with_imu
 from flowgraph.checks import need_count
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
@@ -44,7 +45,6 @@ from flowgraph.graphs.ukf import ukf
 __all__ = ["FILTERS", "PUBLISHED", "SETTINGS", "thesis"]
 
 RATE = 200.0
-WEIGHTLESS = (0.0, 0.0, 0.0)
 NEAR = StartSpread(1e-3, 1e-3, 1e-3, 1e-3, 0.0, 0.0)
 """The start is the truth; a covariance of zero has no square root."""
 
@@ -107,11 +107,9 @@ def fly(seed: int, noise: Noise, *, duration: float = 20.0) -> Flight:
         "vicon.noise": noise.pose,
         "vicon.attitude_noise": noise.pose,
     }
-    flight = load_world("thesis", seed=seed, settings=settings)
-    gyro, push = flight.streams["gyro"], flight.streams["coordinate_acceleration"]
-    imu = Series(gyro.time, Imu(gyro=gyro["rate"], specific_force=push["acceleration"]), name="imu")
-    info = {**flight.info, "imu_noise": noise.imu}
-    return Flight(flight.name, {"imu": imu, "vicon": flight.streams["vicon"]}, flight.truth, info)
+    flight = with_imu(load_world("thesis", seed=seed, settings=settings))
+    streams = {name: flight.streams[name] for name in ("imu", "vicon")}
+    return Flight(flight.name, streams, flight.truth, flight.info)
 
 
 def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
