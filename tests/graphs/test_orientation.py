@@ -71,7 +71,7 @@ def test_without_bias_and_noise_the_integral_is_exact():
     "settings", [{"mean": "markley"}, {"weighted": True}, {"weighted": True, "alpha": 0.1}]
 )
 def test_the_options_change_little(settings):
-    found, plain = (score(quaternion_ukf, trip(0, "8"), **s) for s in (settings, {}))
+    found, plain = (score(quaternion_ukf, trip(0, "8"), **chosen) for chosen in ({**settings}, {}))
     assert found["total_rmse_deg"] == pytest.approx(plain["total_rmse_deg"], rel=0.1)
 
 
