@@ -74,7 +74,7 @@ def apriltag(
 
 def _row(data: str, what: str, error: Mapping[str, float], raw: float | None, **more: Any) -> dict[str, Any]:
     position = error.get("position_rmse_m")
-    return {
+    found = {
         "data": data,
         "what": what,
         "position_m": position,
@@ -86,6 +86,7 @@ def _row(data: str, what: str, error: Mapping[str, float], raw: float | None, **
         "published_m": None,
         **more,
     }
+    return {name: round(v, 4) if isinstance(v, float) else v for name, v in found.items()}
 
 
 def _posed(
