@@ -8,7 +8,7 @@ Two error-state filters, of the tilt and of the heading, so that a magnet cannot
               correct   north - atan2(m_y, m_x),  m = R field                 every reading of the field
 
 An acceleration is told from a tilt by the velocity, which must stay small; a disturbed field by its strength
-and its dip. The equations stand in `blocks/marg.py`.
+and its dip. The equations stand in `blocks/marg.py` and `blocks/heading.py`.
 
 Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, secs.
 5-7; D. Laidig and T. Seel, "VQF", Information Fusion 91, 2023.
@@ -23,21 +23,23 @@ import numpy as np
 from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph, latest
 from flowgraph.blocks.alignment import static_alignment
 from flowgraph.blocks.datasets.scores import scored_errors
+from flowgraph.blocks.heading import (
+    FieldTrust,
+    HeadingBelief,
+    join_orientation,
+    predict_heading,
+    start_heading,
+    update_heading,
+)
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.marg import (
     UNIT,
-    FieldTrust,
-    HeadingBelief,
     LevelBelief,
     RestRule,
     detect_rest,
     hold_velocity,
-    join_orientation,
-    predict_heading,
     predict_level,
-    start_heading,
     start_level,
-    update_heading,
 )
 from flowgraph.blocks.signals import Imu, MagneticField
 from flowgraph.checks import need_numbers

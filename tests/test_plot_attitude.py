@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from flowgraph import DataError, Series, UnknownNameError
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
-from flowgraph.blocks.marg import OrientationBelief
+from flowgraph.blocks.heading import OrientationBelief
 from flowgraph.blocks.signals import Attitude
 from flowgraph.cli import app
 from flowgraph.plot_attitude import _angle_sigmas, plot_orientation
