@@ -1,7 +1,7 @@
 """Generated C beside hand-written code of the same work: Eigen for the Kalman step, our Python for `ins_eskf`.
 
-Only the loop over the ticks is timed, in the engine's own library and in the floor's, on data that lies ready in
-memory. What both compute must be equal before anything is timed.
+Only the loop over the ticks is timed, in the engine's own library and in the floor's, on data that lies
+ready in memory. What both compute must be equal before anything is timed.
 """
 
 from __future__ import annotations
