@@ -154,9 +154,6 @@ class Tape:
 
     def reduce(self, kind: str, node: Node, space: Space) -> Node:
         """A sum, product, maximum, minimum, any or all over the loops."""
-        return self.node_reduced(kind, node, space)
-
-    def node_reduced(self, kind: str, node: Node, space: Space) -> Node:
         key = ("reduce", kind, node.order, space)
         if key not in self._made:
             made = Node("reduce", (node,), node.dtype, (), (kind, space), len(self.items), self.origin)

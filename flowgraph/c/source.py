@@ -201,11 +201,9 @@ class _File:
         body = writer.body()
         body += ["    uint64_t made = 0;"]
         for k, present in flags:
-            name = self.names.outputs[k]
             bit = f"made |= UINT64_C({1 << k}); /* {comment(pipeline.outputs[k].name)} */"
             text = writer.ref(present)
             body.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
-            del name
         body.append("    return made;")
         all_text = "\n".join(body)
         unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]

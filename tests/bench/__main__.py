@@ -27,6 +27,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
     "kalman-c": (generated_c.kalman, {"ticks": 200, "repeats": 1}),
     "eskf-c": (generated_c.eskf, {"duration": 0.5, "repeats": 1}),
+    "rbpf-c": (generated_c.rbpf, {"particles_": 50, "duration": 1.5, "repeats": 1}),
     "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),
     "rbpf-libraries": (particles.libraries, {"sizes": (1000,), "steps": 10, "repeats": 1}),
     "resampling": (particles.resampling, {"sizes": (100,), "repeats": 1}),

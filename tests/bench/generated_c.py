@@ -1,7 +1,7 @@
-"""Generated C beside hand-written code of the same work: Eigen for the Kalman step, our Python for `ins_eskf`.
+"""Generated C beside hand-written code of the same work: Eigen for Kalman, NumPy and our Python for others.
 
-Only the loop over the ticks is timed, in the engine's own library and in the floor's, on data that lies ready in
-memory. What both compute must be equal before anything is timed.
+Only the loop over the ticks is timed, in the engine's own library and in the floor's, on data that lies
+ready in memory. What both compute must be equal before anything is timed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flowgraph.inputs import prepare, tape
 from flowgraph.playback import real_leaves
 from flowgraph.random import seed_words
 from flowgraph.series import Series
-from tests.bench import inertial
+from tests.bench import inertial, particles
 from tests.bench.rows import Row, interleaved, missing, seconds
 
 FLOOR = Path(__file__).parent / "floor"
@@ -131,3 +131,16 @@ def eskf(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
     scale = 1e6 / len(direct["time"])
     a, b, ratio = interleaved(lambda: ours() * scale, lambda: simulate(built, inputs).wall_s * scale, repeats)
     return [Row("ins_eskf, c", a, b, "us/tick", "our Python engine", ratio, "ratio <= 1/50", ratio <= 0.02)]
+
+
+def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 5) -> list[Row]:
+    """Microseconds a tick of `rbpf_indoor`, draws included, against the hand-written NumPy loop."""
+    built, direct = particles.case(particles_, duration)
+    by_hand = particles.direct_rbpf.run(**direct)
+    particles.check(simulate(built.graph, built.inputs, engine="c"), by_hand)
+    ours = loop(built.graph, built.inputs)
+    scale = 1e6 / len(by_hand.poses)
+    a, b, ratio = interleaved(
+        lambda: ours() * scale, lambda: seconds(lambda: particles.direct_rbpf.run(**direct)) * scale, repeats
+    )
+    return [Row(f"rbpf_indoor, {particles_:,} particles, c", a, b, "us/tick", "direct NumPy", ratio)]
