@@ -11,8 +11,8 @@ Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans.
 1965). With `error`, the mean over recordings of the logarithm of a metric against the truth, so that a
 recording counts by how much better it gets and not by how hard it is.
 
-What is sought is the logarithm of each parameter, between bounds. Recordings that are held out take no part in
-the search; before and after are given for both.
+What is sought is the logarithm of each parameter, between bounds. Recordings that are held out take no part
+in the search; before and after are given for both.
 """
 
 from __future__ import annotations
