@@ -449,7 +449,7 @@ def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], 
 
     def joined(pick: Callable[[Chunk], np.ndarray]) -> np.ndarray:
         rows = [np.concatenate([pick(part) for part in parts], axis=1) for parts in chunks]
-        return np.concatenate(rows)[:runs]
+        return (rows[0] if len(rows) == 1 else np.concatenate(rows))[:runs]
 
     masks = [part.outputs[k][0] for part in chunks[0]]
     if all(mask.ndim == 1 for mask in masks):  # the same in all runs, and already left out where absent

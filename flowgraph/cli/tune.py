@@ -85,7 +85,7 @@ def tune(
             "": "held out" if j.held_out else "fitted",
         }
         line |= {f"{by} before": f"{j.before:.5g}", "after": f"{j.after:.5g}"}
-        if first in j.metrics:
+        if first is not None and first in j.metrics:
             before, after = j.metrics[first]
             line |= {f"{first} before": f"{before:.4g}", "then": f"{after:.4g}"}
         lines.append(line)

@@ -11,8 +11,8 @@ Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans.
 1965). With `error`, the mean over recordings of the logarithm of a metric against the truth, so that a
 recording counts by how much better it gets and not by how hard it is.
 
-What is sought is the logarithm of each parameter, between bounds. Recordings that are held out take no part in
-the search; before and after are given for both.
+What is sought is the logarithm of each parameter, between bounds. Recordings that are held out take no part
+in the search; before and after are given for both.
 """
 
 from __future__ import annotations
@@ -149,8 +149,10 @@ def tune(
     problem = _Problem(graph, [*recordings, *held_out], settings, measure, metric, engine)
     low, high = (np.log([getattr(f, n) for f in fits]) for n in ("low", "high"))
     start = np.log([f.start or math.sqrt(f.low * f.high) for f in fits])
-    named = lambda x: {f.name: float(v) for f, v in zip(fits, np.exp(x), strict=True)}
     count, best = 0, (math.inf, start)
+
+    def named(x: np.ndarray) -> dict[str, float]:
+        return {f.name: float(v) for f, v in zip(fits, np.exp(x), strict=True)}
 
     def values(points: np.ndarray) -> np.ndarray:
         nonlocal count, best
@@ -169,8 +171,9 @@ def tune(
         steps = np.array([(a - b).sum() for a, b in zip(ends[::2], ends[1::2], strict=True)])
         return float(found[0]), (found[1::2] - found[2::2]) / steps
 
-    from scipy.optimize import minimize
+    from scipy import optimize
 
+    minimize: Callable[..., Any] = optimize.minimize
     how: dict[str, Any] = {"method": method, "bounds": list(zip(low, high, strict=True))}
     if method == "L-BFGS-B":
         limits = {"maxfun": max(1, most // (2 * len(fits) + 1)), "ftol": 1e-8}

@@ -1,8 +1,8 @@
 """Studies: a thousand seeds of one filter, against a process pool over the same filter in filterpy.
 
 Both make each flight, filter it and score it, in two processes; ours to a table on disk, its processes
-started and its program compiled within the time that counts. Of the peer's runs only a sample is done, after one a
-process that is not counted.
+started and its program compiled within the time that counts. Of the peer's runs only a sample is done,
+after one a process that is not counted.
 """
 
 from __future__ import annotations
@@ -100,7 +100,8 @@ def memory_of_particles(*, runs: int = 10_000, fewer: int = 500, duration: float
     against = f"a study of {fewer:,}"
     return [
         Row(f"{name}: memory", peak, None, "MiB", "none: a bound", None, "ours < 2048 MiB", peak < 2048.0),
-        Row(f"{name}: cost of a run", cost, small, "ms", against, cost / small, "ratio <= 1.2", cost <= 1.2 * small),
+        Row(f"{name}: cost of a run", cost, small, "ms", against, cost / small, "ratio <= 1.2",
+            cost <= 1.2 * small),
     ]  # fmt: skip
 
 

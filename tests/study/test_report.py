@@ -52,8 +52,10 @@ def test_the_worst_runs_are_linked_and_can_be_run_again(folder):
     links = re.findall(r'href="(trajectories/[0-9a-f]+\.npz)"', page)
     assert len(links) == 10
     assert all((folder / link).exists() for link in links)
-    command = re.search(r"<code>flowgraph (run [^<]*)</code>", page)[1].replace("&#x27;", "'").split()
-    done = invoke(*command, "--json")
+    command = re.search(r"<code>flowgraph (run [^<]*)</code>", page)
+    assert command is not None
+    words = command[1].replace("&#x27;", "'").split()
+    done = invoke(*words, "--json")
     assert done.exit_code == 0
     assert f"{json.loads(done.stdout)['tilt_rmse_deg']:.4g}" in page
 

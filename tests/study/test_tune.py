@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from flowgraph import DataError, DeclarationError, UnknownNameError, find_graph,
 from flowgraph.cli import app
 from flowgraph.study.tune import Fit, Recording, surprise, tune
 
-PERFECT = {
+PERFECT: dict[str, Any] = {
     "gyro.walk": 0.0, "accelerometer.walk": 0.0, "gyro.bias": 0.0, "accelerometer.bias": 0.0,
     "duration": 4.0, "imu.rate": 25.0, "vicon.rate": 25.0,
 }  # fmt: skip
@@ -32,7 +33,9 @@ def test_likelihood_finds_the_true_noise_of_the_measurement():
     assert found.converged
     assert found.at_bound == ()
     assert [j.held_out for j in found.judged] == [False, False, True]
-    before, after = found.mean(held_out=False)
+    means = found.mean(held_out=False)
+    assert means is not None
+    before, after = means
     assert after <= before + 1e-9  # before are the true values, which the fit can only beat on its own data
 
 
@@ -82,7 +85,7 @@ def test_surprise_is_the_negative_logarithm_of_the_density():
 
 def test_vectorised_evaluation_is_that_of_one_at_a_time():
     pytest.importorskip("jax")
-    how = {"settings": PERFECT, "most": 1}
+    how: Any = {"settings": PERFECT, "most": 1}
     fits, flights = [Fit("position_noise", 1e-3, 0.1)], [Recording("sim", 0), Recording("sim", 1)]
     one = tune("ekf", fits, flights, **how)
     many = tune("ekf", fits, flights, engine="xla", **how)
@@ -116,7 +119,7 @@ BAD = [
 
 @pytest.mark.parametrize(("wrong", "said"), BAD, ids=[str(k) for k in range(len(BAD))])
 def test_what_cannot_be_tuned_is_refused(wrong, said):
-    how = {"fits": NOISES[:1], "recordings": [Recording("sim")], "settings": {"imu.rate": 50}, **wrong}
+    how: Any = {"fits": NOISES[:1], "recordings": [Recording("sim")], "settings": {"imu.rate": 50}, **wrong}
     with pytest.raises((DataError, DeclarationError, UnknownNameError)) as caught:
         tune("ekf", how.pop("fits"), how.pop("recordings"), how.pop("held_out", ()), **how)
     assert said in str(caught.value)
