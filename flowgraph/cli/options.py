@@ -14,7 +14,9 @@ from flowgraph.series import Flight
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
 Data = Annotated[
     str,
-    typer.Option("--data", metavar="SPEC", help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH"),
+    typer.Option(
+        "--data", metavar="SPEC", help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH"
+    ),
 ]
 Settings = Annotated[
     list[str] | None,
