@@ -107,7 +107,7 @@ def test_it_gives_the_numbers_of_the_same_filter_written_by_hand():
         accelerometer_noise=noise.accelerometer,
         position_noise=flight.info["position_noise"],
         attitude_noise=flight.info["attitude_noise"],
-        resample_below=0.1,
+        resample_below=0.5,
         still=1.0,
     )
     result = simulate(case.graph, case.inputs, seed=7)
