@@ -278,9 +278,7 @@ def _threaded(
             if progress is not None:
                 progress.update(n + 1, 0)
     wall = perf_counter() - start
-    return Batch(
-        graph.name, "c", seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall
-    )
+    return Batch(graph.name, "c", seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall)
 
 
 def _reals(events: Tape, real: Any) -> list[list[np.ndarray]]:
@@ -340,9 +338,7 @@ def _vectorised(
     which = (keys, real.name, ticks, runs_at_once, shared, repr(kept), tuple(chosen))
     compiled: dict[Any, Scan] = whole.__dict__.setdefault("_batched", {})  # they live as long as it does
     if which not in compiled:
-        compiled[which] = Scan(
-            pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen
-        )
+        compiled[which] = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen)
     scan = compiled[which]
     dense_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []

@@ -395,7 +395,9 @@ def test_an_overflow_is_the_same_error_in_every_engine():
     assert "t = 20 ns" in messages.pop()
 
 
-@pytest.mark.parametrize("pair", [("python", "xla"), ("xla", "python"), ("xla", "reference"), ("python", "c"), ("c", "python")])
+@pytest.mark.parametrize(
+    "pair", [("python", "xla"), ("xla", "python"), ("xla", "reference"), ("python", "c"), ("c", "python")]
+)
 def test_a_run_resumes_from_and_to_xla(pair):
     recipe = [(kind, n, n + 1, 2) for n, kind in enumerate(("loop", "match", "dt", "zip", "state"))]
     built, data = random_graph(recipe), random_data(list(range(0, 24, 2)), list(range(1, 24, 3)), 3)

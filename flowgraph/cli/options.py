@@ -17,7 +17,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         metavar="SPEC",
-        help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH, broad:FILE, ese650:DIR:N, ...",
+        help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH, broad:FILE, ese650:DIR:N ...",
     ),
 ]
 DataOrNone = Annotated[

@@ -22,7 +22,7 @@ from flowgraph.inputs import prepare, tape
 from flowgraph.playback import real_leaves
 from flowgraph.random import seed_words
 from flowgraph.series import Series
-from tests.bench import inertial, particles
+from tests.bench import direct_eskf, direct_rbpf, inertial, particles
 from tests.bench.rows import Row, interleaved, missing, seconds
 
 FLOOR = Path(__file__).parent / "floor"
@@ -59,7 +59,7 @@ def loop(built: Graph, inputs: dict[str, Series]) -> Callable[[], float]:
     def timed(*arguments: Any) -> None:
         spent[0] += seconds(lambda: play(*arguments))
 
-    library._play = timed
+    library._play = timed  # type: ignore[assignment]
 
     def once() -> float:
         spent[0] = 0.0
@@ -126,7 +126,7 @@ def kalman(*, ticks: int = 20_000, repeats: int = 15) -> list[Row]:
 def eskf(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
     """Microseconds a tick of `ins_eskf`, against our Python engine."""
     built, inputs, direct = inertial.case(duration)
-    inertial.check(simulate(built, inputs, engine="c"), *inertial.direct_eskf.run(**direct)[:2])
+    inertial.check(simulate(built, inputs, engine="c"), *direct_eskf.run(**direct)[:2])
     ours = loop(built, inputs)
     scale = 1e6 / len(direct["time"])
     a, b, ratio = interleaved(lambda: ours() * scale, lambda: simulate(built, inputs).wall_s * scale, repeats)
@@ -136,11 +136,11 @@ def eskf(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
 def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 5) -> list[Row]:
     """Microseconds a tick of `rbpf_indoor`, draws included, against the hand-written NumPy loop."""
     built, direct = particles.case(particles_, duration)
-    by_hand = particles.direct_rbpf.run(**direct)
+    by_hand = direct_rbpf.run(**direct)
     particles.check(simulate(built.graph, built.inputs, engine="c"), by_hand)
     ours = loop(built.graph, built.inputs)
     scale = 1e6 / len(by_hand.poses)
     a, b, ratio = interleaved(
-        lambda: ours() * scale, lambda: seconds(lambda: particles.direct_rbpf.run(**direct)) * scale, repeats
+        lambda: ours() * scale, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, repeats
     )
     return [Row(f"rbpf_indoor, {particles_:,} particles, c", a, b, "us/tick", "direct NumPy", ratio)]

@@ -205,8 +205,8 @@ def test_an_oversampled_gyroscope_reads_the_turn_since_its_last_reading():
     apart = {n: np.abs(load("thesis", seed=1, settings={**quiet, "imu.oversample": n}).streams["imu"].gyro[1:]
                        - turn * 200.0).max() for n in (1, 20)}  # fmt: skip
     assert apart[20] < 0.02 < 1.0 < apart[1]
-    noisy = [load("hover", settings={"imu.oversample": n}).streams["imu"].gyro for n in (1, 20)]
-    np.testing.assert_allclose(*noisy, atol=1e-12)
+    one, many = (load("hover", settings={"imu.oversample": n}).streams["imu"].gyro for n in (1, 20))
+    np.testing.assert_allclose(one, many, atol=1e-12)
     with pytest.raises(DeclarationError, match="'imu.oversample' is not usable"):
         load("hover", settings={"imu.oversample": 1.5})
 

@@ -26,7 +26,7 @@ from flowgraph import (
     merge,
     simulate,
 )
-from flowgraph.blocks.flights import euroc
+from flowgraph.blocks.datasets import euroc
 from flowgraph.c import CompileError, build, generate, write_c, write_events
 from flowgraph.c.syntax import comment, identifier, string, unique
 from flowgraph.cli.app import app

@@ -197,7 +197,7 @@ def test_passes_show_in_the_report(eskf):
 @pytest.mark.parametrize("setting", ["multipliers", "lanes", "clock"])
 def test_a_machine_of_nothing_is_refused(eskf, setting):
     with pytest.raises(DeclarationError, match=f"a machine needs {setting}"):
-        cost_report(eskf, **{setting: 0})
+        cost_report(eskf, **{setting: 0})  # type: ignore[arg-type]
 
 
 def test_stages_start_when_those_before_are_done(eskf):

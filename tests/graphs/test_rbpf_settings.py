@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import math
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,7 @@ IMU, CAPTURE = periodic("5ms", phase=0), periodic("250ms", phase=0)
 
 @functools.cache
 def flight(setting: str, seed: int, duration: float) -> Flight:
-    capture, push, turn = setting
+    capture, push, turn = list(setting)
     deviation = math.sqrt(VICON[capture])
     return load_world("thesis", seed=seed, settings={
         "duration": duration,
@@ -77,7 +79,7 @@ def rmse(found: Runs, setting: str, seeds: range, duration: float) -> float:
 def errors(setting: str, particles: int, seeds: range, duration: float = 20.0) -> tuple[float, float]:
     """The position RMSE of the particles and of the error-state filter, m."""
     deviation = math.sqrt(VICON[setting[0]])
-    common = {
+    common: dict[str, Any] = {
         "imu": IMU,
         "noise": ImuNoise.per_sample(200.0, gyro=READING[setting[2]], accelerometer=READING[setting[1]]),
         "position_noise": deviation,

@@ -44,9 +44,7 @@ def test_a_row_a_setting_and_filter(tmp_path):
     done = CliRunner().invoke(app, ["bench", "thesis", *arguments, "--json", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["rows"]
-    assert [(row["setting"], row["filter"]) for row in rows] == [
-        (s, f) for s in ("LLL",) for f in FILTERS
-    ]
+    assert [(row["setting"], row["filter"]) for row in rows] == [(s, f) for s in ("LLL",) for f in FILTERS]
     for row in rows:
         assert set(row) >= KEYS
         expected = PUBLISHED.get((row["filter"], row["setting"]), (None, None))
