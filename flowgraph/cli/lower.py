@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, Name, Seed, Settings, case_of
+from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, case_of, example_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.errors import UnknownNameError
 from flowgraph.lowering import lower as lower_graph
@@ -24,7 +24,7 @@ TARGETS = ("description", "c")
 def lower(
     graph: Name,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="For the pipeline.")],
-    data: Data = "sim",
+    data: DataOrNone = None,
     settings: Settings = None,
     seed: Seed = 0,
     target: Annotated[
@@ -50,7 +50,7 @@ def lower(
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()))
-    case, _ = case_of(graph, data, settings, seed)
+    case, _ = example_of(graph, settings, seed) if data is None else case_of(graph, data, settings, seed)
     pipeline = lower_graph(case.graph, dtype=dtype)
     pipeline.save(output)
     if target == "c":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
@@ -24,7 +25,12 @@ DataOrNone = Annotated[
     str | None,
     typer.Option("--data", metavar="SPEC", help="As for run; if left out, a simulated flight that fits."),
 ]
-EXAMPLES: tuple[tuple[str, tuple[str, ...]], ...] = (("sim", ()), ("sim:thesis", ("sensors=all",)))
+EXAMPLES: tuple[tuple[str, Mapping[str, str]], ...] = (
+    ("sim", {}),
+    ("sim:thesis", {"sensors": "all"}),
+    ("sim:plane", {}),
+    ("course", {"duration": "1"}),
+)
 """The flights on which a graph is shown when nobody names one: the first that has what it needs."""
 
 Settings = Annotated[
@@ -53,8 +59,9 @@ def example_of(name: str, settings: list[str] | None, seed: int) -> tuple[Case, 
     """`case_of` on the first of `EXAMPLES` that has what the graph needs; if none has, the first's error."""
     first: DataError | None = None
     for spec, more in EXAMPLES:
+        chosen = {**more, **pairs(settings)}
         try:
-            return case_of(name, spec, [*more, *(settings or [])], seed)
+            return case_of(name, spec, [f"{key}={value}" for key, value in chosen.items()], seed)
         except DataError as error:
             first = first or error
     assert first is not None
