@@ -5,7 +5,7 @@ indices it resamples with must be those of the engines before anything is timed.
 
 The libraries filter with something simpler: nine plain states (position, velocity and acceleration of a point
 in space, constant acceleration), a measured position at each step, a bootstrap proposal, and systematic
-resampling below a tenth of the particles. Beside them, `rbpf_indoor` gets a measured pose at each tick.
+resampling below half of the particles. Beside them, `rbpf_indoor` gets a measured pose at each tick.
 
 A library that is not installed gives a row without a peer. The extra `bench` leaves out `particles` 0.4: it
 asks for NumPy < 2, although it runs with newer ones (`pip install --no-deps particles`, and its numba, joblib
@@ -57,7 +57,7 @@ def case(particles: int, duration: float, **settings: float) -> tuple[Case, dict
         "accelerometer_noise": noise.accelerometer,
         "position_noise": flight.info["position_noise"],
         "attitude_noise": flight.info["attitude_noise"],
-        "resample_below": 0.1,
+        "resample_below": 0.5,
         "still": 1.0,
     }
     return built, direct
@@ -136,7 +136,7 @@ def with_particles(n: int, steps: int) -> Callable[[], np.ndarray]:
 
     def run() -> np.ndarray:
         proposal = models.Bootstrap(ssm=model, data=data)
-        filter_ = smc.SMC(fk=proposal, N=n, resampling="systematic", ESSrmin=0.1)
+        filter_ = smc.SMC(fk=proposal, N=n, resampling="systematic", ESSrmin=0.5)
         filter_.run()
         return np.asarray(filter_.W @ filter_.X)
 
