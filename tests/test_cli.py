@@ -251,7 +251,7 @@ def test_json_is_all_there_is_on_standard_output(tmp_path):
     )
     assert json.loads(done.stdout)["graph"] == "ins_eskf"
     assert "Fontconfig" not in done.stderr
-    written = {"diagram.svg", "estimate.tum", "metrics.json", "navigation.png"}
+    written = {"diagram.svg", "estimate.tum", "metrics.json", "navigation.png", "trajectory.png"}
     assert {f.name for f in (tmp_path / "new").iterdir()} == written
 
 
@@ -445,3 +445,26 @@ def test_lower_leaves_passes_out_by_name(tmp_path):
 def test_lower_without_a_report_writes_none(tmp_path):
     assert invoke("lower", "kalman", "--set", "duration=1", "-o", str(tmp_path)).exit_code == 0
     assert not (tmp_path / "report.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("graph", "data", "picture"),
+    [("particle", "sim:plane", "outputs.png"), ("roll_pitch", "sim:roundtrip", "orientation.png")],
+)
+def test_a_report_of_what_has_no_place_in_space(graph, data, picture, tmp_path):
+    done = invoke("run", graph, "--data", data, "--set", "duration=2", "--out", str(tmp_path), "--json")
+    assert done.exit_code == 0, done.stderr
+    assert (tmp_path / picture).stat().st_size > 5_000
+
+
+@pytest.mark.parametrize("graph", ["tag_pose", "particle", "ins_ukf_velocity", "orientation_complementary"])
+def test_a_graph_is_shown_on_a_flight_that_fits(graph):
+    done = invoke("show", graph)
+    assert done.exit_code == 0
+    assert done.stdout.startswith(graph)
+
+
+def test_a_graph_that_only_recordings_fit_says_what_it_needs():
+    done = invoke("show", "imu_calibration")
+    assert done.exit_code == 1
+    assert "lacks what imu_calibration needs" in done.stderr

@@ -31,7 +31,7 @@ from flowgraph.export import write_tum
 from flowgraph.progress import ProgressBar
 from flowgraph.registry import Case, find_graph, flight_names, graph_names
 from flowgraph.result import Result
-from flowgraph.series import Flight
+from flowgraph.series import Flight, Series
 from flowgraph.simulate import ENGINES, simulate
 
 
@@ -148,9 +148,16 @@ def _measure(
     return result, row
 
 
+def _recorded(case: Case) -> list[Series]:
+    """What the graph was fed, where it is recorded."""
+    inputs = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
+    return [s for s in inputs.values() if isinstance(s, Series)]
+
+
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
     from flowgraph.plot import plot_navigation, plot_result
     from flowgraph.plot_attitude import plot_orientation
+    from flowgraph.plot_trajectory import plot_space
 
     with writes(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -164,9 +171,13 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
     if "attitude" in estimate.leaves and len(estimate):
         with writing(out / "estimate.tum") as file:
             write_tum(estimate, file)
-    if "position" in estimate.leaves:
+    if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         with writing(out / "navigation.png") as file:
             plot_navigation(estimate, flight.truth, file)
+        observed = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
+        if observed is not None:
+            with writing(out / "trajectory.png") as file:
+                plot_space(estimate, flight.truth, observed, file)
     elif "attitude" in estimate.leaves:
         with writing(out / "orientation.png") as file:
             plot_orientation(estimate, flight.truth, file)
