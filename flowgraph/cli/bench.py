@@ -15,6 +15,7 @@ from flowgraph.cli.terminal import (
     make_ready,
     out_console,
     print_json,
+    print_whole,
     reports_errors,
     table,
     writing,
@@ -61,4 +62,4 @@ def bench(
                 draw(file)
     if as_json:
         return print_json({"bench": name, "rows": list(report.rows)})
-    out_console.print(table(report.rows))
+    print_whole(table(report.rows))

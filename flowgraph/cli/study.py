@@ -12,7 +12,7 @@ import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson
-from flowgraph.cli.terminal import err_console, make_ready, out_console, print_json, reports_errors, table
+from flowgraph.cli.terminal import err_console, make_ready, print_json, print_whole, reports_errors, table
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 Folder = Annotated[
@@ -119,7 +119,7 @@ def report(
         page, rows = found.page, found.summary
     if as_json:
         return print_json({"page": str(page), "rows": rows})
-    out_console.print(table([{n: _short(v) for n, v in row.items()} for row in rows]))
+    print_whole(table([{n: _short(v) for n, v in row.items()} for row in rows]))
     err_console.print(f"wrote {page}", markup=False)
 
 
@@ -152,7 +152,7 @@ def _show(outcome: Any, study: Any, quiet: bool) -> None:
     from flowgraph.study.statistics import summarised
 
     if not quiet and outcome.rows:
-        out_console.print(table(summarised(outcome.rows, study.names(), study.metrics, most=4)))
+        print_whole(table(summarised(outcome.rows, study.names(), study.metrics, most=4)))
     err_console.print(
         f"{outcome.done} runs in {outcome.seconds:.1f} s, {outcome.kept} were there already;"
         f" the table is {outcome.folder / 'results.parquet'}",

@@ -112,12 +112,22 @@ _HIDDEN = ("graph", "engine", "compared_ticks", "heading_3sigma")
 
 def table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """A column a key, for lists."""
-    table = Table(box=None, pad_edge=False)
-    for key in dict.fromkeys(k for row in rows for k in row):
-        table.add_column(key)
+    keys = list(dict.fromkeys(k for row in rows for k in row))
+    table = Table(*keys, box=None, pad_edge=False)
     for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
+        table.add_row(*(_short(row.get(key)) for key in keys))
     return table
+
+
+def print_whole(shown: Table) -> None:
+    """Print a table of figures with all its columns, wider than the terminal if it must be."""
+    options = out_console.options.update(width=10_000)
+    wide = max(out_console.width, out_console.measure(shown, options=options).maximum)
+    Console(file=out_console.file, width=wide).print(shown, crop=False, no_wrap=True)
+
+
+def _short(value: Any) -> str:
+    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def runs_table(rows: list[dict[str, Any]]) -> Table:

@@ -10,7 +10,15 @@ import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, Name, Settings, pairs
-from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, table, writing
+from flowgraph.cli.terminal import (
+    err_console,
+    out_console,
+    print_json,
+    print_whole,
+    reports_errors,
+    table,
+    writing,
+)
 from flowgraph.errors import DeclarationError
 
 
@@ -89,7 +97,7 @@ def tune(
             before, after = j.metrics[first]
             line |= {f"{first} before": f"{before:.4g}", "then": f"{after:.4g}"}
         lines.append(line)
-    out_console.print(table(lines))
+    print_whole(table(lines))
     out_console.print(" ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()), markup=False)
     for name in found.at_bound:
         err_console.print(f"note: {name} ended at its bound: the least lies beyond it", markup=False)

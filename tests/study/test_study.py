@@ -97,9 +97,9 @@ def test_a_changed_parameter_graph_or_engine_is_another_key(monkeypatch):
     for other in ({"parameters": {"settle": 0.5}}, {"engine": "reference"}, {"seeds": [1]}):
         assert not keys(**other) & first
     assert not keys(parameters={"gyro.noise": 0.002}) & first
-    from flowgraph.blocks import extended
+    from flowgraph.blocks import tuning
 
-    monkeypatch.setattr(extended, "GRAVITY", (0.0, 0.0, -9.8))
+    monkeypatch.setattr(tuning, "GRAVITY", (0.0, 0.0, -9.8))
     assert not keys() & first
 
 
@@ -319,7 +319,7 @@ def test_a_poison_run_is_a_row_and_is_tried_again_next_time(tmp_path, monkeypatc
 
 @pytest.fixture
 def broken_recording(tmp_path):
-    """A recording with NaN in a file."""
+    """A recording with an infinity in a file."""
     data = Path(os.environ.get("FLOWGRAPH_DATA", Path(__file__).parents[2] / ".." / "shared" / "datasets"))
     source = next(iter(sorted(data.glob("euroc/*"))), None) if data.exists() else None
     if source is None or not list(source.rglob("imu0/data.csv")):
@@ -328,7 +328,7 @@ def broken_recording(tmp_path):
     shutil.copytree(source, folder, ignore=shutil.ignore_patterns("*.png"))
     file = next(folder.rglob("imu0/data.csv"))
     lines = file.read_text().splitlines()
-    lines[100] = lines[100].split(",")[0] + ",nan" * 6
+    lines[100] = lines[100].split(",")[0] + ",inf" * 6
     file.write_text("\n".join(lines) + "\n")
     return folder
 
