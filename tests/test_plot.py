@@ -11,7 +11,7 @@ import pytest
 from flowgraph import Array, DataError, Series, Signal, Stream, UnknownNameError, graph, real, simulate
 from flowgraph.plot import plot_navigation, plot_result, plot_trajectory
 from flowgraph.result import Result
-from flowgraph.types import Scalar
+from flowgraph.types import ArrayType, Scalar, StructType
 
 SECOND = 1_000_000_000
 
@@ -215,3 +215,20 @@ def test_an_empty_series_is_refused_by_name():
         plot_navigation(nav(0))
     with pytest.raises(DataError, match="truth: there are no values to plot"):
         plot_trajectory(truth(0), nav())
+
+
+@pytest.mark.parametrize("size", [6, 9, 15])
+def test_a_band_for_each_part_that_the_covariance_covers(size):
+    """Position, velocity and attitude by 6 or 9 numbers, as of a point or a pose; biases by 15."""
+    n = 50
+    time = np.arange(n) * SECOND
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    P = np.tile(np.eye(size) * 0.04, (n, 1, 1))
+    fields = {"position": np.zeros((n, 3)), "velocity": np.zeros((n, 3)), "attitude": q, "covariance": P}
+    kinds = tuple((k, ArrayType(v.shape[1:], "real")) for k, v in fields.items())
+    estimate = Series(time, fields, type=StructType("estimate", kinds, dict), name="estimate")
+    truth = Series(time, Truth(np.zeros((n, 3)), q), name="truth")
+    figure = plot_navigation(estimate, truth)
+    banded = [a.get_title(loc="left") for a in figure.axes if getattr(a, "collections", None)]
+    for words, least in (("position error x", 6), ("velocity", 6), ("roll", 9)):
+        assert any(words in title for title in banded) == (size >= least), (words, banded)

@@ -30,7 +30,14 @@ from flowgraph.blocks.kalman import (
 )
 from flowgraph.blocks.linear import LinearModel
 from flowgraph.blocks.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.roots import GaussianRoot, lower_root, predict_root, semidefinite_root, update_root
+from flowgraph.blocks.roots import (
+    GaussianRoot,
+    lower_root,
+    predict_root,
+    semidefinite_root,
+    update_extended_root,
+    update_root,
+)
 from tests.support import all_engines
 
 RNG = np.random.default_rng(5)
@@ -313,6 +320,30 @@ def test_a_quaternion_is_corrected_by_a_rotation_whatever_its_sign():
         )
         np.testing.assert_allclose(found.value.residual, np.r_[[0.1] * 3, turn], atol=1e-12)
     assert update_extended.step(prior, None, xp=np, **options) == (prior, None)
+
+
+def bearing(x: Any, xp: Any) -> tuple[Any, Any]:
+    """The angle and the distance at which a point of the plane is seen, and their Jacobian."""
+    a, b = x[..., 0], x[..., 1]
+    r = xp.sqrt(a * a + b * b)
+    H = xp.stack([xp.stack([-b / r**2, a / r**2]), xp.stack([a / r, b / r])])
+    return xp.stack([xp.atan2(b, a), r]), xp.concat([H, 0.0 * H], axis=-1)
+
+
+@pytest.mark.parametrize("gate", [None, 0.999, 1e-6])
+@pytest.mark.parametrize("gap", [False, True])
+def test_the_extended_update_on_roots_is_the_extended_update(gap, gate):
+    prior = Gaussian(mean=np.array([2.0, -1.0, 0.3, 0.1]), covariance=a_belief().covariance * 0.01)
+    z = np.array([-0.4, np.nan if gap else 2.3])
+    options = {"observe": bearing, "R": np.diag([0.01, 0.04]), "gate": gate}
+    options["measured_space"] = StateSpace(angle(), euclidean(1))
+    plain, heard = update_extended.step(prior, z, xp=np, **options)
+    root, heard_too = update_extended_root.step(rooted(prior), z, xp=np, **options)
+    same(unrooted(root), plain)
+    for leaf in ("residual", "covariance", "nis", "parts", "accepted"):
+        a, b = getattr(heard.value, leaf), getattr(heard_too.value, leaf)
+        np.testing.assert_allclose(a, b, atol=1e-12)
+    assert update_extended_root.step(rooted(prior), None, xp=np, **options)[1] is None
 
 
 # In a graph, in every engine

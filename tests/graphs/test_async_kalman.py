@@ -168,3 +168,12 @@ def test_a_flight_without_motion_capture_is_refused():
     part = Flight(whole.name, {"imu": whole.streams["imu"]}, whole.truth, whole.info)
     with pytest.raises(DataError, match=r"lacks what async_kalman needs[\s\S]*imu, vicon"):
         async_kalman.case(part)
+
+
+@pytest.mark.parametrize("graph", [kalman, async_kalman])
+def test_a_run_can_be_smoothed_by_a_setting(graph):
+    """Both use what came later, so they are better than the filter; the whole run more than a lag."""
+    case = graph.case(thesis(1), smooth="rts", lag=1.0)
+    score = case.score(simulate(case.graph, case.inputs))
+    whole, lagged, plain = (score[f"{front}position_rmse_m"] for front in ("smoothed_", "lagged_", ""))
+    assert whole < 1.02 * lagged < lagged * 1.05 < plain
