@@ -266,3 +266,10 @@ def block(step: Callable[..., Any] | None = None, /, **options: Any) -> Any:
 
 def _snake(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+
+
+def line_of(block: Block[Any]) -> str:
+    """module:line of a block's function, as far as it is known."""
+    step = inspect.unwrap(block.step)
+    code = getattr(step, "__code__", None)
+    return getattr(step, "__module__", "") + ("" if code is None else f":{code.co_firstlineno}")

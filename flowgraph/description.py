@@ -25,6 +25,7 @@ from flowgraph.pipeline import (
     VERSION,
     Cell,
     Fault,
+    HostStage,
     Leaf,
     Pipeline,
     Port,
@@ -70,6 +71,7 @@ def to_json(pipeline: Pipeline) -> dict[str, Any]:
         "faults": [_plain(f) for f in pipeline.faults],
         "random": [_plain(r) for r in pipeline.random],
         "limits": [{**limit._asdict(), "numbers": list(limit.numbers)} for limit in pipeline.limits],
+        **({"host": [_plain(stage) for stage in pipeline.host]} if pipeline.host else {}),
         "totals": pipeline.totals(),
         "latency": pipeline.latency(),
     }
@@ -170,6 +172,10 @@ def from_json(data: Any, *, path: str = "pipeline") -> Pipeline:
         faults=tuple(Fault(**f) for f in data["faults"]),
         random=tuple(RandomSite(**{**r, "shape": tuple(r["shape"])}) for r in data["random"]),
         limits=tuple(Limit(**{**r, "numbers": tuple(r["numbers"])}) for r in data.get("limits", ())),
+        host=tuple(
+            HostStage(**{**r, "reads": tuple(r["reads"]), "feeds": tuple(r["feeds"])})
+            for r in data.get("host", ())
+        ),
     )
     _check_ports(pipeline, path)
     _check_values(pipeline, path)

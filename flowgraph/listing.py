@@ -16,6 +16,10 @@ def listing(pipeline: Pipeline) -> str:
             for leaf in port.leaves:
                 more = "".join(f", {p}" for p in (leaf.unit, leaf.frame) if p)
                 lines.append(f"    %{leaf.value:<5} {leaf.name}: {_spec(Spec(leaf.shape, leaf.dtype))}{more}")
+    for host in pipeline.host:
+        streams = f", feeds {', '.join(host.feeds)}" if host.feeds else ""
+        streams += f", reads {', '.join(host.reads)}" if host.reads else ""
+        lines.append(f"on the host, {host.side}: {host.path} ({host.block}){streams}  # {host.line}")
     lines.append("")
     for register in pipeline.registers:
         lines.append(f"register {register.path} ({register.role})")

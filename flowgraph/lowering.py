@@ -9,11 +9,13 @@ pattern of present sources (in `program`) folds all of that away again.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flowgraph.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source, Timing
+from flowgraph.cut import cut
 from flowgraph.errors import LoweringError
 from flowgraph.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.ops import OPS, Spec
@@ -29,17 +31,22 @@ from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 def lower(graph: Graph, *, dtype: str = "float64") -> Pipeline:
     """The fixed-size pipeline of a graph; made once and kept with it.
 
+    Host blocks stay outside (`flowgraph.cut`): the pipeline's `host` names them, what they give before it are
+    inputs of the pipeline, and what they read after it are outputs.
+
     Args:
         graph: a built graph.
         dtype: what `real` is going to be: "float64", "float32" or "fixed". The pipeline is the same for all;
             a graph that cannot be trusted in this one is refused.
 
     Raises:
-        LoweringError: for a host block, or a step that does what a pipeline cannot hold; names the line. Also
+        LoweringError: for a host block between accelerated ones, or a step that does what a pipeline cannot hold; names the line. Also
             for a block whose settings rule out `dtype`, with the reason.
     """
     if "pipeline" not in graph.plans:
-        graph.plans["pipeline"] = _Lowering(graph).pipeline()
+        parts = cut(graph)
+        made = _Lowering(graph if parts is None else parts.accelerated).pipeline()
+        graph.plans["pipeline"] = made if parts is None else replace(made, host=parts.host)
     found: Pipeline = graph.plans["pipeline"]
     found.need_numbers(dtype)
     return found

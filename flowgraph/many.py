@@ -170,6 +170,8 @@ def simulate_many(
         )
     if dtype not in ("float64", "float32"):
         raise UnknownNameError("dtype", dtype, ("float64", "float32"))
+    if engine in ("xla", "c") and lower(graph, dtype=dtype).host:  # the host has its part in every run
+        return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
     if engine == "c":

@@ -126,6 +126,25 @@ class RandomSite:
     value: int
 
 
+@dataclass(frozen=True)
+class HostStage:
+    """A block that stays in Python, on one side of the pipeline.
+
+    Args:
+        path, block: of the call in the graph, and `line`, module:line, of the block's function.
+        side: "before" the pipeline, or "after" it.
+        reads: after it, the streams that the block reads, by label.
+        feeds: before it, the names of the pipeline's inputs that the block gives.
+    """
+
+    path: str
+    block: str
+    side: str
+    line: str
+    reads: tuple[str, ...] = ()
+    feeds: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Pipeline:
     """A lowered graph. `run` plays it, `save` and `load` keep it.
@@ -135,6 +154,7 @@ class Pipeline:
         time: number of the value that holds the tick's time (int64, ns).
         seed: number of the value that holds the run's seed (two uint32 words, low first).
         inputs, outputs, registers, constants, stages, faults, random, limits: see their classes.
+        host: what the graph does outside the pipeline, in firing order; a pipeline alone does not run it.
     """
 
     name: str
@@ -149,6 +169,7 @@ class Pipeline:
     faults: tuple[Fault, ...] = ()
     random: tuple[RandomSite, ...] = ()
     limits: tuple[Limit, ...] = ()
+    host: tuple[HostStage, ...] = ()
 
     def need_numbers(self, kind: str) -> None:
         """Refuse a kind of number, "float64", "float32" or "fixed", in which a block must not be computed.

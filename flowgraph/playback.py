@@ -62,6 +62,13 @@ def play(
     """Lower a graph and play it; the result has the graph's own signal types."""
     check_start(init, state, path=graph.name)
     pipeline = lower(graph)
+    if pipeline.host:
+        from flowgraph.cut_run import play_parts
+
+        return play_parts(
+            graph, inputs, engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress,
+            passes=passes,
+        )  # fmt: skip
     if state is None:
         slots, last = initial_registers(graph, init), dict.fromkeys(graph.sources, NEVER)
     else:
@@ -135,12 +142,15 @@ def _inputs(pipeline: Pipeline, inputs: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for port in pipeline.inputs:
         if port.name not in given:
+            maker = next((h for h in pipeline.host if port.name in h.feeds), None)
+            made = "" if maker is None else f", made on the host by {maker.path} ({maker.line})"
+            whole = "" if maker is None else ", or simulate the graph, which runs its host blocks too"
             raise DataError(
                 f"input {port.name!r} has no data",
                 path=pipeline.name,
-                expected=f"events of {port.type}",
+                expected=f"events of {port.type}{made}",
                 got=", ".join(given) or "no inputs",
-                fix=f"pass {{{port.name!r}: Series(time, values)}}",
+                fix=f"pass {{{port.name!r}: Series(time, values)}}{whole}",
             )
         value = given[port.name]
         if isinstance(value, Series) or (isinstance(value, tuple) and len(value) == 2):

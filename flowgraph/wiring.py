@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flowgraph import clock as clocks
-from flowgraph.block import REQUIRED, WIRING, Block
+from flowgraph.block import REQUIRED, WIRING, Block, line_of
 from flowgraph.builder import Builder, builder
 from flowgraph.clock import Clock, Condition, both, clock_of, either, within
 from flowgraph.errors import ClockError, DeclarationError, LoweringError, TypeMismatchError, UnknownNameError
@@ -223,8 +223,8 @@ def _variants(
                 "a host block cannot be lowered",
                 path=path,
                 expected="blocks of array-API operations",
-                got=f"@block(host=True) {block.name}",
-                fix="keep it outside the lowered graph: before its sources or after its outputs",
+                got=f"@block(host=True) {block.name}, {line_of(block)}",
+                fix="put it before or after blocks that can be lowered; alone outside the lowered graph it runs in Python",
             )
             continue
         try:

@@ -140,8 +140,8 @@ def run_task(task: Task) -> list[Done]:
     for run in task.runs:
         try:
             lane = _ready(run)
-            if task.engine in MANY:
-                _lowered.lower(lane.case.graph)  # here, where its error is that of one run
+            # lowered here, where its error is that of one run; the host has its part in every run
+            if task.engine in MANY and not _lowered.lower(lane.case.graph).host:
                 lanes.append(lane)
             else:
                 found[run.key] = _alone(task, lane)
