@@ -9,13 +9,15 @@ asked for.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from flowgraph import Flight, Result, Series
+from flowgraph import Flight, Graph, Result, Series
 from flowgraph.blocks.consistency import nis_summary
 from flowgraph.blocks.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.types import leaves_of
 
-__all__ = ["SMOOTHED", "scorer"]
+__all__ = ["SMOOTHED", "Scorer", "scorer"]
 
 Errors = Callable[..., dict[str, float]]
 
@@ -39,7 +41,7 @@ def scorer(
     steps: Callable[[Result], Steps] | None = None,
     smooth: str = "none",
     lag: float | None = None,
-) -> Callable[[Result], dict[str, float]]:
+) -> Scorer:
     """The `score` of a `Case`.
 
     Args:
@@ -51,28 +53,52 @@ def scorer(
         smooth: "rts" smooths the whole run, "none" does not.
         lag: s: with one, each tick is smoothed with what came until so much later.
     """
-    truth = flight.truth
+    return Scorer(flight.truth, errors, estimate, settle, steps, smooth, lag)
 
-    def compared(series: Series) -> dict[str, float]:
-        return {} if truth is None else errors(series, truth, settle=settle)
 
-    def score(result: Result) -> dict[str, float]:
-        found = compared(result[estimate])
+@dataclass(frozen=True)
+class Scorer:
+    """A score that says which streams it reads, so that a run of many need not keep the others."""
+
+    truth: Series | None
+    errors: Errors
+    estimate: str
+    settle: float
+    steps: Callable[[Result], Steps] | None
+    smooth: str
+    lag: float | None
+
+    @property
+    def smoothing(self) -> bool:
+        """Whether the smoothed runs are compared too."""
+        asked = self.smooth == "rts" or self.lag is not None
+        return asked and self.steps is not None and self.truth is not None
+
+    def reads(self, graph: Graph) -> list[str]:
+        """The collected streams of a graph that the score looks at."""
+        types = {c.name: graph.port(c.wire).type for c in graph.collected}
+        if self.smoothing:
+            return list(types)
+        return [n for n, t in types.items() if n == self.estimate or "nis" in dict(leaves_of(t))]
+
+    def __call__(self, result: Result) -> dict[str, float]:
+        found = self._compared(result[self.estimate])
         innovations = {n: s for n, s in result.series.items() if "nis" in s.leaves and len(s)}
         for name, series in innovations.items():
             front = name.removesuffix("innovation")
             found.update({front + key: value for key, value in nis_summary(series).items()})
         smoothed: dict[str, Any] = {}
-        if steps is not None and truth is not None and (smooth == "rts" or lag is not None):
-            prior, posterior, transition, space, named = steps(result)
-            if smooth == "rts":
+        if self.smoothing and self.steps is not None:
+            prior, posterior, transition, space, named = self.steps(result)
+            if self.smooth == "rts":
                 smoothed["smoothed"] = rauch_tung_striebel(prior, posterior, transition, space=space)
-            if lag is not None:
-                ticks = lag_ticks(posterior.time, lag)
+            if self.lag is not None:
+                ticks = lag_ticks(posterior.time, self.lag)
                 smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
             for front, series in smoothed.items():
-                better = compared(named(series))
+                better = self._compared(named(series))
                 found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
         return found
 
-    return score
+    def _compared(self, series: Series) -> dict[str, float]:
+        return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)

@@ -37,7 +37,8 @@ class Case:
     Args:
         graph: built, with the start and the noise for this flight.
         inputs: the flight's streams by source name.
-        score: `result -> {metric: value}`, against the flight's truth.
+        score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
+            the names of the streams that it looks at; then a study of many runs at once keeps only those.
         estimate: name of the collected stream that the score and the pictures are of.
     """
 

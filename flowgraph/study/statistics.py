@@ -59,7 +59,7 @@ def summarised(
     most: int | None = None,
 ) -> list[dict[str, Any]]:
     """A row a setting (graph, flight, parameters): how many runs, how many failed, and each metric as
-    "median (quartile .. quartile)"; of the first `most` metrics."""
+    "median (quartile .. quartile)", or the one value; of the first `most` metrics."""
     by = ["graph", "data", *parameters]
     names = metrics_of(rows, parameters, chosen)[:most]
     table = []
@@ -70,7 +70,8 @@ def summarised(
         for name in names:
             values = finite_values(members, name)
             low, middle, high = np.quantile(values, (0.25, 0.5, 0.75)) if len(values) else [math.nan] * 3
-            line[name] = f"{middle:.4g} ({low:.4g} .. {high:.4g})" if len(values) else "-"
+            spread = f" ({low:.4g} .. {high:.4g})" if len(values) > 1 else ""
+            line[name] = f"{middle:.4g}{spread}" if len(values) else "-"
         table.append(line)
     return table
 

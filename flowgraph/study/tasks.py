@@ -148,7 +148,11 @@ def run_task(task: Task) -> list[Done]:
         except Exception as error:
             found[run.key] = _failed(run, error)
     for program, places in grouped([lane.case for lane in lanes]):
-        found.update({d.key: d for d in _together(task, program, [lanes[k] for k in places])})
+        reading: dict[Any, list[_Lane]] = {}
+        for k in places:
+            reading.setdefault(None if task.keep else _read(lanes[k].case), []).append(lanes[k])
+        for keep, together in reading.items():
+            found.update({d.key: d for d in _together(task, program, together, keep)})
     return [found[run.key] for run in task.runs]
 
 
@@ -187,18 +191,19 @@ def _program(name: str, program: Any, graph: Graph) -> Graph:
     return kept[-1][1]
 
 
-def _together(task: Task, program: Any, lanes: list[_Lane]) -> list[Done]:
+def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...] | None) -> list[Done]:
     try:
         start = perf_counter()
         cases, seeds = [lane.case for lane in lanes], [lane.run.seed for lane in lanes]
         results = simulate_together(
-            cases, seeds, program=program, engine=task.engine, dtype=task.dtype, chunk=task.chunk
-        )
+            cases, seeds, program=program, engine=task.engine, dtype=task.dtype, chunk=task.chunk,
+            keep=keep,
+        )  # fmt: skip
         share = (perf_counter() - start) / len(lanes)
     except Exception as error:
         if len(lanes) == 1:
             return [_failed(lanes[0].run, error)]
-        return [done for lane in lanes for done in _together(task, program, [lane])]
+        return [done for lane in lanes for done in _together(task, program, [lane], keep)]
     found = []
     for lane, result in zip(lanes, results, strict=True):
         lane.times["run_s"] = share
@@ -210,9 +215,19 @@ def _together(task: Task, program: Any, lanes: list[_Lane]) -> list[Done]:
 
 
 def simulate_together(
-    cases: Sequence[Case], seeds: Sequence[int], *, program: Any, engine: str, dtype: str, chunk: int
+    cases: Sequence[Case],
+    seeds: Sequence[int],
+    *,
+    program: Any,
+    engine: str,
+    dtype: str,
+    chunk: int,
+    keep: Sequence[str] | None = None,
 ) -> list[Result]:
-    """Cases of one program and one set of ticks (see `grouped`) in one vectorised call."""
+    """Cases of one program and one set of ticks (see `grouped`) in one vectorised call.
+
+    With `keep` only the streams of these names come back.
+    """
     graph = _program(cases[0].graph.name, program, cases[0].graph)
     batch = simulate_many(
         graph,
@@ -221,9 +236,16 @@ def simulate_together(
         engine=engine,
         dtype=dtype,
         init=[start_of(case.graph) for case in cases],
+        keep=keep,
         runs_at_once=chunk,
     )
     return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
+
+
+def _read(case: Case) -> tuple[str, ...] | None:
+    """The streams that a score looks at; None where it does not say, for then it may be any."""
+    reads = getattr(case.score, "reads", None)
+    return None if reads is None else tuple(reads(case.graph))
 
 
 def grouped(cases: Sequence[Case]) -> list[tuple[Any, list[int]]]:
@@ -262,6 +284,8 @@ def _result(graph: Graph, batch: Batch, k: int) -> Result:
     """One run of a batch, with the graph's own signal types; without a last state, which a batch has not."""
     series = {}
     for collected in graph.collected:
+        if collected.name not in batch.series:
+            continue
         runs = batch[collected.name]
         here, type_ = runs.present[k], graph.port(collected.wire).type
         whole = bool(here.all())
