@@ -34,12 +34,13 @@ from flowgraph.blocks.outdoor_cloud import (
     OutdoorCloud,
     as_cloud,
     correct_distance,
+    correct_field,
     correct_flow,
     correct_position,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
-    weigh_field,
+    take_picture,
 )
 from flowgraph.blocks.particles import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.resampling import draw_ancestors
@@ -82,13 +83,11 @@ def rbpf_outdoor(
     last = delay(Imu.at_rest(), name="last_control")
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
-    now = predict_outdoor(
-        cloud, between_imu(last, control), noise=s.imu, draws=f"{draws}.attitude", name="predict"
-    )
+    now = predict_outdoor(cloud, between_imu(last, control), noise=s.imu, name="predict")
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
-    now = weigh_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
+    now = correct_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
     now = correct_flow(now, optical_flow, displacement=s.displacement, turn=s.turn, name="fuse_flow")
 
     plain = as_cloud(now, name="plain")
@@ -97,6 +96,7 @@ def rbpf_outdoor(
         plain, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", at=seen, name="ancestors"
     )
     fresh = take_outdoor_ancestors(now, ancestors, at=seen, name="resample")
+    fresh = take_picture(fresh, optical_flow, draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
     return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
