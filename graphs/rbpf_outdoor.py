@@ -1,14 +1,15 @@
 """rbpf_outdoor: a Rao-Blackwellized particle filter on six sensors, each whenever it comes.
 
-The attitude is sampled through the gyroscope; given it, velocity and position have a Kalman filter of their
-own. What is then linear in them, two GPS receivers, an altimeter and the displacement of optical flow, is a
-partial Kalman update of each particle; what sees the attitude only, a magnetometer and the turn of optical
-flow, weighs the particles. No sensor waits for another.
+The attitude is sampled; given it, velocity, position and what the gyroscope's noise has turned since the
+attitude was last drawn have a Kalman filter of their own. Two GPS receivers, an altimeter, a magnetometer and
+optical flow are each a Kalman update of each particle, and weigh it. The attitude is drawn when optical flow
+takes a picture, from what all readings since the last picture have left of it. No sensor waits for another.
 
 Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the asynchronous
-Rao-Blackwellized particle filter. Mended: the altimeter reads p_z / cos(tilt) (the thesis prints a sine), and
-optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0 q_1, in the world). The equations
-stand in `blocks/outdoor_cloud.py`.
+Rao-Blackwellized particle filter. Mended: the attitude is drawn after the readings, not before them (drawn at
+every step, a thousand particles are too few for a sharp magnetometer); the altimeter reads p_z / cos(tilt)
+(the thesis prints a sine), and optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0
+q_1, in the world). The equations stand in `blocks/outdoor_cloud.py`.
 """
 
 from __future__ import annotations
@@ -68,15 +69,16 @@ def rbpf_outdoor(
     *,
     start: OutdoorCloud,
     sensors: OutdoorSensors,
-    resample_below: float = 0.5,
+    resample_below: float = 0.25,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
 ):
     """Rao-Blackwellized particle filter of pose and velocity on asynchronous sensors.
 
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
-    resampled if its weights have become too uneven. Collected: `pose` at every tick, averaged before
-    resampling; `effective_sample_size` and `ancestors` at every tick with a reading.
+    resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
+    Collected: `pose` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at
+    every tick with a reading.
     """
     s = sensors
     cloud = delay(start, name="cloud")
@@ -108,7 +110,7 @@ def for_flight(
     *,
     particles: int = 1000,
     seed: int = 0,
-    resample_below: float = 0.5,
+    resample_below: float = 0.25,
     scheme: str = "systematic",
     settle: float = 1.0,
 ) -> Case:
