@@ -18,6 +18,7 @@ from flowgraph import Array
 from flowgraph.blocks import geometry
 
 __all__ = [
+    "cross",
     "exponential",
     "inverse_and_determinant",
     "matrix_product",
@@ -97,8 +98,14 @@ def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:
     return xp.where(w < 0.0, -scale, scale) * v
 
 
+def cross(a: Array, B: Array, *, xp: Any) -> Array:
+    """The cross products (3, m, n) of vectors a (3, n), or one for all (3, 1), with m columns B (3, m, n)."""
+    after, before = (lambda v, k=k: xp.concat([v[k:, ...], v[:k, ...]], axis=0) for k in (1, 2))
+    return after(a)[:, None, :] * before(B) - before(a)[:, None, :] * after(B)
+
+
 def transpose(a: Array, *, xp: Any) -> Array:
-    """The transposed matrices (3, 3, n)."""
+    """The transposed matrices (m, k, n) of a (k, m, n)."""
     return xp.permute_dims(a, (1, 0, 2))
 
 

@@ -1,23 +1,30 @@
-"""The particles of an outdoor filter: attitude by particles; velocity, position and displacement Gaussian
-given each.
+"""The particles of an outdoor filter: attitude by particles, drawn once a picture; all else Gaussian given
+each.
 
-A sensor is fused in one of two ways. What is linear once the attitude is known (a position, a distance to the
-ground, a displacement) is a partial Kalman update of each particle, which also says how likely the reading
-was. What sees the attitude only (a magnetic field, a turn) weighs the particles. Each block takes one sensor,
-passes the cloud through where there is no reading, and leaves the weights normalised; so sensors may come in
-any order, at any time.
+Given a particle's attitude, velocity and position are linear in the sensors. Drawing the gyroscope's noise at
+every step, to let sharp sensors weigh the outcome, wastes particles: most are drawn where the next reading
+will not have them. So the noise since the last draw stays a small Gaussian too, a rotation vector e that the
+particle's Kalman filter carries beside its motion; within a few hundredths of a radian every sensor is linear
+in it. Each reading is then a Kalman update of each particle, and weighs it by how likely it was beforehand.
+When a picture is taken, e is drawn from what all readings since the last one have left of it, and the motion
+is conditioned on the draw: the proposal that looks at the readings first, and the least uneven weights.
+
+Each block takes one sensor, passes the cloud through where there is no reading, and leaves the weights
+normalised; so sensors may come in any order, at any time.
 
 Optical flow measures from one picture to the next. Each particle keeps its attitude at the last picture and,
 in its Kalman state, how far it has moved since, which is zero and certain when a picture is taken.
 
 Source: A. Doucet, N. de Freitas, K. Murphy and S. Russell, "Rao-Blackwellised particle filtering for dynamic
-Bayesian networks", UAI 2000; for the sensors and their two kinds of update: R. Fiszel's thesis on reactive
-pose estimation, Stanford 2017.
+Bayesian networks", UAI 2000; for the draw: A. Doucet, S. Godsill and C. Andrieu, "On sequential Monte Carlo
+sampling methods for Bayesian filtering", Statistics and Computing 10, 2000, sec. II-D (the optimal proposal,
+by local linearisation); for the sensors: R. Fiszel's thesis on reactive pose estimation, Stanford 2017.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,30 +40,28 @@ __all__ = [
     "OutdoorCloud",
     "as_cloud",
     "correct_distance",
+    "correct_field",
     "correct_flow",
     "correct_position",
     "predict_outdoor",
     "start_outdoor_cloud",
     "take_outdoor_ancestors",
-    "weigh_field",
+    "take_picture",
 ]
 
 ORIGIN = (0.0, 0.0, 0.0)
-_VELOCITY, _POSITION, _MOVED = slice(0, 3), slice(3, 6), slice(6, 9)
+_VELOCITY, _POSITION, _MOVED, _TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _LEAST_UPRIGHT = 0.05
 """cos(tilt) below which a beam along body z does not meet the ground for any practical purpose."""
 
 
 def _blocks(entries: dict[tuple[int, int], float]) -> np.ndarray:
-    """A (9, 9) matrix of multiples of I (3, 3), by block."""
-    small = np.zeros((3, 3))
+    """A (12, 12) matrix of multiples of I (3, 3), by block: velocity, position, displacement, turn."""
+    small = np.zeros((4, 4))
     for at, value in entries.items():
         small[at] = value
     return np.kron(small, np.eye(3))
 
-
-_DRIFT = _blocks({(1, 0): 1.0, (2, 0): 1.0})
-"""d(position, displacement)/dt is the velocity."""
 
 _WHITE = (
     _blocks({(0, 0): 1.0}),
@@ -65,20 +70,30 @@ _WHITE = (
 )
 """What white noise on the acceleration leaves: the coefficients of dt, dt^2 and dt^3."""
 
+_WHITE_TURN = _blocks({(3, 3): 1.0})
+"""What white noise on the rate leaves: the coefficient of dt."""
+
+_KEPT = np.repeat([1.0, 1.0, 0.0, 0.0], 3)
+"""What of the state outlives a picture."""
+
+_LEAST_VARIANCE = 1e-20
+"""Below it (rad^2) a turn is taken for certain when it is drawn; in float32 too it is not zero."""
+
 
 class OutdoorCloud(Signal):
     """A Rao-Blackwellized cloud whose particles remember the last picture. The particle is the last axis.
 
-    log_weight: natural logarithm of the weights, which add up to 1. attitude: of now; picture: at the last
-    picture. motion: the mean of (velocity in m/s, position in m, displacement since the last picture in m),
-    world; covariance: of it.
+    log_weight: natural logarithm of the weights, which add up to 1. attitude: the mean of now, so that the
+    true one is Exp(e) * attitude; picture: at the last picture, exactly. motion: the mean of (velocity in
+    m/s, position in m, displacement since the last picture in m), world; covariance: of it and of e (rad,
+    world), the mean of which is zero.
     """
 
     log_weight: Array = real("particles")
     attitude: Array = real(4, "particles", unit="1", frame="world<-body")
     picture: Array = real(4, "particles", unit="1", frame="world<-body")
     motion: Array = real(9, "particles", frame="world")
-    covariance: Array = real(9, 9, "particles")
+    covariance: Array = real(12, 12, "particles")
 
 
 @block
@@ -89,48 +104,51 @@ def predict_outdoor(
     noise: ImuNoise,
     gravity: tuple[float, float, float] = GRAVITY,
     dt: float,
-    draw: Any,
     xp: Any,
 ) -> OutdoorCloud:
-    """Carry the cloud over `dt` seconds: each attitude by a drawn turn, the rest by a Kalman prediction.
+    """Carry the cloud over `dt` seconds: a Kalman prediction of each particle.
 
-        turn = gyro dt + noise.gyro sqrt(dt) e,  e ~ N(0, I) for each particle
-        q' = q * Exp(turn)      a = R(q * Exp(turn/2)) specific_force + gravity
-        v' = v + a dt      p' = p + v dt + a dt^2/2      s' = s + v dt + a dt^2/2      P' = F P F^T + Q
+        f = R(q * Exp(gyro dt/2)) specific_force      a = f + gravity      q' = q * Exp(gyro dt)
+        v' = v + a dt      p' = p + v dt + a dt^2/2      s' = s + v dt + a dt^2/2      e' = e
+        P' = F (P + N/2) F^T + N/2 + Q
 
-    s is the displacement since the last picture. Q is white noise on the acceleration, noise.accelerometer^2
-    [dt, dt^2/2; dt^2/2, dt^3/3] on v and on p and s, which move alike. Fires when its inputs do; with dt = 0,
-    as at the first firing, this is the identity. Draws `gyro` (3, n).
+    s is the displacement since the last picture. F is the Jacobian: with the attitude wrong by e, the force
+    is wrong by e x f. N is the gyroscope's white noise on e, noise.gyro^2 dt, half of it before the step so
+    that the motion feels it; Q is white noise on the acceleration, noise.accelerometer^2 [dt, dt^2/2; dt^2/2,
+    dt^3/3] on v and on p and s, which move alike. Fires when its inputs do; with dt = 0, as at the first
+    firing, this is the identity.
 
     Args:
         cloud: the belief at the last firing.
         imu: the reading that held since then: rad/s and m/s^2, body.
         noise: densities.
     """
-    kind, n = cloud.motion.dtype, cloud.log_weight.shape[-1]
-    errors = xp.asarray(draw.normal("gyro", (3, n)), dtype=kind)
-    turn = imu.gyro[:, None] * dt + errors * (noise.gyro * xp.sqrt(dt))
-    half = lanes.exponential(0.5 * turn, xp=xp)
+    kind = cloud.motion.dtype
+    half = lanes.exponential((0.5 * dt) * imu.gyro[:, None], xp=xp)
     middle = lanes.multiply(cloud.attitude, half, xp=xp)
     attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
-    down = xp.asarray(gravity, dtype=kind)[:, None]
-    step = (lanes.rotate(middle, imu.specific_force, xp=xp) + down) * dt
+    force = lanes.rotate(middle, imu.specific_force, xp=xp)
+    step = (force + xp.asarray(gravity, dtype=kind)[:, None]) * dt
     path = (cloud.motion[_VELOCITY, :] + 0.5 * step) * dt
-    F = xp.eye(9, dtype=kind) + xp.asarray(_DRIFT, dtype=kind) * dt
     W, W2, W3 = (xp.asarray(table * noise.accelerometer**2, dtype=kind) for table in _WHITE)
     Q = (W + (W2 + W3 * dt) * dt) * dt
+    N = xp.asarray(_WHITE_TURN * (0.5 * noise.gyro**2), dtype=kind) * dt
+    wide = cloud.covariance + N[:, :, None]
+    for _ in range(2):  # F (F P)^T, which is F P F^T
+        wide = lanes.transpose(_advanced(wide, force * dt, dt, xp), xp=xp)
     return cloud.replace(
         attitude=attitude,
         motion=cloud.motion + xp.concat([step, path, path], axis=0),
-        covariance=_between(F, cloud.covariance, xp) + Q[:, :, None],
+        covariance=wide + (N + Q)[:, :, None],
     )
 
 
-def _between(F: Array, P: Array, xp: Any) -> Array:
-    """F P F^T for each particle: F (9, 9), P (9, 9, n) symmetric."""
-    n = P.shape[-1]
-    left = lambda A: xp.reshape(F @ xp.reshape(A, (9, 9 * n)), (9, 9, n))
-    return left(lanes.transpose(left(P), xp=xp))
+def _advanced(A: Array, push: Array, dt: Array, xp: Any) -> Array:
+    """F A for each particle: A (12, 12, n), and push (3, n) the force times dt."""
+    v, p, s, e = (A[part, :, :] for part in (_VELOCITY, _POSITION, _MOVED, _TURN))
+    step = -lanes.cross(push, e, xp=xp)
+    path = (v + 0.5 * step) * dt
+    return xp.concat([v + step, p + path, s + path, e], axis=0)
 
 
 @block
@@ -142,8 +160,7 @@ def correct_position(
     lever: tuple[float, float, float] = ORIGIN,
     xp: Any,
 ) -> OutdoorCloud:
-    """A partial Kalman update of each particle with a measured position: z = p + R(q) lever + N(0, noise^2
-    I).
+    """Correct each particle with a measured position: z = p + R lever + N(0, noise^2 I).
 
     Args:
         position: z, m, world, of a point fixed to the body; without one the cloud passes through.
@@ -153,17 +170,20 @@ def correct_position(
     if position is None:
         return cloud
     residual = position.position[:, None] - cloud.motion[_POSITION, :]
-    if lever != ORIGIN:
-        arm = xp.asarray(lever, dtype=residual.dtype)
-        residual = residual - lanes.rotate(cloud.attitude, arm, xp=xp)
-    return _corrected(cloud, residual, _POSITION, noise**2, xp)
+    if lever == ORIGIN:
+        return _corrected(cloud, residual, lambda A: A[_POSITION, :, :], noise**2, xp)
+    arm = lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=residual.dtype), xp=xp)
+    seen = lambda A: A[_POSITION, :, :] - lanes.cross(arm, A[_TURN, :, :], xp=xp)
+    return _corrected(cloud, residual - arm, seen, noise**2, xp)
 
 
 @block
 def correct_distance(cloud: OutdoorCloud, distance: Range | None, *, noise: float, xp: Any) -> OutdoorCloud:
-    """A partial Kalman update of each particle with a distance to the ground (world z = 0) along body -z.
+    """Correct each particle with a distance to the ground (world z = 0) along body -z.
 
-    z = p_z / R_33(q) + N(0, noise^2): given the attitude, linear in the position.
+        z = p_z / u_z + N(0, noise^2),  u = R (0, 0, 1)
+
+    of which the derivative by e is -p_z / u_z^2 (u_y, -u_x, 0).
 
     Args:
         distance: z, m; without one the cloud passes through.
@@ -171,24 +191,21 @@ def correct_distance(cloud: OutdoorCloud, distance: Range | None, *, noise: floa
     """
     if distance is None:
         return cloud
-    q = cloud.attitude
-    upright = 1.0 - 2.0 * (q[1, :] * q[1, :] + q[2, :] * q[2, :])
-    h = 1.0 / xp.maximum(upright, _LEAST_UPRIGHT)
-    height = cloud.covariance[5, :, :]  # (9, n): of everything with p_z
-    residual = distance.distance - cloud.motion[5, :] * h
-    S = height[5, :] * h * h + noise**2
-    gain = height * (h / S)
-    covariance = cloud.covariance - gain[:, None, :] * (height * h)[None, :, :]
+    up = lanes.rotate(cloud.attitude, xp.asarray([0.0, 0.0, 1.0], dtype=cloud.motion.dtype), xp=xp)
+    h = 1.0 / xp.maximum(up[2, :], _LEAST_UPRIGHT)
+    seen = cloud.motion[5, :] * h
+    lean_x, lean_y = -seen * h * up[1, :], seen * h * up[0, :]
+    P = cloud.covariance
+    across = P[5, :, :] * h + P[9, :, :] * lean_x + P[10, :, :] * lean_y  # (12, n)
+    S = across[5, :] * h + across[9, :] * lean_x + across[10, :] * lean_y + noise**2
+    residual = distance.distance - seen
+    gain = across / S
     log_likelihood = -0.5 * (residual * residual / S + xp.log(S) + math.log(2.0 * math.pi))
-    return cloud.replace(
-        log_weight=_weighed(cloud.log_weight, log_likelihood, xp),
-        motion=cloud.motion + gain * residual,
-        covariance=0.5 * (covariance + lanes.transpose(covariance, xp=xp)),
-    )
+    return _moved(cloud, gain * residual, P - gain[:, None, :] * across[None, :, :], log_likelihood, xp)
 
 
 @block
-def weigh_field(
+def correct_field(
     cloud: OutdoorCloud,
     field: MagneticField | None,
     *,
@@ -196,7 +213,9 @@ def weigh_field(
     noise: float,
     xp: Any,
 ) -> OutdoorCloud:
-    """Weigh each particle by a measured magnetic field: z = R(q)^T earth + N(0, noise^2 I).
+    """Correct each particle with a measured magnetic field: z = R^T earth + N(0, noise^2 I).
+
+    Turned into the world by the mean attitude, R z = earth + earth x e + N(0, noise^2 I).
 
     Args:
         field: z, T, body; without one the cloud passes through.
@@ -205,23 +224,22 @@ def weigh_field(
     """
     if field is None:
         return cloud
-    away = _inverse(cloud.attitude, xp)
     # in units of the noise: squares of tesla are too small for single precision
-    seen = lanes.rotate(away, xp.asarray([m / noise for m in earth], dtype=away.dtype), xp=xp)
-    return _weighed_by(cloud, (field.field / noise)[:, None] - seen, 1.0, xp)
+    expected = xp.asarray([[m / noise] for m in earth], dtype=cloud.motion.dtype)
+    residual = lanes.rotate(cloud.attitude, field.field / noise, xp=xp) - expected
+    return _corrected(cloud, residual, lambda A: lanes.cross(expected, A[_TURN, :, :], xp=xp), 1.0, xp)
 
 
 @block
 def correct_flow(
     cloud: OutdoorCloud, flow: OpticalFlow | None, *, displacement: float, turn: float, xp: Any
 ) -> OutdoorCloud:
-    """Fuse how the body moved and turned since the last picture, and take a new picture.
+    """Correct each particle with how the body moved and turned since the last picture.
 
-        displacement = R(q_0)^T s + N(0, displacement^2 I)      a partial Kalman update of each particle
-        turn = q_0^-1 q * Exp(N(0, turn^2 I))                   a weight
+        displacement = R(q_0)^T s + N(0, displacement^2 I)
+        turn = q_0^-1 Exp(e) q * Exp(N(0, turn^2 I)),  so that  Log(q_0 turn q^-1) = e + N(0, turn^2 I)
 
-    q_0 is the particle's attitude at the last picture and s its displacement since. Then q_0 = q, and s = 0
-    with no variance.
+    q_0 is the particle's attitude at the last picture and s its displacement since.
 
     Args:
         flow: over the time since the reading before it, or since the start; without one the cloud passes
@@ -230,51 +248,85 @@ def correct_flow(
     """
     if flow is None:
         return cloud
-    moved = lanes.rotate(cloud.picture, flow.displacement, xp=xp)
-    cloud = _corrected(cloud, moved - cloud.motion[_MOVED, :], _MOVED, displacement**2, xp)
-    own = lanes.multiply(_inverse(cloud.picture, xp), cloud.attitude, xp=xp)
-    cloud = _weighed_by(cloud, lanes.rotation_vectors_to(own, flow.turn, xp=xp), turn, xp)
-    keep = xp.asarray([1.0] * 6 + [0.0] * 3, dtype=cloud.motion.dtype)
+    moved = lanes.rotate(cloud.picture, flow.displacement, xp=xp) - cloud.motion[_MOVED, :]
+    cloud = _corrected(cloud, moved, lambda A: A[_MOVED, :, :], displacement**2, xp)
+    back = cloud.picture * xp.asarray([[1.0], [-1.0], [-1.0], [-1.0]], dtype=moved.dtype)
+    own = lanes.multiply(back, cloud.attitude, xp=xp)
+    error = lanes.rotation_vectors_to(own, flow.turn, xp=xp)  # in the body
+    error = xp.sum(lanes.rotation_matrices(cloud.attitude, xp=xp) * error[None, :, :], axis=1)
+    return _corrected(cloud, error, lambda A: A[_TURN, :, :], turn**2, xp)
+
+
+@block
+def take_picture(cloud: OutdoorCloud, flow: OpticalFlow | None, *, draw: Any, xp: Any) -> OutdoorCloud:
+    """Draw each particle's attitude, and make it that of the last picture.
+
+    e ~ N(0, P_ee), one component after the other, each conditioned on those before it; with a component drawn
+    d standard deviations off, and c the covariance of everything with it over its deviation, the mean moves
+    by c d and the covariance falls by c c^T. Then q' = Exp(e) q, q_0 = q', and e = s = 0 with no variance.
+    Draws `turn` (3, n).
+
+    Args:
+        flow: the reading that ends at this picture; without one the cloud passes through.
+    """
+    if flow is None:
+        return cloud
+    P = cloud.covariance
+    deviations = xp.asarray(draw.normal("turn", (3, P.shape[-1])), dtype=P.dtype)
+    state = 0.0 * P[0, :, :]  # (12, n)
+    for k in range(3):
+        # what the earlier components have said of this one is in `state` already: the rest is independent
+        with_k = P[9 + k, :, :]
+        c = with_k / xp.sqrt(xp.maximum(with_k[9 + k, :], _LEAST_VARIANCE))
+        state = state + c * deviations[k, :]
+        P = P - c[:, None, :] * c[None, :, :]
+    kept = xp.asarray(_KEPT, dtype=P.dtype)
+    attitude = _turned(cloud.attitude, state[_TURN, :], xp)
     return cloud.replace(
-        picture=cloud.attitude,
-        motion=cloud.motion * keep[:, None],
-        covariance=cloud.covariance * (keep[:, None] * keep[None, :])[:, :, None],
+        attitude=attitude,
+        picture=attitude,
+        motion=(cloud.motion + state[:9, :]) * kept[:9, None],
+        covariance=P * (kept[:, None] * kept[None, :])[:, :, None],
     )
 
 
-def _corrected(cloud: OutdoorCloud, residual: Array, part: slice, variance: float, xp: Any) -> OutdoorCloud:
-    """The Kalman update and the weights for z = part of the motion + N(0, variance I); residual (3, n)."""
-    across = cloud.covariance[part, :, :]  # (3, 9, n)
-    own = across[:, part, :] + xp.asarray((np.eye(3) * variance)[:, :, None], dtype=residual.dtype)
+def _corrected(
+    cloud: OutdoorCloud, residual: Array, seen: Callable[[Array], Array], variance: float, xp: Any
+) -> OutdoorCloud:
+    """The Kalman update and the weights for residual (3, n) = H x + N(0, variance I), where `seen` applies H.
+
+    seen: H A (3, m, n) of A (12, m, n).
+    """
+    across = seen(cloud.covariance)  # (3, 12, n)
+    own = seen(lanes.transpose(across, xp=xp))
+    own = own + xp.asarray((np.eye(3) * variance)[:, :, None], dtype=residual.dtype)
     inverse, determinant = lanes.inverse_and_determinant(own, xp=xp)
     u = xp.sum(inverse * residual[None, :, :], axis=1)
-    solved = sum(inverse[:, k, None, :] * across[None, k, :, :] for k in range(3))  # (3, 9, n)
+    solved = sum(inverse[:, k, None, :] * across[None, k, :, :] for k in range(3))  # (3, 12, n)
     less = sum(across[k, :, None, :] * solved[k, None, :, :] for k in range(3))
-    covariance = cloud.covariance - less
     log_likelihood = -0.5 * (
         xp.sum(residual * u, axis=0) + xp.log(determinant) + 3.0 * math.log(2.0 * math.pi)
     )
+    state = xp.sum(across * u[:, None, :], axis=0)
+    return _moved(cloud, state, cloud.covariance - less, log_likelihood, xp)
+
+
+def _moved(
+    cloud: OutdoorCloud, state: Array, covariance: Array, log_likelihood: Array, xp: Any
+) -> OutdoorCloud:
+    """The cloud with its means moved by `state` (12, n), of which the turn goes into the attitude."""
+    both = cloud.log_weight + log_likelihood
     return cloud.replace(
-        log_weight=_weighed(cloud.log_weight, log_likelihood, xp),
-        motion=cloud.motion + xp.sum(across * u[:, None, :], axis=0),
+        log_weight=both - log_sum_exp(both, xp=xp),
+        attitude=_turned(cloud.attitude, state[_TURN, :], xp),
+        motion=cloud.motion + state[:9, :],
         covariance=0.5 * (covariance + lanes.transpose(covariance, xp=xp)),
     )
 
 
-def _inverse(q: Array, xp: Any) -> Array:
-    """The inverse attitudes (4, n)."""
-    return q * xp.asarray([[1.0], [-1.0], [-1.0], [-1.0]], dtype=q.dtype)
-
-
-def _weighed(log_weight: Array, log_likelihood: Array, xp: Any) -> Array:
-    both = log_weight + log_likelihood
-    return both - log_sum_exp(both, xp=xp)
-
-
-def _weighed_by(cloud: OutdoorCloud, error: Array, noise: float, xp: Any) -> OutdoorCloud:
-    """Weights for an error (3, n) ~ N(0, noise^2 I); what is the same for all particles is left out."""
-    log_likelihood = xp.sum(error * error, axis=0) * (-0.5 / noise**2)
-    return cloud.replace(log_weight=_weighed(cloud.log_weight, log_likelihood, xp))
+def _turned(q: Array, e: Array, xp: Any) -> Array:
+    """Exp(e) q: attitudes (4, n) turned by rotation vectors (3, n) in the world."""
+    return lanes.normalize(lanes.multiply(lanes.exponential(e, xp=xp), q, xp=xp), xp=xp)
 
 
 @block
@@ -311,7 +363,7 @@ def start_outdoor_cloud(particles: int, start: OutdoorStart, *, seed: int = 0) -
     plain = start_cloud(
         particles, seed=seed, position=start.position, attitude=start.attitude, spread=start.spread
     )
-    variance = np.repeat([start.spread.velocity**2, start.spread.position**2, 0.0], 3)
+    variance = np.repeat([start.spread.velocity**2, start.spread.position**2, 0.0, 0.0], 3)
     return OutdoorCloud(
         log_weight=plain.log_weight,
         attitude=plain.attitude,

@@ -1,14 +1,15 @@
 """rbpf_outdoor: a Rao-Blackwellized particle filter on six sensors, each whenever it comes.
 
-The attitude is sampled through the gyroscope; given it, velocity and position have a Kalman filter of their
-own. What is then linear in them, two GPS receivers, an altimeter and the displacement of optical flow, is a
-partial Kalman update of each particle; what sees the attitude only, a magnetometer and the turn of optical
-flow, weighs the particles. No sensor waits for another.
+The attitude is sampled; given it, velocity, position and what the gyroscope's noise has turned since the
+attitude was last drawn have a Kalman filter of their own. Two GPS receivers, an altimeter, a magnetometer and
+optical flow are each a Kalman update of each particle, and weigh it. The attitude is drawn when optical flow
+takes a picture, from what all readings since the last picture have left of it. No sensor waits for another.
 
 Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the asynchronous
-Rao-Blackwellized particle filter. Mended: the altimeter reads p_z / cos(tilt) (the thesis prints a sine), and
-optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0 q_1, in the world). The equations
-stand in `blocks/outdoor_cloud.py`.
+Rao-Blackwellized particle filter. Mended: the attitude is drawn after the readings, not before them (drawn at
+every step, a thousand particles are too few for a sharp magnetometer); the altimeter reads p_z / cos(tilt)
+(the thesis prints a sine), and optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0
+q_1, in the world). The equations stand in `blocks/outdoor_cloud.py`.
 """
 
 from __future__ import annotations
@@ -34,12 +35,13 @@ from flowgraph.blocks.outdoor_cloud import (
     OutdoorCloud,
     as_cloud,
     correct_distance,
+    correct_field,
     correct_flow,
     correct_position,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
-    weigh_field,
+    take_picture,
 )
 from flowgraph.blocks.particles import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.resampling import draw_ancestors
@@ -67,28 +69,27 @@ def rbpf_outdoor(
     *,
     start: OutdoorCloud,
     sensors: OutdoorSensors,
-    resample_below: float = 0.5,
+    resample_below: float = 0.25,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
 ):
     """Rao-Blackwellized particle filter of pose and velocity on asynchronous sensors.
 
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
-    resampled if its weights have become too uneven. Collected: `pose` at every tick, averaged before
-    resampling; `effective_sample_size` and `ancestors` at every tick with a reading.
+    resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
+    Collected: `pose` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at
+    every tick with a reading.
     """
     s = sensors
     cloud = delay(start, name="cloud")
     last = delay(Imu.at_rest(), name="last_control")
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
-    now = predict_outdoor(
-        cloud, between_imu(last, control), noise=s.imu, draws=f"{draws}.attitude", name="predict"
-    )
+    now = predict_outdoor(cloud, between_imu(last, control), noise=s.imu, name="predict")
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
-    now = weigh_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
+    now = correct_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
     now = correct_flow(now, optical_flow, displacement=s.displacement, turn=s.turn, name="fuse_flow")
 
     plain = as_cloud(now, name="plain")
@@ -97,6 +98,7 @@ def rbpf_outdoor(
         plain, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", at=seen, name="ancestors"
     )
     fresh = take_outdoor_ancestors(now, ancestors, at=seen, name="resample")
+    fresh = take_picture(fresh, optical_flow, draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
     return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
@@ -108,7 +110,7 @@ def for_flight(
     *,
     particles: int = 1000,
     seed: int = 0,
-    resample_below: float = 0.5,
+    resample_below: float = 0.25,
     scheme: str = "systematic",
     settle: float = 1.0,
 ) -> Case:

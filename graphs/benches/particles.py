@@ -24,11 +24,7 @@ from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 
 __all__ = ["FILTERS", "particles"]
 
-OUTDOOR = {
-    "sensors": "imu,gps,gps2,altimeter,magnetometer,optical_flow",
-    "magnetometer.noise": 5e-6,
-    "optical_flow.attitude_noise": 0.03,
-}
+OUTDOOR = {"sensors": "imu,gps,gps2,altimeter,magnetometer,optical_flow"}
 
 FILTERS: dict[str, tuple[Any, Any, str, dict[str, Any], dict[str, Any]]] = {
     "particle": (particle, None, "plane", {}, {}),

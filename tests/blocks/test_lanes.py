@@ -58,3 +58,12 @@ def test_matrices_agree_with_linear_algebra():
     inverse, determinant = lanes.inverse_and_determinant(last(S), xp=np)
     np.testing.assert_allclose(inverse, last(np.linalg.inv(S)), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(determinant, np.linalg.det(S), rtol=1e-10)
+
+
+def test_cross_products_of_one_vector_with_many():
+    rng = np.random.default_rng(4)
+    a, B = rng.normal(size=(3, N)), rng.normal(size=(3, 5, N))
+    expected = np.cross(a[:, None, :], B, axis=0)
+    np.testing.assert_allclose(lanes.cross(a, B, xp=np), expected, atol=1e-15)
+    shared = np.cross(a[:, :1, None], B, axis=0)
+    np.testing.assert_allclose(lanes.cross(a[:, :1], B, xp=np), shared, atol=1e-15)

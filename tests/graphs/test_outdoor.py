@@ -31,11 +31,7 @@ SENSORS = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
 
 @functools.cache
 def flight(seed: int = 0, duration: float = 3.0, world: str = "thesis", **settings: float) -> Flight:
-    named = {
-        "magnetometer.noise": 5e-6,
-        "optical_flow.attitude_noise": 0.03,
-        **{k.replace("__", "."): v for k, v in settings.items()},
-    }
+    named = {k.replace("__", "."): v for k, v in settings.items()}
     return load_world(world, seed=seed, settings={"sensors": SENSORS, "duration": duration, **named})
 
 
@@ -56,13 +52,14 @@ def both(seeds: range, particles: int, duration: float, engine: str = "python") 
 
 def test_particles_follow_the_error_state_filter():
     ratio = both(range(2), particles=300, duration=4.0)
-    assert ratio["position"] < 1.5
-    assert ratio["attitude"] < 1.5
+    assert ratio["position"] < 1.25
+    assert ratio["attitude"] < 1.25
 
 
 @pytest.mark.slow
 def test_on_twenty_flights_particles_are_nearly_as_good_as_the_error_state_filter():
-    ratio = both(range(20), particles=1000, duration=10.0)
+    """With every sensor as noisy as the simulated flights have it when left out."""
+    ratio = both(range(20), particles=1000, duration=10.0, engine="c")
     assert ratio["position"] < 1.15
     assert ratio["attitude"] < 1.15
 
@@ -112,7 +109,9 @@ def test_the_engines_agree(graph):
 
 def test_they_are_lowered_and_drawn():
     names = ("predict", "fuse_gps", "fuse_gps2", "fuse_altimeter", "fuse_flow")
-    is_lowered_and_drawn(rbpf_outdoor.case(flight(), particles=10), *names, "fuse_field", "resample")
+    is_lowered_and_drawn(
+        rbpf_outdoor.case(flight(), particles=10), *names, "fuse_field", "resample", "picture"
+    )
     is_lowered_and_drawn(outdoor_eskf.case(flight()), *names, "fuse_magnetometer", "picture")
 
 
