@@ -206,7 +206,7 @@ class _Part:
             known = len(self.given), len(self.sources)
             for atom in atoms(*map(self.clock, self._clocks())):
                 if isinstance(atom, Source):
-                    if atom in of_clock:
+                    if atom in of_clock and all(graph.port(w).clock != atom for w in self.given):
                         self.sources.add(of_clock[atom])
                 elif atom in conditions:
                     self._take(conditions[atom])

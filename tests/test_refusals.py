@@ -311,7 +311,7 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
     ),
     (
         "host block between lowered blocks",
-        lambda _: lower(build(lambda x, y: add(block(host=True)(camera)(first := add(x, y)), first))),
+        lambda _: lower(build(lambda x, y: add(block(host=True)(camera)(first := add(x, x)), first))),
         LoweringError,
         ["camera", "accelerated blocks on both sides", "before it", f"{__name__}:", 'engine="python"'],
     ),
