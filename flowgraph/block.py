@@ -89,7 +89,7 @@ class Block(Generic[R]):
     Args:
         step: the function.
         name: what to call it; the function's name where left out.
-        host: whether it must stay in Python on the host (OpenCV, files, plots): lowering refuses it.
+        host: whether it must stay in Python on the host (OpenCV, files, plots), outside the pipeline.
         clock: for joins, `(firing clock, argument clocks, settings) -> Clock | None` of the first output.
         output: for joins, `(argument types, settings) -> Type` of the first output.
         fault: for joins, `(state leaf, message)`: a time in ns at which a bound was exceeded.

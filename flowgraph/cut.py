@@ -57,13 +57,21 @@ class _Knife:
 
     def _needs(self, call: CallNode) -> set[int]:
         """The calls that a call reads, in this tick or an earlier one, or that decide when it fires."""
-        wires = {self.conditions[a] for a in atoms(call.firing) if a in self.conditions}
+        wires = self._deciding(call.firing)
         for argument in call.arguments:
             if argument.wire is not None:
                 wires.add(argument.wire)
             elif argument.register is not None and (feed := _register(self.graph, argument.register).feed):
                 wires.add(feed)
         return {w.node for w in wires if isinstance(self.graph.nodes[w.node], CallNode)}
+
+    def _deciding(self, clock: Clock) -> set[Wire]:
+        """The outputs whose presence is a clock's; what they follow from themselves is their blocks' need."""
+        if clock in self.conditions:
+            return {self.conditions[clock]}
+        if isinstance(clock, AnyOf | AllOf):
+            return set().union(*map(self._deciding, clock.terms))
+        return self._deciding(clock.term) if isinstance(clock, Not) else set()
 
     def cut(self) -> Cut:
         hosts = set(self.hosts)
@@ -131,7 +139,9 @@ class _Knife:
                     feeds = [graph.label(w) for w in middle.given if w.node == i] if side == "before" else []
                     reads = [] if side == "before" else [graph.label(w) for w in self.read(call)]
                     stages.append(
-                        HostStage(call.path, call.block.name, side, line_of(call.block), tuple(reads), tuple(feeds))
+                        HostStage(
+                            call.path, call.block.name, side, line_of(call.block), tuple(reads), tuple(feeds)
+                        )
                     )
         return Cut(
             None if first is None else first.graph(),
@@ -196,7 +206,7 @@ class _Part:
             known = len(self.given), len(self.sources)
             for atom in atoms(*map(self.clock, self._clocks())):
                 if isinstance(atom, Source):
-                    if atom in of_clock:
+                    if atom in of_clock and all(graph.port(w).clock != atom for w in self.given):
                         self.sources.add(of_clock[atom])
                 elif atom in conditions:
                     self._take(conditions[atom])
@@ -214,7 +224,9 @@ class _Part:
 
     def _registers(self) -> list[int]:
         calls = [n for i, n in self.whole.calls if i in self.calls]
-        used = {a.register for c in calls for a in c.arguments} | {r for c in calls for r in (c.state, c.stamp)}
+        used = {a.register for c in calls for a in c.arguments} | {
+            r for c in calls for r in (c.state, c.stamp)
+        }
         return [i for i, _ in self.whole.registers if i in used]
 
     def _wires(self) -> list[Wire]:
@@ -270,7 +282,9 @@ class _Part:
             nodes.append(
                 replace(
                     call,
-                    arguments=tuple(Argument(moved(a.wire), index(a.register), a.optional) for a in call.arguments),
+                    arguments=tuple(
+                        Argument(moved(a.wire), index(a.register), a.optional) for a in call.arguments
+                    ),
                     firing=self.clock(call.firing),
                     outputs=tuple(replace(p, clock=self.clock(p.clock)) for p in call.outputs),
                     state=index(call.state),

@@ -62,15 +62,14 @@ def play_parts(
         wall += found.wall_s
         tree["registers"].update(found.state["registers"])
         for c in part.collected:
-            series = found.series[c.name]
-            collected[c.name] = series
+            collected[c.name] = series = found.series[c.name]
             # what a block made may be NaN; it is not checked again on its way to the next part
             known[part.label(c.wire)] = Series(
                 series.time, series.values, type=series.type, name=part.label(c.wire), gaps=True
             )
     tree["sources"] = {n: np.asarray(t, dtype=np.int64) for n, t in ends.items()}
-    series = {c.name: collected[c.name] for c in graph.collected}
-    return Result(graph.name, engine, series, tree, statistics(graph, tree), len(events.time), wall)
+    outputs = {c.name: collected[c.name] for c in graph.collected}
+    return Result(graph.name, engine, outputs, tree, statistics(graph, tree), len(events.time), wall)
 
 
 def _state_of(part: Graph, tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -40,8 +40,8 @@ def lower(graph: Graph, *, dtype: str = "float64") -> Pipeline:
             a graph that cannot be trusted in this one is refused.
 
     Raises:
-        LoweringError: for a host block between accelerated ones, or a step that does what a pipeline cannot hold; names the line. Also
-            for a block whose settings rule out `dtype`, with the reason.
+        LoweringError: for a host block between accelerated ones, or a step that does what a pipeline cannot
+            hold; names the line. Also for a block whose settings rule out `dtype`, with the reason.
     """
     if "pipeline" not in graph.plans:
         parts = cut(graph)

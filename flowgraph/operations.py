@@ -223,7 +223,7 @@ def tap(stream: Stream[T], function: Callable[[Any], object], *, name: str | Non
     """Call `function(value)` on the host for each value, and return the very same stream.
 
     For a print, a log, a probe: it stands beside the wire and cannot change what flows. No memory. What it
-    returns is not used. Lowering refuses the graph and names the tap, as it does for every host block: what a
+    returns is not used. A lowered graph runs it on the host, after the pipeline (`flowgraph.cut`); what a
     run is seen to do is the same in all engines, so no engine leaves it out in silence.
     """
     need_stream(name or "tap", stream)

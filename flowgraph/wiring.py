@@ -224,7 +224,7 @@ def _variants(
                 path=path,
                 expected="blocks of array-API operations",
                 got=f"@block(host=True) {block.name}, {line_of(block)}",
-                fix="put it before or after blocks that can be lowered; alone outside the lowered graph it runs in Python",
+                fix='keep it outside the lowered graph, or run the graph with engine="python"',
             )
             continue
         try:

@@ -1,4 +1,4 @@
-"""The cut between the host and the pipeline: what goes where, the same answer in each engine, and refusals."""
+"""The cut between the host and the pipeline: what goes where, one answer in each engine, and refusals."""
 
 from __future__ import annotations
 
@@ -87,9 +87,15 @@ def data():
 def test_the_pipeline_says_what_stays_on_the_host(tmp_path):
     pipeline = lower(whole([]))
     sides = {h.path: h.side for h in pipeline.host}
-    assert {"scaled": "before", "camera": "before", "display": "after", "table": "after"}.items() <= sides.items()
+    assert {
+        "scaled": "before",
+        "camera": "before",
+        "display": "after",
+        "table": "after",
+    }.items() <= sides.items()
     by_path = {h.path: h for h in pipeline.host}
-    assert by_path["camera"].feeds == ("camera",) and by_path["scaled"].feeds == ()
+    assert by_path["camera"].feeds == ("camera",)
+    assert by_path["scaled"].feeds == ()
     assert by_path["table"].reads == ("out",)
     assert by_path["camera"].line.startswith(f"{__name__}:")
     assert {p.name for p in pipeline.inputs} == {"imu", "camera"}
@@ -196,7 +202,8 @@ def test_pnp_before_the_filter_in_one_graph():
         ("pnp", "before"),
         ("tap", "after"),
     }
-    assert len(pipeline.inputs) == 2 and any("pnp" in p.name for p in pipeline.inputs)
+    assert len(pipeline.inputs) == 2
+    assert any("pnp" in p.name for p in pipeline.inputs)
     python = simulate(built, inputs)["belief"]
     compare(python, simulate(alone.graph, alone.inputs)["belief"])
     for engine in ("xla", "c"):
@@ -212,8 +219,8 @@ def test_pnp_before_the_filter_in_one_graph():
 
 def refused(body, *words: str) -> None:
     @graph
-    def g(x: Stream[Scalar], y: Stream[Scalar]):
-        return body(x, y)
+    def g(x: Stream[Scalar]):
+        return body(x)
 
     with pytest.raises(LoweringError) as error:
         lower(g.build())
@@ -223,9 +230,9 @@ def refused(body, *words: str) -> None:
 
 
 def test_a_host_block_between_accelerated_blocks_is_refused():
-    """`before` feeds the host and an accelerated block, so it cannot go to the host with it."""
+    """`first` feeds the host and an accelerated block, so it cannot go to the host with it."""
 
-    def body(x, y):
+    def body(x):
         first = double(x, name="first")
         return mixed(looked_up(first, name="inner"), first, name="last")
 
@@ -240,7 +247,7 @@ def test_a_host_block_between_accelerated_blocks_is_refused():
 
 
 def test_a_host_block_in_a_cycle_is_refused():
-    def body(x, y):
+    def body(x):
         memory = delay(0.0, name="memory")
         out = mixed(looked_up(memory, at=x, name="inner"), x, name="last")
         memory.feed(out)
@@ -259,5 +266,5 @@ def test_a_host_block_in_a_cycle_is_refused():
 def test_a_graph_of_host_blocks_alone_is_refused():
     line = looked_up.step.__code__.co_firstlineno
     refused(
-        lambda x, y: looked_up(x, name="alone"), "alone: a host block cannot be lowered", f"{__name__}:{line}"
+        lambda x: looked_up(x, name="alone"), "alone: a host block cannot be lowered", f"{__name__}:{line}"
     )

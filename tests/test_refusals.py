@@ -310,10 +310,10 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         ["match(x, y)", "needs the size", "None", "size=8"],
     ),
     (
-        "host block in a lowered graph",
-        lambda _: lower(build(lambda x, y: block(host=True)(camera)(x))),
+        "host block between lowered blocks",
+        lambda _: lower(build(lambda x, y: add(block(host=True)(camera)(first := add(x, x)), first))),
         LoweringError,
-        ["camera", "a host block cannot be lowered", "outside"],
+        ["camera", "accelerated blocks on both sides", "before it", f"{__name__}:", 'engine="python"'],
     ),
 ]
 
