@@ -17,7 +17,7 @@ from tests.bench.__main__ import BENCHES, main, show
 NEEDS = {
     "toy-python": ["reactivex"],
     **{name: ["jax"] for name in ("toy-xla", "eskf-engines", "rbpf-engines", "normals-xla", "many-runs")},
-    "study-seeds": ["jax", "filterpy", "pyarrow"],
+    "study-seeds": ["filterpy", "pyarrow"],
     "study-memory": ["jax", "pyarrow"],
 }
 

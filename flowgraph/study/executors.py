@@ -117,6 +117,7 @@ class _Worker:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=_one_thread(os.environ),
+                process_group=0,  # a terminal's Ctrl-C is for the process that leads, not for these
             )
         self.connection = Connection(ours.detach())
         self.task: str | None = None
@@ -216,7 +217,6 @@ class ProcessPool(_Closing):
 
 def serve(descriptor: int) -> None:
     """What a worker process does: run tasks from its connection until that is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a key pressed is for the process that leads
     with Connection(descriptor) as connection:
         while True:
             try:

@@ -24,6 +24,7 @@ from flowgraph.study.statistics import compared, finite_values, grouped, metrics
 from flowgraph.study.store import Store, read_study, read_table, write_atomically
 
 WORST = 10
+_FEW = 10  # values of a box that are drawn as points too
 PAGE, FIGURES = "report.html", "figures"
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
@@ -150,7 +151,10 @@ def _png(draw: Draw) -> bytes:
 
 
 def _draw_boxes(figure: Any, rows: Sequence[Mapping[str, Any]], metric: str) -> None:
-    """A box a filter at each data set: quartiles, whiskers to the furthest within 1.5 of their distance."""
+    """A box a filter at each data set: quartiles, whiskers to the furthest within 1.5 of their distance.
+
+    Of a few runs each is a point as well, for the box of one is only a line.
+    """
     ax = figure.add_subplot()
     graphs, flights = (list(dict.fromkeys(r[n] for r in rows)) for n in ("graph", "data"))
     width = 0.8 / len(graphs)
@@ -168,6 +172,10 @@ def _draw_boxes(figure: Any, rows: Sequence[Mapping[str, Any]], metric: str) -> 
                 flierprops={"markersize": 3},
                 boxprops={"facecolor": colour, "alpha": 0.5}, medianprops={"color": "black"},
             )  # fmt: skip
+            few = [
+                (x, v) for x, found in zip(places, values, strict=True) if len(found) <= _FEW for v in found
+            ]
+            ax.plot([x for x, _ in few], [v for _, v in few], "o", color=colour, markersize=5)
         ax.plot([], [], color=f"C{k}", linewidth=6, alpha=0.5, label=graph)
     _log_where_wide(ax.yaxis, finite_values(rows, metric))
     ax.set_xticks(range(len(flights)), [_short(f) for f in flights], rotation=25 if len(flights) > 3 else 0)

@@ -34,7 +34,10 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "normals-xla": (random.in_xla, {"ticks": 20, "repeats": 1}),
     "normals-python": (random.in_numpy, {"ticks": 5, "repeats": 1}),
     "many-runs": (many.rows, {"runs": 16, "duration": 2.0}),
-    "study-seeds": (studies.seeds_of_ekf, {"runs": 8, "sample": 2, "duration": 2.0, "chunk": 4}),
+    "study-seeds": (
+        studies.seeds_of_ekf,
+        {"runs": 8, "sample": 2, "duration": 2.0, "chunk": 4, "repeats": 1},
+    ),
     "study-memory": (studies.memory_of_particles, {"runs": 8, "fewer": 4, "duration": 1.2}),
     "import": (imports.import_time, {"repeats": 1}),
 }

@@ -31,7 +31,11 @@ def test_runs_on_threads_are_those_of_one_at_a_time(tmp_path):
     """Also where a parameter sets what the score reads: a smoothed run needs more streams than another."""
     many: dict[str, Any] = {
         "seeds": 2,
-        "parameters": {"position_noise": [0.005, 0.02], "gyro_factor": [1.0, 30.0], "smooth": ["none", "rts"]},
+        "parameters": {
+            "position_noise": [0.005, 0.02],
+            "gyro_factor": [1.0, 30.0],
+            "smooth": ["none", "rts"],
+        },
     }
     one = run_study(study("reference", **many), tmp_path / "one")
     c = run_study(study("c", chunk=6, **many), tmp_path / "c")
