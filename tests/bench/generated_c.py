@@ -140,7 +140,7 @@ def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 5) ->
     built, direct = particles.case(particles_, duration)
     by_hand = direct_rbpf.run(**direct)
     particles.check(simulate(built.graph, built.inputs, engine="c"), by_hand)
-    ours = loop(built.graph, built.inputs)
+    ours = loop(built.graph, dict(built.inputs))
     scale = 1e6 / len(by_hand.poses)
     a, b, ratio = interleaved(
         lambda: ours() * scale, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, repeats

@@ -142,7 +142,11 @@ def check_update(
     log_weight = np.empty(N)
     for i in range(N):
         state, P = one(cloud, i), cloud.covariance[..., i]
-        H = -jacobian(lambda d, state=state: minus(shifted(state, d)))
+
+        def moved(d: np.ndarray, state: State = state) -> np.ndarray:
+            return minus(shifted(state, d))
+
+        H = -jacobian(moved)
         S = H @ P @ H.T + R
         K = P @ H.T @ np.linalg.inv(S)
         r = minus(state)

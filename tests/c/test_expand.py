@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flowgraph import Array, Series, Signal, Stream, block, graph, integer, real, simulate
-from flowgraph.c.expand import _ELEMENTWISE, _RULES
+from flowgraph.c.expand import _RULES
+from flowgraph.c.shapes import ELEMENTWISE
 from flowgraph.ops import OPS
 
 SHAPES = [(3, 4), (20,), (3, 20), (20, 3), (9, 9), (2, 18, 19)]
@@ -146,7 +147,7 @@ def test_instructions_agree_with_the_reference(shape):
 
 
 def test_every_instruction_has_a_rule():
-    assert set(OPS) == {*_ELEMENTWISE, *_RULES}
+    assert set(OPS) == {*ELEMENTWISE, *_RULES}
 
 
 def test_functions_for_lanes_are_exact_at_their_edges():

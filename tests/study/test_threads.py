@@ -96,7 +96,12 @@ def test_a_score_that_does_not_say_gets_every_stream(tmp_path, monkeypatch):
 
     def silent(*arguments):
         case, flight = made(*arguments)
-        return replace(case, score=lambda result: seen.append(set(result.series)) or {"one": 1.0}), flight
+
+        def score(result):
+            seen.append(set(result.series))
+            return {"one": 1.0}
+
+        return replace(case, score=score), flight
 
     monkeypatch.setattr(tasks, "prepared", silent)
     assert not run_study(study("c"), tmp_path).failed
