@@ -10,7 +10,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,7 @@ def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 5) ->
     built, direct = particles.case(particles_, duration)
     by_hand = direct_rbpf.run(**direct)
     particles.check(simulate(built.graph, built.inputs, engine="c"), by_hand)
+    assert isinstance(built.inputs, Mapping)
     ours = loop(built.graph, dict(built.inputs))
     scale = 1e6 / len(by_hand.poses)
     a, b, ratio = interleaved(
