@@ -69,7 +69,7 @@ def rbpf_outdoor(
     *,
     start: OutdoorCloud,
     sensors: OutdoorSensors,
-    resample_below: float = 0.25,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
 ):
@@ -110,7 +110,7 @@ def for_flight(
     *,
     particles: int = 1000,
     seed: int = 0,
-    resample_below: float = 0.25,
+    resample_below: float = 0.5,
     scheme: str = "systematic",
     settle: float = 1.0,
 ) -> Case:
