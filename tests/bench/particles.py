@@ -57,7 +57,7 @@ def case(particles: int, duration: float, **settings: float) -> tuple[Case, dict
         "accelerometer_noise": noise.accelerometer,
         "position_noise": flight.info["position_noise"],
         "attitude_noise": flight.info["attitude_noise"],
-        "resample_below": 0.1,
+        "resample_below": 0.5,  # as the case does
         "still": 1.0,
     }
     return built, direct
