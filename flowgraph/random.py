@@ -94,7 +94,7 @@ def normal_from(bits: Any, *, xp: Any) -> Any:
     The lowest bit is the sign, the others the tail probability. Its float32 form is octave and leading bits,
     which is the segment's number. The error of the inverse is below 3e-5; the largest draw is 6.2.
     """
-    start, slope = _segments()
+    start, slope = segments()
     tail = xp.astype((bits >> np.uint32(1)) | np.uint32(1), xp.int32)
     form = xp.float32_bits(tail)
     segment = (form >> np.int32(23 - _SEGMENT_BITS)) - np.int32(_BASE)
@@ -109,7 +109,7 @@ def normal_from(bits: Any, *, xp: Any) -> Any:
 
 
 @lru_cache(maxsize=1)
-def _segments() -> tuple[np.ndarray, np.ndarray]:
+def segments() -> tuple[np.ndarray, np.ndarray]:
     """Start and fall of each segment of the upper quantile function, in units of 2^-22 (int32)."""
     places = np.concatenate([2.0**k * (1 + np.arange(64) / 64) for k in range(31)] + [[2.0**31]])
     inverse = NormalDist().inv_cdf

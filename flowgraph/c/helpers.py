@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
 
-from flowgraph.random import ROUNDS, _segments
+from flowgraph.random import ROUNDS, segments
 
 _PI = Fraction(31415926535897932384626433832795028841971693993751, 10**49)
 _LN2 = Fraction(69314718055994530941723212145817656807550013436025, 10**50)
@@ -55,7 +55,7 @@ def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
     cosine = _series([(-1) ** k * factorial[2 * k] for k in range(9)], "z")
     artanh = _series([Fraction(1, 2 * k + 3) for k in range(11)], "z")
     arctan = _series([Fraction((-1) ** k, 2 * k + 1) for k in range(21)], "z")
-    start, slope = _segments()
+    start, slope = segments()
     f = "" if real == "double" else "f"
     found: dict[str, tuple[tuple[str, ...], str]] = {
         "fg_bits": (

@@ -116,7 +116,7 @@ def for_engine(engine: str, passes: Collection[str] | None = None) -> tuple[str,
     Raises:
         UnknownNameError: for a pass that is not there.
     """
-    suited = {"reference": (), "xla": ARRAYS, "c": ARRAYS}.get(engine, DEFAULT)
+    suited = {"reference": (), "xla": ARRAYS}.get(engine, DEFAULT)
     return check_passes(suited if passes is None else passes)
 
 

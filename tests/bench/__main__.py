@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import generated_c, imports, inertial, many, particles, random, studies, toy
+from tests.bench import generated_c, imports, inertial, many, particles, random, studies, toy, unscented_c
 from tests.bench.rows import Row
 
 Bench = Callable[..., list[Row]]
@@ -26,6 +26,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "eskf-python": (inertial.against_numpy, {"duration": 0.5, "repeats": 1}),
     "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
     "kalman-c": (generated_c.kalman, {"ticks": 200, "repeats": 1}),
+    "ukf-c": (unscented_c.rows, {"ticks": 100, "repeats": 1}),
     "eskf-c": (generated_c.eskf, {"duration": 0.5, "repeats": 1}),
     "rbpf-c": (generated_c.rbpf, {"particles_": 50, "duration": 1.5, "repeats": 1}),
     "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),

@@ -19,8 +19,9 @@ import numpy as np
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
 from flowgraph.c.engine import Compiled
 from flowgraph.inputs import prepare, tape
+from flowgraph.optimise import for_engine
 from flowgraph.playback import real_leaves
-from flowgraph.random import seed_words
+from flowgraph.random import ROUNDS, Site, seed_words, segments
 from flowgraph.series import Series
 from tests.bench import direct_eskf, direct_rbpf, inertial, particles
 from tests.bench.rows import Row, interleaved, missing, seconds
@@ -29,8 +30,12 @@ FLOOR = Path(__file__).parent / "floor"
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffast-math", "-I/usr/include/eigen3", "-fPIC")
 
 
-def floor(name: str) -> ctypes.CDLL:
+def floor(name: str, *defines: str) -> ctypes.CDLL:
     """A hand-written peer, compiled.
+
+    Args:
+        name: of its file.
+        defines: constants of the compilation, as NAME=VALUE.
 
     Raises:
         ImportError: without a C++ compiler or Eigen.
@@ -41,7 +46,8 @@ def floor(name: str) -> ctypes.CDLL:
     folder = Path(tempfile.mkdtemp(prefix="flowgraph-floor-"))
     try:
         part, made = folder / f"{name}.o", folder / f"{name}.so"
-        subprocess.run([compiler, *FLAGS, "-c", "-o", part, FLOOR / f"{name}.cpp"], check=True)
+        defined = [f"-D{d}" for d in defines]
+        subprocess.run([compiler, *FLAGS, *defined, "-c", "-o", part, FLOOR / f"{name}.cpp"], check=True)
         # Linked without -ffast-math, which would turn small numbers into zero in all of this process.
         subprocess.run([compiler, "-shared", "-o", made, part], check=True)
         return ctypes.CDLL(str(made))
@@ -53,7 +59,7 @@ def loop(built: Graph, inputs: dict[str, Series]) -> Callable[[], float]:
     """A call that plays the inputs once in C and returns the seconds spent there."""
     pipeline = lower(built)
     events = tape(prepare(built, inputs), built)
-    library = Compiled(pipeline, np.float64, events.patterns)
+    library = Compiled(pipeline, np.float64, events.patterns, passes=for_engine("c"))
     rows = library.rows([real_leaves(s, np.float64) for s in events.series])
     cells = [c.reset for r in pipeline.registers for c in r.cells]
     play, spent = library._play, [0.0]
@@ -135,15 +141,57 @@ def eskf(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
     return [Row("ins_eskf, c", a, b, "us/tick", "our Python engine", ratio, "ratio <= 1/50", ratio <= 0.02)]
 
 
-def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 5) -> list[Row]:
-    """Microseconds a tick of `rbpf_indoor`, draws included, against the hand-written NumPy loop."""
+def rbpf_by_hand(direct: dict[str, Any]) -> tuple[Callable[[], float], direct_rbpf.History]:
+    """A call of the C++ filter that returns the seconds it took, and where it leaves its results."""
+    n = len(direct["start"].log_weight)
+    peer = floor("rbpf", f"PARTICLES={n}", f"ROUNDS={ROUNDS}").floor_rbpf
+    ticks, seen = len(direct["time"]), len(direct["poses"])
+    names = [
+        Site(name, "normal", ()).hash for name in ("rbpf_indoor.attitude/gyro", "rbpf_indoor.resample/place")
+    ]
+    settings = (
+        "gyro_noise",
+        "accelerometer_noise",
+        "position_noise",
+        "attitude_noise",
+        "resample_below",
+        "still",
+    )
+    given = [
+        *(np.ascontiguousarray(direct[name], np.int64) for name in ("time", "imu_index", "pose_index")),
+        *(np.ascontiguousarray(direct[name], np.float64) for name in ("imu", "poses")),
+        np.concatenate([np.ravel(field) for field in vars(direct["start"]).values()]),
+        np.array([*(direct[name] for name in settings), -9.81]),
+        seed_words(direct["seed"]),
+        np.array(names, np.uint32),
+        *segments(),
+    ]
+    made = [np.empty((ticks, 10)), np.empty(seen), np.empty(seen, bool), np.empty((seen, n), np.int32)]
+    peer.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * (len(given) + len(made))]
+    pointers = [a.ctypes.data for a in (*given, *made)]
+    return lambda: seconds(lambda: (given, peer(ticks, *pointers))), direct_rbpf.History(*made)
+
+
+def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 9) -> list[Row]:
+    """Microseconds a tick of `rbpf_indoor`, draws included, against C++ and NumPy loops written by hand."""
     built, direct = particles.case(particles_, duration)
-    by_hand = direct_rbpf.run(**direct)
-    particles.check(simulate(built.graph, built.inputs, engine="c"), by_hand)
+    in_numpy = direct_rbpf.run(**direct)
+    found = simulate(built.graph, built.inputs, engine="c")
+    particles.check(found, in_numpy)
     assert isinstance(built.inputs, Mapping)
     ours = loop(built.graph, dict(built.inputs))
-    scale = 1e6 / len(by_hand.poses)
+    name, scale = f"rbpf_indoor, {particles_:,} particles, c", 1e6 / len(in_numpy.poses)
+    mine = lambda: ours() * scale
+    try:
+        peer, by_hand = rbpf_by_hand(direct)
+    except ImportError as error:
+        rows = [missing(name, mine(), "us/tick", "C++", error)]
+    else:
+        peer()
+        particles.check(found, by_hand)
+        a, b, ratio = interleaved(mine, lambda: peer() * scale, repeats)
+        rows = [Row(name, a, b, "us/tick", "C++ -O3 by hand", ratio, "ratio <= 1.5", ratio <= 1.5)]
     a, b, ratio = interleaved(
-        lambda: ours() * scale, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, repeats
+        mine, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, min(repeats, 5)
     )
-    return [Row(f"rbpf_indoor, {particles_:,} particles, c", a, b, "us/tick", "direct NumPy", ratio)]
+    return [*rows, Row(name, a, b, "us/tick", "direct NumPy", ratio)]
