@@ -334,14 +334,26 @@ def windows_of(
     )
 
 
-def fit_counts(windows: Sequence[Window], *, robust: bool = True, rounds: int = 30) -> CountsCalibration:
+def fit_counts(
+    windows: Sequence[Window], *, robust: bool = True, rounds: int = 30, aligned: bool = False
+) -> CountsCalibration:
     """Least squares over the windows of one or more recordings.
+
+    With `aligned` the accelerometer is fitted the other way round, each axis by itself, and solved for f:
+
+        c_k = f_k / s_k + z_k
+
+    What is uncertain is then on the left: a window's counts hold all that accelerates the body, its force is
+    nearly exact. Regressed the usual way, y on c, uncertain counts draw the scale towards zero, the more so
+    the less the body tilts, and what crosses axes is made of the same motions; far from the tilts that were
+    seen, both show as degrees of roll and pitch.
 
     Args:
         windows: from `windows_of`.
         robust: weight each window by Tukey's function of its residual over 4.685 robust deviations, found
             axis by axis; otherwise all count alike.
         rounds: of weighting.
+        aligned: whether the accelerometer's axes are those of the body, with a scale and a zero each.
 
     Raises:
         DataError: without windows, or when they do not determine the fit (a body that never turned).
@@ -361,8 +373,23 @@ def fit_counts(windows: Sequence[Window], *, robust: bool = True, rounds: int = 
                 got=f"{len(A)} windows",
                 fix="record motion about each axis, or give other recordings",
             )
-        betas.append(np.column_stack([_weighted(A, y[:, k], rounds if robust else 0) for k in range(3)]))
+        again = rounds if robust else 0
+        if aligned and name == "accelerometer":
+            betas.append(_by_axis(x, y, again))
+        else:
+            betas.append(np.column_stack([_weighted(A, y[:, k], again) for k in range(3)]))
     return CountsCalibration.of(*betas)
+
+
+def _by_axis(counts: np.ndarray, force: np.ndarray, rounds: int) -> np.ndarray:
+    """beta (4, 3) of c_k = f_k / s_k + z_k, an axis at a time."""
+    beta = np.zeros((4, 3))
+    for k in range(3):
+        per_force, zero = _weighted(
+            np.column_stack([force[:, k], np.ones(len(force))]), counts[:, k], rounds
+        ).tolist()
+        beta[k, k], beta[3, k] = 1.0 / per_force, -zero / per_force
+    return beta
 
 
 def _weighted(A: np.ndarray, y: np.ndarray, rounds: int) -> np.ndarray:

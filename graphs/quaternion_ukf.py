@@ -98,7 +98,7 @@ def for_flight(
     attitude_walk: float = 0.02,
     rate_walk: float = 10.0,
     gyro_noise: float = 0.02,
-    force_noise: float = 2.5,
+    force_noise: float = 2.0,
     weighted: bool = False,
     alpha: float = 1.0,
     beta: float = 2.0,

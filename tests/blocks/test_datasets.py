@@ -234,6 +234,10 @@ def test_the_real_sets_agree_on_their_calibration():
     assert (np.ptp(scales, axis=0) < 0.01 * scales.mean(axis=0)).all()
     zeros = np.array([c.gyro_zero for c in found])
     np.testing.assert_allclose(zeros, np.tile([373.6, 375.4, 369.7], (6, 1)), atol=0.2)  # what stands at rest
+    scales = np.array([np.diag(c.force) for c in found])
+    assert (np.ptp(scales, axis=0) < 0.01 * np.abs(scales.mean(axis=0))).all()
+    zeros = np.array([c.force_zero for c in found])
+    np.testing.assert_allclose(zeros, np.tile([511.7, 500.5, 502.3], (6, 1)), atol=0.3)
     assert load_flight(f"ese650:{folder}:6").info["absent"] == {"truth": 129}
 
 

@@ -43,6 +43,20 @@ def test_the_fit_finds_scale_and_zero(flight):
     np.testing.assert_allclose(found.force_zero, [511.0, 500.0, 505.0], atol=0.5)
 
 
+def test_a_body_that_accelerates_does_not_shrink_the_scale():
+    """Counts hold accelerations that the force leaves out: y on c loses a third of the scale, c on y none."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    force = rng.normal(size=(n, 3)) * [2.0, 2.0, 1.0] + [0.0, 0.0, 9.5]
+    counts = (force + rng.normal(size=(n, 3)) * [1.4, 1.4, 0.7]) * 10.0 + [510.0, 500.0, 505.0]
+    turns = rng.normal(size=(n, 3))
+    windows = [Window(counts=np.hstack([turns, counts]), rate=turns, force=force)]
+    usual, aligned = (fit_counts(windows, aligned=a) for a in (False, True))
+    assert (np.diag(usual.force) < 0.075).all()
+    np.testing.assert_allclose(aligned.force, np.eye(3) * 0.1, atol=0.002)
+    np.testing.assert_allclose(aligned.force_zero, [510.0, 500.0, 505.0], atol=3.0)
+
+
 def test_the_rate_is_that_of_the_body_not_of_the_world(flight):
     """log(R0^T R1) explains what the gyroscope read; log(R1 R0^T), turned into the world, does not."""
     windows = whole(flight)
