@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass, replace
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,8 +90,9 @@ class SymbolicDraw:
 def remembering(memory: OrderedDict[Any, Any]) -> Iterator[None]:
     """Within it, a step recorded before with the same settings and types is not recorded again.
 
-    For those who build the same graph many times over. Only steps whose settings are plain values, arrays
-    and dataclasses of these are remembered; the oldest are forgotten beyond a few hundred.
+    For those who build the same graph many times over. Only steps whose settings are plain values, arrays,
+    dataclasses of these and functions without a closure are remembered; the oldest are forgotten beyond a
+    few hundred.
     """
     token = _memory.set(memory)
     try:
@@ -119,6 +121,8 @@ def _fingerprint(value: Any) -> Any:
         return type(value), *map(_fingerprint, value)
     if is_dataclass(value) and not isinstance(value, type):
         return type(value), *(_fingerprint(getattr(value, f.name)) for f in fields(value))
+    if isinstance(value, FunctionType) and value.__closure__ is None:
+        return FunctionType, value  # as itself; the rule for ties of a `merge` is one
     raise _NotPlainError
 
 

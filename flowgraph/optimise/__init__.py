@@ -63,6 +63,11 @@ ARRAYS = ("fold", "share", "drop", "algebra")
 """Passes that keep arrays whole: for backends that are fast on arrays and slow on many small operations."""
 
 
+COMPILED = tuple(name for name in PASSES if name not in ("symmetry", "structure"))
+"""Passes for C, which leaves out known zeros by itself: with the other two a large filter takes ten times as
+long to compile and is no faster."""
+
+
 def optimise(
     program: Program, passes: Collection[str] = DEFAULT, *, unroll_work: int = LARGEST_WORK
 ) -> Program:
@@ -116,7 +121,7 @@ def for_engine(engine: str, passes: Collection[str] | None = None) -> tuple[str,
     Raises:
         UnknownNameError: for a pass that is not there.
     """
-    suited = {"reference": (), "xla": ARRAYS}.get(engine, DEFAULT)
+    suited = {"reference": (), "xla": ARRAYS, "c": COMPILED}.get(engine, DEFAULT)
     return check_passes(suited if passes is None else passes)
 
 

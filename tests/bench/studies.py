@@ -178,7 +178,7 @@ def memory_of_particles(*, runs: int = 10_000, fewer: int = 500, duration: float
 def _particles(runs: int, duration: float) -> tuple[float, float]:
     """Milliseconds a run, and the largest peak of any process in MiB."""
     study = Study(
-        graphs=["rbpf_indoor"], data=["sim"], seeds=runs, engine="xla",
+        graphs=["rbpf_indoor"], data=["sim"], seeds=runs, engine="c",
         parameters={"particles": 100, "duration": duration},
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:

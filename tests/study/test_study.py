@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -97,9 +98,8 @@ def test_a_changed_parameter_graph_or_engine_is_another_key(monkeypatch):
     for other in ({"parameters": {"settle": 0.5}}, {"engine": "reference"}, {"seeds": [1]}):
         assert not keys(**other) & first
     assert not keys(parameters={"gyro.noise": 0.002}) & first
-    from flowgraph.blocks import tuning
-
-    monkeypatch.setattr(tuning, "GRAVITY", (0.0, 0.0, -9.8))
+    ekf = importlib.import_module("flowgraph.graphs.ekf")
+    monkeypatch.setattr(ekf, "gravity_of", lambda flight: (0.0, 0.0, -9.8))
     assert not keys() & first
 
 

@@ -107,3 +107,23 @@ def test_a_score_that_does_not_say_gets_every_stream(tmp_path, monkeypatch):
     assert not run_study(study("c"), tmp_path).failed
     (streams,) = seen
     assert {"belief", "prior", "posterior"} <= streams
+
+
+@pytest.mark.parametrize("name", ["ekf", "rbpf_indoor"])
+def test_graphs_of_many_seeds_are_lowered_once(name, monkeypatch):
+    """The second particle filter has merges, whose rule for ties is a function."""
+    from collections import OrderedDict
+
+    from flowgraph.recording import remembering
+    from flowgraph.study.lifting import Lowered
+
+    lowered, steps, settings = Lowered(), OrderedDict[Any, Any](), dict(FLIGHT)
+    if name == "rbpf_indoor":
+        settings["particles"] = 10
+    found = []
+    for seed in range(3):
+        with remembering(steps):
+            case, _ = tasks.prepared(name, "sim", seed, settings)
+        found.append(lowered.lower(case.graph))
+    assert found[1] is found[0]
+    assert found[2] is found[0]
