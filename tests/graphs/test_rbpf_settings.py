@@ -93,16 +93,19 @@ def errors(setting: str, particles: int, seeds: range, duration: float = 20.0) -
     )
     ours = simulate_many(
         cloud, lambda s: chosen(setting, s, duration, "imu", "vicon"), seeds, keep=["pose"],
-        runs_at_once=min(4, len(seeds)),
+        engine="c",
     )["pose"]  # fmt: skip
     theirs = simulate_many(
-        eskf, lambda s: chosen(setting, s, duration, "imu", "position", "attitude"), seeds, keep=["belief"]
+        eskf,
+        lambda s: chosen(setting, s, duration, "imu", "position", "attitude"),
+        seeds,
+        keep=["belief"],
+        engine="c",
     )["belief"]
     return rmse(ours, setting, seeds, duration), rmse(theirs, setting, seeds, duration)
 
 
 def test_in_one_setting_it_is_nearly_as_good_as_an_error_state_filter():
-    pytest.importorskip("jax")
     ours, theirs = errors("HHH", 300, range(3), duration=8.0)
     assert ours < 1.25 * theirs
 
@@ -111,7 +114,6 @@ def test_in_one_setting_it_is_nearly_as_good_as_an_error_state_filter():
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize(("particles", "flights", "factor"), [(1000, 20, 1.12), (10_000, 6, 1.03)])
 def test_it_is_nearly_as_good_as_an_error_state_filter_in_each_setting(setting, particles, flights, factor):
-    pytest.importorskip("jax")
     ours, theirs = errors(setting, particles, range(flights))
     assert BOUND[setting[:2]] < ours < factor * theirs
     assert BOUND[setting[:2]] < theirs

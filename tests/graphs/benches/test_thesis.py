@@ -64,7 +64,7 @@ def test_an_unknown_filter_or_setting_is_refused(setting):
 
 @cache
 def five_flights() -> Report:
-    return thesis(flights=5, engine="xla")
+    return thesis(flights=5, engine="c")
 
 
 def cell(setting: str, name: str) -> dict[str, Any]:
@@ -74,7 +74,6 @@ def cell(setting: str, name: str) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_our_filters_are_below_the_figures_of_the_thesis(setting):
-    pytest.importorskip("jax")
     for name in ("acf", "ekf", "ukf"):
         row = cell(setting, name)
         assert row["thesis_metric_position"] < row["thesis_position"], name
@@ -84,7 +83,6 @@ def test_our_filters_are_below_the_figures_of_the_thesis(setting):
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_nobody_beats_the_bound_and_particles_come_near_the_error_state_filter(setting):
-    pytest.importorskip("jax")
     for name in FILTERS:
         row = cell(setting, name)
         assert row["position_rmse_m"] >= row["bound_position_rmse_m"], name
