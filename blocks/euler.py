@@ -35,6 +35,7 @@ __all__ = [
     "quaternion_from_angles",
     "singular_cosine",
     "world_rate_matrix",
+    "wrapped",
 ]
 
 ORDERS = ("zxy", "zyx")
@@ -85,12 +86,12 @@ def matrix_from_angles(e: Array, *, order: str, xp: Any) -> Array:
 
 def angles_from_matrix(R: Array, *, order: str, xp: Any) -> Array:
     """The angles (..., 3) of a rotation (..., 3, 3); the one that flips over lies in [-pi/2, pi/2]."""
-    bound = lambda x: xp.clip(x, -1.0, 1.0)
+    size = lambda a, b: xp.sqrt(a * a + b * b)  # not asin: near +-90 degrees that has half the digits
     if order == "zyx":
-        theta = xp.asin(bound(-R[..., 2, 0]))
+        theta = xp.atan2(-R[..., 2, 0], size(R[..., 2, 1], R[..., 2, 2]))
         phi, psi = xp.atan2(R[..., 2, 1], R[..., 2, 2]), xp.atan2(R[..., 1, 0], R[..., 0, 0])
     else:
-        phi = xp.asin(bound(R[..., 2, 1]))
+        phi = xp.atan2(R[..., 2, 1], size(R[..., 2, 0], R[..., 2, 2]))
         theta, psi = xp.atan2(-R[..., 2, 0], R[..., 2, 2]), xp.atan2(-R[..., 0, 1], R[..., 1, 1])
     return xp.stack([phi, theta, psi], axis=-1)
 

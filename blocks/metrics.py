@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from flowgraph import Series
 from flowgraph.blocks.chi_square import chi_square_band, inside
+from flowgraph.blocks.euler import angles_from_quaternion, wrapped
 from flowgraph.blocks.geometry import (
     conjugate,
     geodesic_angle,
@@ -31,7 +32,6 @@ from flowgraph.errors import DataError
 __all__ = [
     "attitude_errors",
     "error_summary",
-    "euler_angles",
     "interpolate_pose",
     "nees",
     "nees_summary",
@@ -244,14 +244,6 @@ def _true_velocity(truth: Series, time: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, seconds, column) for column in truth["velocity"].T], axis=-1)
 
 
-def euler_angles(attitude: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (..., 3) in rad of attitudes (..., 4): R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    R = np.asarray(to_matrix(attitude, xp=np))
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
-    return np.stack([roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])], axis=-1)
-
-
 def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
     """Compare attitudes with the truth, at the estimate's times that it covers.
 
@@ -271,11 +263,11 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
     """
     chosen = within_truth(estimate, truth, settle)
     q = _between(truth, "attitude", chosen.time)
-    apart = euler_angles(chosen["attitude"]) - euler_angles(q)
-    wrapped = np.pi - np.remainder(np.pi - apart, 2.0 * np.pi)
+    a, b = (np.asarray(angles_from_quaternion(x, order="zyx", xp=np)) for x in (chosen["attitude"], q))
+    apart = wrapped(a - b)
     tilt, heading = tilt_and_heading(chosen["attitude"], q)
     return {
-        **{f"{n}_rmse_rad": _rms(wrapped[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
+        **{f"{n}_rmse_rad": _rms(apart[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
         "total_rmse_deg": _rms(geodesic_angle(chosen["attitude"], q)),
         "heading_rmse_deg": _rms(heading),
         "inclination_rmse_deg": _rms(tilt),

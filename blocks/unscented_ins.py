@@ -1,15 +1,11 @@
-"""The unscented filter of `euler_ins`: sigma points that are augmented with the noises.
+"""What the unscented filters of `euler_ins` add to `unscented`: how a point moves, and a camera's velocity.
 
-State and noises are independent, so a sigma point moves one of them at a time, along a column of its own
-factor: S of P = S S^T for the state, and the square roots of the noises' variances. Points lie in pairs
-around the mean, sqrt(3) deviations away. Everything is taken as deviations from the image of the mean: then a
-wide spread costs no digits, an angle is never averaged as a number, and the covariance is a sum of squares.
+The sigma points are augmented with the noises, as in `unscented`: state and noises are independent, so a
+point moves one of them at a time. They lie sqrt(3) deviations away, where they match a Gaussian's fourth
+moment.
 
-    d_i = Y_i minus Y_0        m = sum d_i / 6        x' = Y_0 plus m
-    P' = sum d_i d_i^T / 6 + (beta - alpha^2) m m^T        alpha^2 = 3 / L, beta = 2
-
-L is the number of augmented coordinates. Measurements correct in regression form: H is the slope of the
-pairs, and what they leave unexplained adds to the noise, so the Joseph form applies.
+A camera's velocity corrects in regression form: H is the slope of the pairs of points, and what they leave
+unexplained, of curvature and of the noises, is the noise of the Joseph form.
 
 Sources: S. Julier and J. Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92, 2004; E. Wan
 and R. van der Merwe, 2001 (alpha, beta); the report's sec. on its two filters.
@@ -18,74 +14,42 @@ and R. van der Merwe, 2001 (alpha, beta); the report's sec. on its two filters.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Array, block
 from flowgraph.blocks.euler import matrix_from_angles
-from flowgraph.blocks.euler_ins import STATE, increment_variances, increments, move, moved_by
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.kalman import Gaussian, KalmanInnovation, correct
+from flowgraph.blocks.sigma_points import SigmaPoints
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import CameraMotion, camera_velocity
 from flowgraph.errors import UnknownNameError
 
-__all__ = ["RATES", "predict_unscented_ins", "update_camera_velocity"]
-
-_FAR = math.sqrt(3.0)
-_BETA = 2.0
+__all__ = ["RATES", "carried", "far_points", "update_camera_velocity"]
 
 RATES = ("gyro", "camera")
 """Whose rate the body's is taken for: the gyroscope's minus its bias (eq. 10), or the camera's (eq. 9)."""
 
 
-def sigma_points(x: Array, P: Array, noise: Array, xp: Any) -> tuple[Array, Array, Array]:
-    """Sigma points of a state (15) with covariance P, and independent noises with deviations (k).
+def carried(order: str) -> Callable[..., Array]:
+    """`move` of `predict_unscented`: `euler_ins.move` over the IMU's readings, each point with its own noise
+    (..., 12) of (increments of angle and velocity, steps of the two biases)."""
 
-    Returns:
-        Points (2 L, 15), noises (2 L, k), L = 15 + k: first all steps forth, then all back. And the state's
-        factor S (15, 15).
-    """
-    S = xp.linalg.cholesky(P)
-    k, n = noise.shape[-1], x.shape[-1]
-    steps = xp.concat([S.mT, xp.zeros((k, n), dtype=x.dtype)], axis=0) * _FAR
-    shakes = xp.eye(n + k, dtype=x.dtype)[:, n:] * (noise * _FAR)
-    points = STATE.plus(x[None, :], xp.concat([steps, -steps], axis=0), xp)
-    return points, xp.concat([shakes, -shakes], axis=0), S
+    def moved(x: Array, imu: Imu, w: Array, dt: Any, xp: Any) -> Array:
+        turn, push = increments(x, imu, dt)
+        after = move(x, turn + w[..., 0:3], push + w[..., 3:6], dt, order=order, xp=xp)
+        return after + xp.concat([xp.zeros_like(after[..., 0:9]), w[..., 6:12]], axis=-1)
+
+    return moved
 
 
-@block
-def predict_unscented_ins(
-    belief: Gaussian, imu: Imu, *, order: str, noise: ImuNoise, dt: float, xp: Any
-) -> Gaussian:
-    """Predict over `dt` seconds with one IMU reading, through 54 sigma points of state (15) and noise (12).
-
-    With dt = 0, as at the first firing, this is the identity (to rounding).
-
-    Args:
-        belief: over `euler_ins.STATE`; its covariance must be positive definite.
-        imu: the reading that holds over the step.
-        order: "zxy" or "zyx".
-        noise: continuous densities; the increments have dt times their squares.
-    """
-    x = belief.mean
-    deviations = xp.sqrt(xp.asarray(increment_variances(noise), dtype=x.dtype) * dt)
-    points, shakes, _ = sigma_points(x, belief.covariance, deviations, xp)
-    steps = xp.concat([xp.zeros((points.shape[0], 9), dtype=x.dtype), shakes[:, 6:12]], axis=-1)
-
-    def moved(point: Array, shake: Array) -> Array:
-        turn, push = increments(point, imu, dt)
-        return move(point, turn + shake[..., 0:3], push + shake[..., 3:6], dt, order=order, xp=xp)
-
-    middle = moved(x, xp.zeros((12,), dtype=x.dtype))
-    images = moved(points, shakes) + steps
-    apart = STATE.minus(images, middle[None, :], xp)
-    mean = xp.sum(apart, axis=0) / 6.0
-    spread = _BETA - 6.0 / points.shape[0]  # alpha^2 = 3 / L, and there are 2 L points
-    P = apart.mT @ apart / 6.0 + spread * (mean[:, None] * mean[None, :])
-    return Gaussian(mean=STATE.plus(middle, mean, xp), covariance=0.5 * (P + P.mT))
+def far_points(noises: int) -> SigmaPoints:
+    """Points sqrt(3) deviations away from the mean of a state with so many noises."""
+    return SigmaPoints(alpha=math.sqrt(3.0 / (STATE.tangent + noises)))
 
 
 @block
@@ -129,27 +93,24 @@ def update_camera_velocity(
         raise UnknownNameError("source of the rate", rate, RATES, path="update_camera_velocity")
     if motion is None:
         return prior, None
-    x = prior.mean
-    noise = xp.asarray(np.repeat([velocity_noise, rate_noise], 3), dtype=x.dtype)
-    points, shakes, S = sigma_points(x, prior.covariance, noise, xp)
-    seen = motion.rate @ xp.asarray(mount.rotation, dtype=x.dtype)
-
-    def view(point: Array, shake: Array) -> Array:
-        w = (imu.gyro - point[..., 9:12] if rate == "gyro" else seen + 0.0 * point[..., 9:12]) - shake[
-            ..., 3:6
-        ]
-        R = matrix_from_angles(point[..., 3:6], order=order, xp=xp)
-        return camera_velocity(point[..., 6:9], R, w, mount=mount, xp=xp) + shake[..., 0:3]
-
-    middle = view(x, xp.zeros((6,), dtype=x.dtype))
-    apart = view(points, shakes) - middle
-    mean = xp.sum(apart, axis=0) / 6.0
-    half = points.shape[0] // 2
-    slope = (apart[:15, :] - apart[half : half + 15, :]).mT / (2.0 * _FAR)  # H S
-    spread = _BETA - 6.0 / points.shape[0]
-    whole = apart.mT @ apart / 6.0 + spread * (mean[:, None] * mean[None, :])
-    rest = whole - slope @ slope.mT
+    x, kind = prior.mean, prior.mean.dtype
+    n, points = x.shape[-1], far_points(6)
+    scale = points.scale(n + 6)
+    S = xp.linalg.cholesky(prior.covariance)
+    deviations = xp.asarray(np.diag(np.repeat([velocity_noise, rate_noise], 3)), dtype=kind)
+    apart, shakes = points.around(S, scale, xp), points.around(deviations, scale, xp)
+    X = STATE.plus(x[None, :], xp.concat([0.0 * apart[:1], apart, 0.0 * apart[:12]], axis=0), xp)
+    w = xp.concat([xp.zeros((1 + 2 * n, 6), dtype=kind), shakes], axis=0)
+    if rate == "gyro":
+        turning = imu.gyro - X[:, 9:12]
+    else:
+        turning = motion.rate @ xp.asarray(mount.rotation, dtype=kind) + 0.0 * X[:, 9:12]
+    R = matrix_from_angles(X[:, 3:6], order=order, xp=xp)
+    seen = camera_velocity(X[:, 6:9], R, turning - w[:, 3:6], mount=mount, xp=xp) + w[:, 0:3]
+    cluster = points.cluster(seen, None, scale, xp)
+    slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * scale)  # H S
+    rest = points.covariance(cluster, cluster, scale) - slope @ slope.mT
     H = xp.linalg.solve(S.mT, slope.mT).mT
-    residual = motion.velocity - (middle + mean)
+    residual = motion.velocity - cluster.mean
     found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, xp=xp)
     return moved_by(prior, found, xp)

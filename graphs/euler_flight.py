@@ -13,6 +13,7 @@ from flowgraph.blocks.euler_ins import singularity_warning, start_gaussian
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.scores import scorer
 
 __all__ = ["POSE_NOISE", "SingularityWarning", "noise_of", "pose_covariance", "scored", "start_at"]
 
@@ -44,16 +45,16 @@ def start_at(pose: Series, order: str) -> Gaussian:
     return start_gaussian(pose["position"][0], pose["attitude"][0], order=order)
 
 
-def scored(truth: Series | None, order: str, settle: float) -> Callable[[Result], dict[str, float]]:
-    """The score of a run: pose errors, and how near the attitude came to the singularity (a warning, if
-    near)."""
+def scored(flight: Flight, order: str, settle: float) -> Callable[[Result], dict[str, float]]:
+    """The score of a run: errors and consistency, as every filter has them, and how near the attitude came to
+    the singularity (a warning, if near)."""
+    usual = scorer(flight, pose_errors, settle=settle)
 
     def score(result: Result) -> dict[str, float]:
         cosine = result["angles"]["cosine"]
         said = singularity_warning(cosine, order)
         if said:
             warnings.warn(said, SingularityWarning, stacklevel=2)
-        row = {"least_cosine": float(np.abs(cosine).min(initial=1.0))}
-        return ({} if truth is None else pose_errors(result["belief"], truth, settle=settle)) | row
+        return usual(result) | {"least_cosine": float(np.abs(cosine).min(initial=1.0))}
 
     return score

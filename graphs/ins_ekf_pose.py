@@ -113,4 +113,4 @@ def for_flight(
         order=order,
         gate=gate,
     )
-    return Case(built, inputs, scored(flight.truth, order, settle))
+    return Case(built, inputs, scored(flight, order, settle))

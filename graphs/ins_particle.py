@@ -153,4 +153,4 @@ def for_flight(
         spread=spread,
         scheme=scheme,
     )
-    return Case(built, inputs, scored(flight.truth, order, settle))
+    return Case(built, inputs, scored(flight, order, settle))

@@ -6,21 +6,30 @@ Every tick predicts to now, through sigma points that are augmented with the IMU
 also corrects. The pose, found by PnP on the host (`tag_pose`), is a source.
 
 Sources: the report's first filter, and the course's nonlinear Kalman filter. Equations: `blocks/euler_ins.py`
-and `blocks/unscented_ins.py`.
+and `blocks/unscented.py`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from flowgraph import Case, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.euler import need_order
-from flowgraph.blocks.euler_ins import euler_angles, navigation_belief, update_pose_angles
+from flowgraph.blocks.euler_ins import (
+    STATE,
+    euler_angles,
+    increment_variances,
+    navigation_belief,
+    update_pose_angles,
+)
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented_ins import predict_unscented_ins
+from flowgraph.blocks.unscented import predict_unscented
+from flowgraph.blocks.unscented_ins import carried, far_points
 from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.checks import need_numbers
 from flowgraph.graphs.euler_flight import noise_of, pose_covariance, scored, start_at
@@ -47,9 +56,10 @@ def ins_ukf_pose(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
-    prior = predict_unscented_ins(
-        belief, between_imu(last, control), order=order, noise=noise, name="predict"
-    )
+    prior = predict_unscented(
+        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
+        space=STATE, points=far_points(12), name="predict",
+    )  # fmt: skip
     posterior, innovation = update_pose_angles(
         prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
     )
@@ -112,4 +122,4 @@ def for_flight(
         order=order,
         gate=gate,
     )
-    return Case(built, inputs, scored(flight.truth, order, settle))
+    return Case(built, inputs, scored(flight, order, settle))

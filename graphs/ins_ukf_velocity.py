@@ -16,13 +16,20 @@ import numpy as np
 
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.euler import need_order
-from flowgraph.blocks.euler_ins import euler_angles, navigation_belief, start_gaussian
+from flowgraph.blocks.euler_ins import (
+    STATE,
+    euler_angles,
+    increment_variances,
+    navigation_belief,
+    start_gaussian,
+)
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.metrics import interpolate_pose
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented_ins import RATES, predict_unscented_ins, update_camera_velocity
+from flowgraph.blocks.unscented import predict_unscented
+from flowgraph.blocks.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import CameraMotion
 from flowgraph.checks import need_numbers
@@ -52,9 +59,10 @@ def ins_ukf_velocity(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | motion, name="control")
-    prior = predict_unscented_ins(
-        belief, between_imu(last, control), order=order, noise=noise, name="predict"
-    )
+    prior = predict_unscented(
+        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
+        space=STATE, points=far_points(12), name="predict",
+    )  # fmt: skip
     posterior, innovation = update_camera_velocity(
         prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
         rate_noise=rate_noise, rate=rate, gate=gate, name="update",
@@ -133,4 +141,4 @@ def for_flight(
         order=order,
         gate=gate,
     )
-    return Case(built, inputs, scored(flight.truth, order, settle))
+    return Case(built, inputs, scored(flight, order, settle))

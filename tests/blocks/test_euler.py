@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from flowgraph import UnknownNameError
 from flowgraph.blocks import euler
 from flowgraph.blocks import euler_ins as ins
-from flowgraph.blocks import unscented_ins as unscented
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.unscented import predict_unscented
+from flowgraph.blocks.unscented_ins import carried, far_points
 from flowgraph.blocks.vision.pnp import PoseMeasurement
 
 SCIPY = {"zyx": ("ZYX", [2, 1, 0]), "zxy": ("ZXY", [2, 0, 1])}
@@ -153,17 +154,34 @@ def test_the_step_follows_a_rigid_body_to_second_order(order):
     assert 3.5 < errors[0] / errors[1] < 4.5
 
 
+def unscented(belief: Gaussian, imu: Imu, *, order: str, noise: ImuNoise, **more: Any) -> Gaussian:
+    """The prediction of `ins_ukf_pose`."""
+    density = np.diag(ins.increment_variances(noise))
+    return predict_unscented.step(
+        belief, imu, move=carried(order), noise=density, space=ins.STATE, points=far_points(12), **more
+    )
+
+
+@pytest.mark.parametrize("order", euler.ORDERS)
+def test_an_angle_of_ninety_degrees_keeps_its_digits(order):
+    """An arc sine would lose half of them."""
+    e = np.zeros(3)
+    e[{"zxy": 0, "zyx": 1}[order]] = np.pi / 2 - 1e-6
+    R = euler.matrix_from_angles(e, order=order, xp=np)
+    np.testing.assert_allclose(euler.angles_from_matrix(R, order=order, xp=np), e, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("order", euler.ORDERS)
 def test_both_conventions_and_both_filters_say_the_same(order):
     x, imu = a_step(2)
     A = np.random.default_rng(0).normal(size=(15, 15))
     belief = Gaussian(mean=x, covariance=1e-6 * (A @ A.T + np.eye(15)))
     extended = ins.predict_extended.step(belief, imu, order=order, noise=NOISE, dt=DT, xp=np)
-    sigma = unscented.predict_unscented_ins.step(belief, imu, order=order, noise=NOISE, dt=DT, xp=np)
+    sigma = unscented(belief, imu, order=order, noise=NOISE, dt=DT, xp=np)
     np.testing.assert_allclose(sigma.mean, extended.mean, atol=1e-5)
     np.testing.assert_allclose(sigma.covariance, extended.covariance, atol=1e-3 * extended.covariance.max())
-    for block in (ins.predict_extended, unscented.predict_unscented_ins):
-        still = block.step(belief, imu, order=order, noise=NOISE, dt=0.0, xp=np)
+    for step in (ins.predict_extended.step, unscented):
+        still = step(belief, imu, order=order, noise=NOISE, dt=0.0, xp=np)
         np.testing.assert_allclose(still.mean, x, atol=1e-14)
         np.testing.assert_allclose(still.covariance, belief.covariance, atol=1e-18)
 
@@ -174,7 +192,7 @@ def test_the_sigma_points_see_the_spread_of_drawn_noise(order):
     x, imu = a_step(3)
     belief = Gaussian(mean=x, covariance=np.diag(np.repeat([0.1, 0.05, 0.2, 0.1, 0.1], 3) ** 2))
     noise = ImuNoise(0.2, 1.0, 0.1, 0.1)
-    found = unscented.predict_unscented_ins.step(belief, imu, order=order, noise=noise, dt=0.1, xp=np)
+    found = unscented(belief, imu, order=order, noise=noise, dt=0.1, xp=np)
     rng = np.random.default_rng(0)
     points = x + rng.normal(size=(200_000, 15)) @ np.linalg.cholesky(belief.covariance).T
     shakes = rng.normal(size=(200_000, 12)) * np.sqrt(ins.increment_variances(noise) * 0.1)
