@@ -8,9 +8,7 @@ not depend on how many others are asked for.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -28,7 +26,7 @@ from flowgraph.random import seed_words
 from flowgraph.run import Meter
 from flowgraph.series import Series
 from flowgraph.state import initial_registers
-from flowgraph.types import DTYPES, ArrayType, StructType, Type, dtype_name, flatten, leaves_of
+from flowgraph.types import ArrayType, StructType, Type, dtype_name, flatten, leaves_of
 
 if TYPE_CHECKING:
     from flowgraph.xla import Chunk
@@ -73,7 +71,7 @@ class Runs:
         fields = {n: a[index][at] for n, a in self.leaves.items()}
         if list(fields) == ["value"]:
             return Series(self.time[at], fields["value"], name=self.name)
-        type_ = StructType(self.name, tuple((n, _leaf_type(a)) for n, a in fields.items()), dict)
+        type_ = StructType(self.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
         return Series(self.time[at], fields, type=type_, name=self.name)
 
 
@@ -173,7 +171,9 @@ def simulate_many(
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
     if engine == "c":
-        return _threaded(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
+        from flowgraph.c.batch import threaded
+
+        return threaded(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
     return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
 
 
@@ -193,14 +193,14 @@ def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
     return found
 
 
-def _of_run(given: Any, run: int, seed: int) -> Any:
+def of_run(given: Any, run: int, seed: int) -> Any:
     """Inputs or initial values of the run of that place and seed."""
     if isinstance(given, list | tuple):
         return given[run]
     return given(seed) if callable(given) else given
 
 
-def _shared(inputs: Any) -> bool:
+def is_shared(inputs: Any) -> bool:
     return not (callable(inputs) or isinstance(inputs, list | tuple))
 
 
@@ -210,13 +210,13 @@ def _one_by_one(
 ) -> Batch:  # fmt: skip
     from flowgraph.simulate import simulate
 
-    if _shared(inputs):  # an iterable can be read only once
+    if is_shared(inputs):  # an iterable can be read only once
         inputs = dict(zip(graph.sources, tape(prepare(graph, inputs), graph).series, strict=True))
     parts: dict[str, list[Series]] = {name: [] for name in kept}
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
         result = simulate(
-            graph, _of_run(inputs, n, seed), engine=engine, dtype=dtype, init=_of_run(init, n, seed),
+            graph, of_run(inputs, n, seed), engine=engine, dtype=dtype, init=of_run(init, n, seed),
             seed=seed, passes=passes,
         )  # fmt: skip
         wall, ticks = wall + result.wall_s, result.ticks
@@ -224,92 +224,25 @@ def _one_by_one(
             parts[name].append(result[name])
         if progress is not None:
             progress.update(n + 1, 0)
-    return Batch(
-        graph.name, engine, seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall
-    )
+    return Batch(graph.name, engine, seeds, {n: joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall)
 
 
-def _threaded(
-    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
-    kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
-) -> Batch:  # fmt: skip
-    """Runs in C, as many at once as there are processors: a call into C lets other threads go on."""
-    from flowgraph.c.engine import compiled
-
-    pipeline, real = lower(graph, dtype=dtype), np.dtype(dtype)
-    chosen = for_engine("c", passes)
-    if init is not None:
-        chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
-    shared = tape(prepare(graph, inputs), graph) if _shared(inputs) else None
-    library = None if shared is None else compiled(pipeline, real, shared.patterns, chosen)
-    shared_rows = None if library is None or shared is None else library.rows(_reals(shared, real))
-
-    def run(n: int) -> tuple[dict[str, Series], int]:
-        events = shared or tape(prepare(graph, _of_run(inputs, n, seeds[n])), graph)
-        c = library if library is not None else compiled(pipeline, real, events.patterns, chosen)
-        rows = shared_rows if shared_rows is not None else c.rows(_reals(events, real))
-        cells = [cell[0] for cell in _cells(graph, init, seeds, (n,))]
-        found: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {name: [] for name in kept}
-        done = 0
-        for part, after in c.play(cells, seed_words(seeds[n]), events.time, events.key, rows):
-            cells = after
-            times = events.time[done : done + part.ticks]
-            for port, (mask, leaves) in zip(pipeline.outputs, part.outputs, strict=True):
-                if port.name in kept:
-                    pairs = zip(port.leaves, leaves, strict=True)
-                    wanted = [x for leaf, x in pairs if leaf.name in kept[port.name]]
-                    found[port.name].append((times[mask], wanted))
-            done += part.ticks
-        check_faults(pipeline, cells)
-        ports = [p for p in pipeline.outputs if p.name in kept]
-        return {p.name: _series(p, kept[p.name], found[p.name]) for p in ports}, done
-
-    if shared is None:  # made here, so that threads do not compile the same thing at once
-        first = tape(prepare(graph, _of_run(inputs, 0, seeds[0])), graph)
-        compiled(pipeline, real, first.patterns, chosen)
-    parts: dict[str, list[Series]] = {name: [] for name in kept}
-    ticks = 0
-    start = perf_counter()
-    with ThreadPoolExecutor(min(len(seeds), os.cpu_count() or 1)) as pool:
-        for n, (series, done) in enumerate(pool.map(run, range(len(seeds)))):
-            ticks = done
-            for name in kept:
-                parts[name].append(series[name])
-            if progress is not None:
-                progress.update(n + 1, 0)
-    wall = perf_counter() - start
-    return Batch(graph.name, "c", seeds, {n: _joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall)
-
-
-def _reals(events: Tape, real: Any) -> list[list[np.ndarray]]:
-    return [real_leaves(s, real) for s in events.series]
-
-
-def _series(port: Port, names: list[str], parts: list[tuple[np.ndarray, list[np.ndarray]]]) -> Series:
-    """Stretches of one output in one, with the leaves of these names."""
-    leaves = [leaf for leaf in port.leaves if leaf.name in names]
-    time = np.concatenate([t for t, _ in parts]) if parts else np.zeros(0, np.int64)
-    fields = {
-        leaf.name: np.concatenate([x[k] for _, x in parts])
-        if parts
-        else np.zeros((0, *leaf.shape), DTYPES[leaf.dtype])
-        for k, leaf in enumerate(leaves)
-    }
-    if list(fields) == ["value"]:
-        return Series(time, fields["value"], name=port.name)
-    type_ = StructType(port.name, tuple((n, _leaf_type(a)) for n, a in fields.items()), dict)
-    return Series(time, fields, type=type_, name=port.name)
-
-
-def _joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
+def joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
     """Series of several runs on the union of their times."""
-    time = np.unique(np.concatenate([p.time for p in parts]))
-    present = np.stack([np.isin(time, p.time) for p in parts])
+    time = parts[0].time
+    same = all(np.array_equal(p.time, time) for p in parts)
+    if same:
+        present = np.ones((len(parts), len(time)), bool)
+    else:
+        time = np.unique(np.concatenate([p.time for p in parts]))
+        present = np.stack([np.isin(time, p.time) for p in parts])
     made = {}
     for leaf in leaves:
         arrays = [p.leaves[leaf] for p in parts]
-        full = np.zeros((len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype)
-        full[present] = np.concatenate(arrays)
+        shape, kind = (len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype
+        full = np.empty(shape, kind) if same else np.zeros(shape, kind)
+        for row, at, array in zip(full, present, arrays, strict=True):
+            row[... if same else at] = array
         made[leaf] = full
     return Runs(name, time, present, made)
 
@@ -324,8 +257,8 @@ def _vectorised(
     real = np.dtype(dtype)
     whole = lower(graph, dtype=dtype)
     pipeline = _pruned(whole, kept)
-    shared = _shared(inputs)
-    first = tape(prepare(graph, _of_run(inputs, 0, seeds[0])), graph)
+    shared = is_shared(inputs)
+    first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
     if not len(first.time):  # nothing to compile for
         nothing = _one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress, None)
         return replace(nothing, engine="xla")
@@ -347,7 +280,7 @@ def _vectorised(
         columns = (
             dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
         )
-        last = cells = _cells(graph, init, seeds, members)
+        last = cells = cells_of(graph, init, seeds, members)
         words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
@@ -391,7 +324,7 @@ def _tapes(
     made: dict[int, Tape] = {}
     for run in members:
         if run not in made:
-            made[run] = tape(prepare(graph, _of_run(inputs, run, seeds[run])), graph)
+            made[run] = tape(prepare(graph, of_run(inputs, run, seeds[run])), graph)
             _same_ticks(graph, first, made[run], seeds[run])
     return [made[run] for run in members]
 
@@ -408,9 +341,9 @@ def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
     )
 
 
-def _cells(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
+def cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
     """Register cells with a leading axis of runs."""
-    made = {run: initial_registers(graph, _of_run(init, run, seeds[run])) for run in set(members)}
+    made = {run: initial_registers(graph, of_run(init, run, seeds[run])) for run in set(members)}
     slots = [made[run] for run in members]
     types: list[tuple[int, Type]] = [(index, node.type) for index, node in graph.registers]
     rows = [[leaf for index, type_ in types for leaf in flatten(slot[index], type_)] for slot in slots]
@@ -462,5 +395,5 @@ def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], 
     return Runs(port.name, time[some], present[:, some], leaves)
 
 
-def _leaf_type(array: np.ndarray) -> Any:
+def leaf_type(array: np.ndarray) -> Any:
     return ArrayType(array.shape[1:], dtype_name(array))

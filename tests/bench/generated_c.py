@@ -46,7 +46,9 @@ def floor(name: str, *defines: str) -> ctypes.CDLL:
     folder = Path(tempfile.mkdtemp(prefix="flowgraph-floor-"))
     try:
         made = folder / f"{name}.so"
-        subprocess.run([compiler, *FLAGS, *(f"-D{d}" for d in defines), "-o", made, FLOOR / f"{name}.cpp"], check=True)
+        subprocess.run(
+            [compiler, *FLAGS, *(f"-D{d}" for d in defines), "-o", made, FLOOR / f"{name}.cpp"], check=True
+        )
         return ctypes.CDLL(str(made))
     finally:
         shutil.rmtree(folder)
@@ -143,8 +145,17 @@ def rbpf_by_hand(direct: dict[str, Any]) -> tuple[Callable[[], float], direct_rb
     n = len(direct["start"].log_weight)
     peer = floor("rbpf", f"PARTICLES={n}", f"ROUNDS={ROUNDS}").floor_rbpf
     ticks, seen = len(direct["time"]), len(direct["poses"])
-    names = [Site(name, "normal", ()).hash for name in ("rbpf_indoor.attitude/gyro", "rbpf_indoor.resample/place")]
-    settings = ("gyro_noise", "accelerometer_noise", "position_noise", "attitude_noise", "resample_below", "still")
+    names = [
+        Site(name, "normal", ()).hash for name in ("rbpf_indoor.attitude/gyro", "rbpf_indoor.resample/place")
+    ]
+    settings = (
+        "gyro_noise",
+        "accelerometer_noise",
+        "position_noise",
+        "attitude_noise",
+        "resample_below",
+        "still",
+    )
     given = [
         *(np.ascontiguousarray(direct[name], np.int64) for name in ("time", "imu_index", "pose_index")),
         *(np.ascontiguousarray(direct[name], np.float64) for name in ("imu", "poses")),
@@ -178,5 +189,7 @@ def rbpf(*, particles_: int = 1000, duration: float = 2.55, repeats: int = 9) ->
         particles.check(found, by_hand)
         a, b, ratio = interleaved(mine, lambda: peer() * scale, repeats)
         rows = [Row(name, a, b, "us/tick", "C++ -O3 by hand", ratio, "ratio <= 1.5", ratio <= 1.5)]
-    a, b, ratio = interleaved(mine, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, min(repeats, 5))
+    a, b, ratio = interleaved(
+        mine, lambda: seconds(lambda: direct_rbpf.run(**direct)) * scale, min(repeats, 5)
+    )
     return [*rows, Row(name, a, b, "us/tick", "direct NumPy", ratio)]
