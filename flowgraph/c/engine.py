@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -118,6 +119,7 @@ class Compiled:
         cells = [c for r in pipeline.registers for c in r.cells]
         flat = [n for r in names.registers for n in r]
         self._cells = self._struct(cells, [*flat, "seed"], seed=True)
+        self._rooms = threading.local()
         per_tick = sum(s.itemsize for s in self._outputs) + 8
         self.chunk = int(max(1, min(_MOST_TICKS, _CHUNK_BYTES // per_tick)))
 
@@ -176,7 +178,7 @@ class Compiled:
         state["fg_seed"] = seed
         done = [0] * len(rows)
         most = min(self.chunk, len(time))
-        outputs = [np.empty(most + 1, s) for s in self._outputs]  # one more: written, though absent
+        outputs = self._room(most)
         made = np.zeros(most, np.uint64)
         out = (ctypes.c_void_p * max(len(outputs), 1))(*(o.ctypes.data for o in outputs))
         time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
@@ -196,6 +198,14 @@ class Compiled:
             )
             done = [n + int((here >> k & 1).sum()) for k, n in enumerate(done)]
             yield Piece(count, self._leaves(outputs, made[:count], kept)), self._after(state)
+
+    def _room(self, ticks: int) -> Structs:
+        """This thread's memory for the outputs of a stretch; new pages a run would cost as much as a filter."""
+        kept: Structs = getattr(self._rooms, "outputs", [])
+        if not kept or len(kept[0]) <= ticks:
+            kept = [np.empty(ticks + 1, s) for s in self._outputs]  # one more: written, though absent
+            self._rooms.outputs = kept
+        return kept
 
     def _leaves(
         self, outputs: Structs, made: np.ndarray, kept: Mapping[str, Collection[str]] | None
