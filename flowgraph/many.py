@@ -173,9 +173,9 @@ def simulate_many(
     if engine == "xla":
         return _vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
     if engine == "c":
-        from flowgraph.c.batch import run_on_threads
+        from flowgraph.c.batch import threaded
 
-        return run_on_threads(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
+        return threaded(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
     return _one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
 
 
@@ -231,13 +231,20 @@ def _one_by_one(
 
 def joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
     """Series of several runs on the union of their times."""
-    time = np.unique(np.concatenate([p.time for p in parts]))
-    present = np.stack([np.isin(time, p.time) for p in parts])
+    time = parts[0].time
+    same = all(np.array_equal(p.time, time) for p in parts)
+    if same:
+        present = np.ones((len(parts), len(time)), bool)
+    else:
+        time = np.unique(np.concatenate([p.time for p in parts]))
+        present = np.stack([np.isin(time, p.time) for p in parts])
     made = {}
     for leaf in leaves:
         arrays = [p.leaves[leaf] for p in parts]
-        full = np.zeros((len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype)
-        full[present] = np.concatenate(arrays)
+        shape, kind = (len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype
+        full = np.empty(shape, kind) if same else np.zeros(shape, kind)
+        for row, at, array in zip(full, present, arrays, strict=True):
+            row[... if same else at] = array
         made[leaf] = full
     return Runs(name, time, present, made)
 
@@ -275,7 +282,7 @@ def _vectorised(
         columns = (
             dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
         )
-        last = cells = cells_of_runs(graph, init, seeds, members)
+        last = cells = cells_of(graph, init, seeds, members)
         words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
@@ -336,9 +343,7 @@ def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
     )
 
 
-def cells_of_runs(
-    graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]
-) -> list[np.ndarray]:
+def cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
     """Register cells with a leading axis of runs."""
     made = {run: initial_registers(graph, of_run(init, run, seeds[run])) for run in set(members)}
     slots = [made[run] for run in members]

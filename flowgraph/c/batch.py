@@ -1,4 +1,8 @@
-"""Many runs in C, on threads: a call into compiled code lets other threads go on."""
+"""Many runs in C: as many at once as there are processors, for a call into C lets other threads go on.
+
+What is the same for all runs, the compiled library and, where they share them, the inputs' structs, is made
+once; of the outputs only what is kept leaves the structs.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from flowgraph.c.engine import compiled
 from flowgraph.graph import Graph
 from flowgraph.inputs import Tape, prepare, tape
 from flowgraph.lowering import lower
-from flowgraph.many import Batch, cells_of_runs, is_shared, joined, leaf_type, of_run
+from flowgraph.many import Batch, cells_of, is_shared, joined, leaf_type, of_run
 from flowgraph.optimise import for_engine, without
 from flowgraph.pipeline import Port
 from flowgraph.playback import check_faults, real_leaves
@@ -24,7 +28,7 @@ from flowgraph.series import Series
 from flowgraph.types import DTYPES, StructType
 
 
-def run_on_threads(
+def threaded(
     graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
     kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
 ) -> Batch:  # fmt: skip
@@ -41,17 +45,15 @@ def run_on_threads(
         events = shared or tape(prepare(graph, of_run(inputs, n, seeds[n])), graph)
         c = library if library is not None else compiled(pipeline, real, events.patterns, chosen)
         rows = shared_rows if shared_rows is not None else c.rows(_reals(events, real))
-        cells = [cell[0] for cell in cells_of_runs(graph, init, seeds, (n,))]
+        cells = [cell[0] for cell in cells_of(graph, init, seeds, (n,))]
         found: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {name: [] for name in kept}
         done = 0
-        for part, after in c.play(cells, seed_words(seeds[n]), events.time, events.key, rows):
+        for part, after in c.play(cells, seed_words(seeds[n]), events.time, events.key, rows, kept):
             cells = after
             times = events.time[done : done + part.ticks]
             for port, (mask, leaves) in zip(pipeline.outputs, part.outputs, strict=True):
                 if port.name in kept:
-                    pairs = zip(port.leaves, leaves, strict=True)
-                    wanted = [x for leaf, x in pairs if leaf.name in kept[port.name]]
-                    found[port.name].append((times[mask], wanted))
+                    found[port.name].append((times[mask], leaves))
             done += part.ticks
         check_faults(pipeline, cells)
         ports = [p for p in pipeline.outputs if p.name in kept]
@@ -81,9 +83,9 @@ def _reals(events: Tape, real: Any) -> list[list[np.ndarray]]:
 def _series(port: Port, names: list[str], parts: list[tuple[np.ndarray, list[np.ndarray]]]) -> Series:
     """Stretches of one output in one, with the leaves of these names."""
     leaves = [leaf for leaf in port.leaves if leaf.name in names]
-    time = np.concatenate([t for t, _ in parts]) if parts else np.zeros(0, np.int64)
+    time = _whole([t for t, _ in parts]) if parts else np.zeros(0, np.int64)
     fields = {
-        leaf.name: np.concatenate([x[k] for _, x in parts])
+        leaf.name: _whole([x[k] for _, x in parts])
         if parts
         else np.zeros((0, *leaf.shape), DTYPES[leaf.dtype])
         for k, leaf in enumerate(leaves)
@@ -92,3 +94,7 @@ def _series(port: Port, names: list[str], parts: list[tuple[np.ndarray, list[np.
         return Series(time, fields["value"], name=port.name)
     type_ = StructType(port.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
     return Series(time, fields, type=type_, name=port.name)
+
+
+def _whole(parts: list[np.ndarray]) -> np.ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +119,7 @@ class Compiled:
         cells = [c for r in pipeline.registers for c in r.cells]
         flat = [n for r in names.registers for n in r]
         self._cells = self._struct(cells, [*flat, "seed"], seed=True)
+        self._rooms = threading.local()
         per_tick = sum(s.itemsize for s in self._outputs) + 8
         self.chunk = int(max(1, min(_MOST_TICKS, _CHUNK_BYTES // per_tick)))
 
@@ -149,7 +151,13 @@ class Compiled:
         return made
 
     def play(
-        self, cells: Sequence[Any], seed: np.ndarray, time: np.ndarray, key: np.ndarray, rows: Structs
+        self,
+        cells: Sequence[Any],
+        seed: np.ndarray,
+        time: np.ndarray,
+        key: np.ndarray,
+        rows: Structs,
+        kept: Mapping[str, Collection[str]] | None = None,
     ) -> Iterator[tuple[Piece, list[np.ndarray]]]:
         """Play ticks; yields stretches of outputs, with the register cells after each.
 
@@ -158,6 +166,7 @@ class Compiled:
             seed: (2,) uint32.
             time, key: (T,) int64.
             rows: events of each port, from `rows`.
+            kept: the leaves that are wanted of each output; all if left out.
         """
         memory = np.zeros(self._size + 64, np.uint8)
         start = -memory.ctypes.data % 64
@@ -169,7 +178,7 @@ class Compiled:
         state["fg_seed"] = seed
         done = [0] * len(rows)
         most = min(self.chunk, len(time))
-        outputs = [np.zeros(most + 1, s) for s in self._outputs]  # one more: written, though absent
+        outputs = self._room(most)
         made = np.zeros(most, np.uint64)
         out = (ctypes.c_void_p * max(len(outputs), 1))(*(o.ctypes.data for o in outputs))
         time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
@@ -188,20 +197,32 @@ class Compiled:
                 made.ctypes.data,
             )
             done = [n + int((here >> k & 1).sum()) for k, n in enumerate(done)]
-            yield Piece(count, self._leaves(outputs, made[:count])), self._after(state)
+            yield Piece(count, self._leaves(outputs, made[:count], kept)), self._after(state)
 
-    def _leaves(self, outputs: Structs, made: np.ndarray) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+    def _room(self, ticks: int) -> Structs:
+        """This thread's memory for the outputs of a stretch; new pages a run would cost as much as a filter."""
+        kept: Structs = getattr(self._rooms, "outputs", [])
+        if not kept or len(kept[0]) <= ticks:
+            kept = [np.empty(ticks + 1, s) for s in self._outputs]  # one more: written, though absent
+            self._rooms.outputs = kept
+        return kept
+
+    def _leaves(
+        self, outputs: Structs, made: np.ndarray, kept: Mapping[str, Collection[str]] | None
+    ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+        """Of each output where it is present, and a copy of its leaves there."""
         found = []
         for k, (port, rows) in enumerate(zip(self.pipeline.outputs, outputs, strict=True)):
             mask = (made >> np.uint64(k) & np.uint64(1)).astype(bool)
             n = int(mask.sum())
             leaves = [
-                np.ascontiguousarray(rows[name][:n]).reshape(n, *leaf.shape)
+                rows[name][:n].copy().reshape(n, *leaf.shape)
                 if math.prod(leaf.shape)
                 else np.zeros((n, *leaf.shape), self._kind(leaf.dtype))
                 for name, leaf in zip(rows.dtype.names or (), port.leaves, strict=False)
+                if kept is None or leaf.name in kept.get(port.name, ())
             ]
-            found.append((mask, [np.array(leaf) for leaf in leaves]))
+            found.append((mask, leaves))
         return found
 
     def _after(self, state: np.ndarray) -> list[np.ndarray]:

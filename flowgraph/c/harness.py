@@ -8,7 +8,7 @@ what comes out in the same form, with as many digits as bring every number back.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,19 @@ from flowgraph.c.syntax import comment, string
 from flowgraph.errors import OutputError, writes
 from flowgraph.graph import NEVER
 from flowgraph.inputs import Inputs, Tape, prepare, tape
+from flowgraph.optimise import for_engine, optimise
 from flowgraph.pipeline import Leaf, Pipeline, Port
 from flowgraph.playback import sources_of
+from flowgraph.program import specialise
 
 
 def write_c(
-    pipeline: Pipeline, folder: str | Path, dtype: str = "float64", *, source: Source | None = None
+    pipeline: Pipeline,
+    folder: str | Path,
+    dtype: str = "float64",
+    *,
+    source: Source | None = None,
+    passes: Collection[str] | None = None,
 ) -> dict[str, Path]:
     """Write the C of a pipeline into a folder, made if missing; returns the files by name.
 
@@ -34,12 +41,15 @@ def write_c(
         folder: for `NAME.h`, `NAME.c`, `main.c` and `Makefile`.
         dtype: "float64" or "float32", what `real` is.
         source: the C, if it is there already.
+        passes: of the optimiser; those that suit C if left out.
 
     Raises:
+        UnknownNameError: for a pass that is not there.
         LoweringError: for what C has no rule for.
         OutputError: where the folder holds another filter's files, or cannot be written.
     """
-    made = source or generate(pipeline, dtype)
+    chosen = for_engine("c", passes)
+    made = source or generate(pipeline, dtype, program=lambda p, key: optimise(specialise(p, key), chosen))
     m = made.names.module
     texts = {
         f"{m}.h": made.header,

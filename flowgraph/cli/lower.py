@@ -12,7 +12,7 @@ from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, case
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.errors import UnknownNameError
 from flowgraph.lowering import lower as lower_graph
-from flowgraph.optimise import PASSES
+from flowgraph.optimise import COMPILED, DEFAULT, PASSES
 from flowgraph.optimise import without as passes_without
 
 TARGETS = ("description", "c")
@@ -49,14 +49,14 @@ def lower(
     for what, given, valid in (("target", target, TARGETS), ("dtype", dtype, kinds)):
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
-    passes = passes_without(*(without or ()))
+    passes = passes_without(*(without or ()), passes=COMPILED if target == "c" else DEFAULT)
     case, _ = example_of(graph, settings, seed) if data is None else case_of(graph, data, settings, seed)
     pipeline = lower_graph(case.graph, dtype=dtype)
     pipeline.save(output)
     if target == "c":
         from flowgraph.c import write_c, write_events
 
-        for file in write_c(pipeline, output, dtype).values():
+        for file in write_c(pipeline, output, dtype, passes=passes).values():
             err_console.print(f"wrote {file}", markup=False)
         if events is not None:
             ticks = write_events(pipeline, case.inputs, events)
