@@ -7,17 +7,28 @@ north from a magnetometer, and the gyroscope's bias, which is all that it then r
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Series, Signal, block, real
+from flowgraph import Array, Flight, Series, Signal, block, real
 from flowgraph.blocks.geometry import from_rotation_vector, level, multiply, normalize, rotate, to_matrix
 from flowgraph.blocks.signals import Attitude, Belief, Imu, MagneticField, SpecificForce
 
-__all__ = ["Alignment", "StartSpread", "align_static", "level_attitude", "static_alignment", "start_belief"]
+__all__ = [
+    "Alignment",
+    "Start",
+    "StartSpread",
+    "align_static",
+    "level_attitude",
+    "orientation_start",
+    "rest_seconds",
+    "start_belief",
+    "static_alignment",
+]
 
 
 class Alignment(Signal):
@@ -154,6 +165,57 @@ def static_alignment(
     q = aligned(part["specific_force"][0], pointer, north=north, nearest=nearest, xp=np)
     zero = np.float64(0.0)
     return Alignment(attitude=q, gyro_bias=np.zeros(3), resting=zero, seconds=zero)
+
+
+def rest_seconds(imu: Series, *, rate: float = 0.03, force: float = 0.3, most: float = 10.0) -> float:
+    """For how many seconds from its first reading on a body rests, told by means and not by single readings
+    as in `align_static`: for units whose readings scatter by more than the rates to be told.
+
+    The means of the readings over tenths of a second stay within `rate` (rad/s) and `force` (m/s^2) of the
+    first such mean. The last two tenths before it moves are left out.
+    """
+    number = (imu.time - imu.time[0]) // 100_000_000
+    first: np.ndarray | None = None
+    bound = np.repeat([rate, force], 3)
+    for tenth in range(math.floor(min(most, float(number[-1]) / 10.0) * 10.0)):
+        at = number == tenth
+        if not at.any():
+            return max(tenth - 2, 0) / 10.0
+        mean = np.concatenate([imu["gyro"][at].mean(axis=0), imu["specific_force"][at].mean(axis=0)])
+        first = mean if first is None else first
+        if (np.abs(mean - first) > bound).any() or np.abs(mean[:3]).max() > 0.2:
+            return max(tenth - 2, 0) / 10.0
+    return min(most, float(number[-1]) / 10.0)
+
+
+class Start(NamedTuple):
+    """Where an orientation filter starts: attitude (4), seconds of rest, and where up is (3, body)."""
+
+    attitude: np.ndarray
+    still: float
+    up: tuple[float, float, float]
+
+
+def orientation_start(flight: Flight, imu: Series, still: float | None = None) -> Start:
+    """Level by the mean specific force at rest, or by the first reading, with the heading of the truth's
+    first attitude; without a truth that of the world.
+
+    Args:
+        still: seconds of rest at the start; those that the flight tells, or that its readings show, if left
+            out.
+    """
+    found = flight.info.get("still") if still is None else still
+    still = rest_seconds(imu) if found is None else float(found)
+    nearest = np.array([1.0, 0.0, 0.0, 0.0])
+    if flight.truth is not None:
+        q = flight.truth["attitude"]
+        q = q[np.isfinite(q).all(axis=-1)]
+        nearest = q[0] if len(q) else nearest
+    push = imu["specific_force"]
+    mean = push[imu.time - imu.time[0] <= round(still * 1e9)].mean(axis=0)
+    x, y, z = (mean / np.linalg.norm(mean)).tolist()
+    q = aligned(mean, np.zeros(3), north=0.0, nearest=nearest, xp=np)
+    return Start(np.asarray(q), still, (x, y, z))
 
 
 @block

@@ -19,13 +19,13 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Flight, Result, Stream, clocks_of, collect, delay, graph
+from flowgraph.blocks.alignment import orientation_start
 from flowgraph.blocks.calibration import silence_frozen_gyro, subtract_rest_bias
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.metrics import orientation_errors
 from flowgraph.blocks.orientation import (
     STATE,
     named_orientation,
-    orientation_start,
     see_rate_and_gravity,
     stacked_imu,
     start_orientation,

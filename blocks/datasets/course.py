@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.datasets.matlab import known_settings, number
 from flowgraph.blocks.datasets.parameters import Parameters
+from flowgraph.blocks.datasets.shape import known, number
 from flowgraph.blocks.datasets.studentdata import SETTINGS as READING
 from flowgraph.blocks.datasets.studentdata import flight_of
 from flowgraph.blocks.euler import angles_from_matrix
@@ -174,8 +174,12 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         DeclarationError, UnknownNameError: for settings.
     """
     given = dict(settings or {})
-    known_settings(given, SETTINGS, "course")
-    ours = {name: number(given, name, value, "course") for name, value in DEFAULTS.items() if name in given}
+    known(given, SETTINGS, "course")
+    ours = {
+        name: number(given, name, value, "course", signed=True)
+        for name, value in DEFAULTS.items()
+        if name in given
+    }
     if (
         min(ours.get("motion.rate", 1.0), ours.get("rate", 1.0)) == 0.0
         or ours.get("duration", 1.0) * ours.get("rate", 100.0) < 1.0

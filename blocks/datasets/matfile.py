@@ -14,7 +14,7 @@ import numpy as np
 
 from flowgraph.errors import DataError
 
-__all__ = ["read_mat"]
+__all__ = ["columns_of", "read_mat", "read_structs"]
 
 
 def read_mat(file: Path, fields: Mapping[str, tuple[int | None, ...]]) -> dict[str, np.ndarray]:
@@ -29,24 +29,65 @@ def read_mat(file: Path, fields: Mapping[str, tuple[int | None, ...]]) -> dict[s
         DataError: the file is missing, cut off or no .mat file, or a field is missing, not numeric or of
             another shape.
     """
-    if not file.is_file():
-        raise DataError(
-            f"{file.name} is missing",
-            path=str(file),
-            expected="a .mat file with " + ", ".join(fields),
-            got="no such file",
-            fix="check the path",
-        )
     content = _content(file, list(fields))
     return {name: _array(file, name, content.get(name), shape) for name, shape in fields.items()}
 
 
-def _content(file: Path, names: list[str]) -> dict[str, Any]:
+def read_structs(file: Path, *names: str) -> dict[str, Any]:
+    """The variables of a .mat file, structs as dictionaries; `names` must be among them.
+
+    Raises:
+        DataError: the file is missing, cut off or no .mat file, or lacks a variable.
+    """
+    found = _content(file, list(names), simplify_cells=True)
+    return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+def columns_of(content: Mapping[str, Any], name: str, file: Path, columns: int | None = None) -> np.ndarray:
+    """A variable as float64: (n,), or (n, columns) finite numbers, a single row included.
+
+    Raises:
+        DataError: naming file, variable and the first bad row.
+    """
+    try:
+        x = np.asarray(content[name], dtype=float)
+    except (TypeError, ValueError):
+        x = np.zeros((0, 0, 0))
+    x = x.ravel() if columns is None else np.atleast_2d(x)
+    if x.ndim != (1 if columns is None else 2) or (columns is not None and x.shape[1] != columns):
+        raise DataError(
+            f"field {name!r} has another shape",
+            path=str(file),
+            expected="numbers, a value a row" if columns is None else f"numbers in {columns} columns",
+            got=f"shape {np.shape(content[name])}",
+            fix="this may be a file of another family",
+        )
+    bad = ~np.isfinite(x if columns is None else x.sum(axis=1))
+    if bad.any():
+        raise DataError(
+            f"field {name!r} holds a value that is not finite",
+            path=f"{file}: {name}, row {int(np.flatnonzero(bad)[0]) + 1}",
+            expected="finite numbers",
+            got=f"NaN or infinity in {int(bad.sum())} rows",
+            fix="mend or delete the row",
+        )
+    return x
+
+
+def _content(file: Path, names: list[str], **how: Any) -> dict[str, Any]:
+    if not file.is_file():
+        raise DataError(
+            f"{file.name} is missing",
+            path=str(file),
+            expected="a .mat file with " + ", ".join(names),
+            got="a folder" if file.is_dir() else "no such file",
+            fix="check the path",
+        )
     from scipy.io import loadmat, whosmat  # slow to import
 
     try:
-        found: dict[str, Any] = loadmat(file, variable_names=names)
-        held = [name for name, _, _ in whosmat(file)] if set(names) - set(found) else []
+        found: dict[str, Any] = loadmat(str(file), variable_names=names, **how)
+        held = [name for name, _, _ in whosmat(str(file))] if set(names) - set(found) else []
     except NotImplementedError:
         raise DataError(
             "this is a MATLAB file of version 7.3",
@@ -55,23 +96,17 @@ def _content(file: Path, names: list[str]) -> dict[str, Any]:
             got="an HDF5 container",
             fix="save it with save(..., '-v7')",
         ) from None
-    except (ValueError, TypeError, KeyError, IndexError, OSError, EOFError, zlib.error, MemoryError) as error:
-        raise DataError(
-            "this is no whole .mat file",
-            path=str(file),
-            expected="a .mat file with " + ", ".join(names),
-            got=f"{file.stat().st_size} bytes: {type(error).__name__}: {error}"[:160],
-            fix="fetch the file again: it is cut off, or something else",
-        ) from None
-    except Exception as error:  # SciPy's own, which derives from nothing narrower
-        if type(error).__module__.partition(".")[0] != "scipy":
+    except Exception as error:
+        # A broken file may raise nearly anything, and SciPy's own error derives from nothing narrower.
+        ours = (ValueError, TypeError, KeyError, IndexError, OSError, EOFError, zlib.error, MemoryError)
+        if not isinstance(error, ours) and type(error).__module__.partition(".")[0] != "scipy":
             raise
         raise DataError(
             "this is no whole .mat file",
             path=str(file),
             expected="a .mat file with " + ", ".join(names),
-            got=f"{file.stat().st_size} bytes: {error}"[:160],
-            fix="fetch the file again: it is cut off, or something else",
+            got=f"{file.stat().st_size} bytes: {type(error).__name__}: {error}"[:160],
+            fix="fetch the file again: it is cut off, or something else; in MATLAB, save it with -v7",
         ) from None
     missing = [name for name in names if name not in found]
     if missing:

@@ -29,8 +29,9 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph import Array, Flight, Series, Signal, real
-from flowgraph.blocks.datasets.matlab import array, choice, known_settings, number, read_mat, split_argument
-from flowgraph.blocks.datasets.matlab import strictly_later as later
+from flowgraph.blocks.datasets.matfile import columns_of, read_structs
+from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
+from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.euler import quaternion_from_angles
 from flowgraph.blocks.geometry import multiply
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
@@ -93,12 +94,12 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         DeclarationError, UnknownNameError: for settings.
     """
     given = settings or {}
-    known_settings(given, SETTINGS, "rob6213")
-    frame = choice(given, "frame", ("registered", "raw"), "rob6213")
+    known(given, SETTINGS, "rob6213")
+    frame = chosen(given, "frame", ("registered", "raw"), "rob6213")
     file, csv = split_argument(argument, "rob6213:FILE[:CSV]")
-    content = read_mat(file, "time", "position", "angle", "linearVel", "angVel")
-    seconds = array(content, "time", file)
-    table = {n: array(content, n, file, columns=3) for n in ("position", "angle", "linearVel", "angVel")}
+    content = read_structs(file, "time", "position", "angle", "linearVel", "angVel")
+    seconds = columns_of(content, "time", file)
+    table = {n: columns_of(content, n, file, 3) for n in ("position", "angle", "linearVel", "angVel")}
     for name, values in table.items():
         if len(values) != len(seconds):
             raise DataError(
@@ -108,7 +109,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
                 got=str(len(values)),
                 fix="restore the file",
             )
-    keep, notes = later(seconds, "time", file)
+    keep, notes = strictly_later(seconds, "time", file)
     position = table["position"][keep]
     attitude = np.asarray(quaternion_from_angles(table["angle"][keep], order="zyx", xp=np))
     if frame == "registered":
@@ -131,7 +132,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         streams["imu"] = derived_imu(truth, window)
         notes.append("imu: derived from the motion capture, not recorded")
         delay = find_delay(motion, truth, COURSE_MOUNT)
-    delay = number(given, "delay", delay, "rob6213")
+    delay = number(given, "delay", delay, "rob6213", signed=True)
     if truth is not None:
         error = velocity_error(motion, truth, COURSE_MOUNT, delay)
         notes.append(f"motion: {delay:.3f} s late; then {error:.4f} m/s RMS from the motion capture")

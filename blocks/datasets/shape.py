@@ -28,6 +28,7 @@ __all__ = [
     "present",
     "offset",
     "policy",
+    "split_argument",
     "the_file",
     "unit_quaternions",
 ]
@@ -62,7 +63,7 @@ def chosen(given: Mapping[str, Any], name: str, valid: Sequence[str], path: str)
     """
     value = str(given.get(name, valid[0]))
     if value not in valid:
-        raise UnknownNameError(name if "." in name else f"{name} policy", value, valid, path=path)
+        raise UnknownNameError(name, value, valid, path=path)
     return value
 
 
@@ -93,8 +94,18 @@ def offset(given: Mapping[str, Any], name: str, path: str) -> int:
     return found
 
 
-def number(given: Mapping[str, Any], name: str, otherwise: float, path: str) -> float:
-    """The setting `name`, a number that is not negative; `otherwise` where it is left out.
+def number(
+    given: Mapping[str, Any],
+    name: str,
+    otherwise: float,
+    path: str,
+    *,
+    positive: bool = False,
+    signed: bool = False,
+) -> float:
+    """The setting `name`, a number below 1e9; `otherwise` where it is left out.
+
+    Not below zero; with `positive` above it, and with `signed` as far either way.
 
     Raises:
         DeclarationError: when it is not one.
@@ -104,15 +115,33 @@ def number(given: Mapping[str, Any], name: str, otherwise: float, path: str) -> 
         found = float(value)
     except (TypeError, ValueError):
         found = float("nan")
-    if not 0.0 <= found < float("inf"):
+    if not (abs(found) < 1e9 and (signed or found > 0.0 or (found == 0.0 and not positive))):
         raise DeclarationError(
             f"setting {name!r} is not usable",
             path=path,
-            expected="a number that is not negative",
+            expected="a positive number" if positive else "a number" + ("" if signed else " not below zero"),
             got=repr(value),
             fix=f"for example {name}={otherwise:g}",
         )
     return found
+
+
+def split_argument(argument: str, form: str) -> tuple[Path, Path | None]:
+    """FILE and perhaps SECOND of "FILE[:SECOND]".
+
+    Raises:
+        DeclarationError: without a FILE.
+    """
+    first, _, second = argument.partition(":")
+    if not first:
+        raise DeclarationError(
+            "which file?",
+            path=form.partition(":")[0],
+            expected=form,
+            got=repr(argument),
+            fix="name the file after the colon",
+        )
+    return Path(first).expanduser(), Path(second).expanduser() if second else None
 
 
 NOISE_SETTINGS: Mapping[str, str] = {

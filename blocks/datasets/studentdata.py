@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.datasets.matlab import choice, known_settings, number, read_mat, split_argument
-from flowgraph.blocks.datasets.matlab import strictly_later as later
+from flowgraph.blocks.datasets.matfile import read_structs
 from flowgraph.blocks.datasets.parameters import Parameters, parse_parameters
+from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
+from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.euler import quaternion_from_angles
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Imu
@@ -63,7 +64,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         DeclarationError, UnknownNameError: for settings.
     """
     file, beside = split_argument(argument, "studentdata:FILE[:PARAMETERS]")
-    content = read_mat(file, "data", "time", "vicon")
+    content = read_structs(file, "data", "time", "vicon")
     parameters = Parameters.of_the_course() if beside is None else parse_parameters(beside)
     return flight_of(content, parameters, file, settings or {})
 
@@ -72,8 +73,8 @@ def flight_of(
     content: Mapping[str, Any], parameters: Parameters, file: Path, given: Mapping[str, str | float]
 ) -> Flight:
     """The flight of the variables `data`, `time` and `vicon`; `file` is what messages call them."""
-    known_settings(given, SETTINGS, "studentdata")
-    images = choice(given, "images", ("auto", "raw", "rectified"), "studentdata")
+    known(given, SETTINGS, "studentdata")
+    images = chosen(given, "images", ("auto", "raw", "rectified"), "studentdata")
     notes = list(parameters.notes)
     found = packets(content["data"], file)
     room = int(number(given, "most_tags", 108, "studentdata", positive=True))
@@ -93,7 +94,7 @@ def flight_of(
                 got=str(len(ids)),
                 fix="raise most_tags",
             )
-    keep, more = later(seconds, "data", file)
+    keep, more = strictly_later(seconds, "data", file)
     notes += more
     imu = Series.from_seconds(seconds[keep], Imu(gyro=gyro[keep], specific_force=force[keep]), name="imu")
     streams = {"imu": imu}
@@ -215,7 +216,7 @@ def _truth(content: Mapping[str, Any], file: Path) -> tuple[Series, list[str]]:
         else [f"{file.name}: {int((~finite).sum())} rows of vicon are not finite: left out"]
     )
     seconds, x = seconds[finite], x[finite]
-    keep, more = later(seconds, "vicon", file)
+    keep, more = strictly_later(seconds, "vicon", file)
     x = x[keep]
     truth = MotionTruth(
         position=x[:, :3],

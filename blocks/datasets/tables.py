@@ -15,7 +15,7 @@ import numpy as np
 
 from flowgraph.errors import DataError
 
-__all__ = ["POLICIES", "in_order", "nanoseconds", "read_table"]
+__all__ = ["POLICIES", "in_order", "nanoseconds", "read_table", "strictly_later"]
 
 POLICIES = ("raise", "drop", "sort")
 """What to do with rows whose time does not increase: refuse them; leave them out; sort, and of equal times
@@ -193,3 +193,18 @@ def _blame(
                     got=repr(cell),
                     fix="mend or delete the row",
                 )
+
+
+def strictly_later(seconds: np.ndarray, what: str, file: Path) -> tuple[np.ndarray, list[str]]:
+    """Which rows (n,) come after all before them, and notes that name those that do not."""
+    stamps = np.rint(np.asarray(seconds) * 1e9)
+    before = np.concatenate([[-np.inf], np.maximum.accumulate(stamps)[:-1]])
+    keep = stamps > before
+    bad = np.flatnonzero(~keep)
+    if not len(bad):
+        return keep, []
+    first = int(bad[0])
+    step = 1e3 * float(seconds[first] - seconds[first - 1])
+    more = f"; {len(bad)} rows in all are not after those before them" if len(bad) > 1 else ""
+    note = f"{file.name}: {what}, row {first + 1} is {step:+.3f} ms after the one before{more}: left out"
+    return keep, [note]

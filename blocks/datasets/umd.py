@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.datasets.matlab import array, known_settings, number, read_mat, split_argument
-from flowgraph.blocks.datasets.matlab import strictly_later as later
+from flowgraph.blocks.datasets.matfile import columns_of, read_structs
+from flowgraph.blocks.datasets.shape import known, number, split_argument
+from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import Camera, Mount
@@ -56,12 +57,12 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         DeclarationError, UnknownNameError: for settings.
     """
     given = settings or {}
-    known_settings(given, SETTINGS, "umd")
+    known(given, SETTINGS, "umd")
     file, beside = split_argument(argument, "umd:FILE[:CALIBRATION]")
-    content = read_mat(file, "DetAll", "TLeftImgs", "IMU")
+    content = read_structs(file, "DetAll", "TLeftImgs", "IMU")
     calibration = beside or file.parent / "CalibParams.mat"
     camera, mount, side = _calibration(calibration)
-    images, imu = array(content, "TLeftImgs", file), array(content, "IMU", file, columns=11)
+    images, imu = columns_of(content, "TLeftImgs", file), columns_of(content, "IMU", file, 11)
     detections = np.atleast_1d(np.asarray(content["DetAll"], dtype=object))
     if len(detections) != len(images):
         raise DataError(
@@ -73,9 +74,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         )
     room = int(number(given, "most_tags", 64, "umd", positive=True))
     frames = [_detected(cell, row, file, room) for row, cell in enumerate(detections, start=1)]
-    keep_image, notes = later(images, "TLeftImgs", file)
-    keep_imu, more = later(imu[:, 10], "IMU", file)
-    offset = number(given, "imu.time_offset", 0.0, "umd")
+    keep_image, notes = strictly_later(images, "TLeftImgs", file)
+    keep_imu, more = strictly_later(imu[:, 10], "IMU", file)
+    offset = number(given, "imu.time_offset", 0.0, "umd", signed=True)
     u = imu[keep_imu]
     streams = {
         "imu": Series.from_seconds(
@@ -99,9 +100,9 @@ PIXELS = {"pixel_noise": 0.25, "position_noise": 1e-4, "attitude_noise": 1e-4}
 
 
 def _calibration(file: Path) -> tuple[Camera, Mount, float]:
-    content = read_mat(file, "K", "qIMUToC", "TIMUToC", "TagSize")
-    q = array(content, "qIMUToC", file)
-    t, side = array(content, "TIMUToC", file), array(content, "TagSize", file)
+    content = read_structs(file, "K", "qIMUToC", "TIMUToC", "TagSize")
+    q = columns_of(content, "qIMUToC", file)
+    t, side = columns_of(content, "TIMUToC", file), columns_of(content, "TagSize", file)
     if q.shape != (4,) or abs(np.linalg.norm(q) - 1.0) > 0.01 or t.shape != (3,) or not side[0] > 0.0:
         raise DataError(
             "the calibration is malformed",
@@ -110,7 +111,7 @@ def _calibration(file: Path) -> tuple[Camera, Mount, float]:
             got=f"qIMUToC {q.tolist()}, TIMUToC {t.tolist()}, TagSize {side.tolist()}",
             fix="restore the file",
         )
-    camera = Camera(array(content, "K", file, columns=3))
+    camera = Camera(columns_of(content, "K", file, 3))
     return camera, Mount(rotation_of(q / np.linalg.norm(q)), t), float(side[0])
 
 

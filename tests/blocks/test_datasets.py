@@ -270,7 +270,7 @@ def test_a_trajectory_with_gaps_is_masked_and_a_bad_one_named(tmp_path):
     fails(f"tum:{file}", "line 2", "column 2 is not a finite number")
     file.write_text("0.2 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n")
     fails(f"tum:{file}", "line 2", "time does not increase")
-    fails(f"tum:{file}", "no role policy", kind=UnknownNameError, role="hope")
+    fails(f"tum:{file}", "no role is called", kind=UnknownNameError, role="hope")
     with pytest.raises(UnknownNameError, match="no setting is called 'rate'"):
         tum.load(str(file), settings={"rate": 1})
 

@@ -19,11 +19,12 @@ from flowgraph import (
     load_flight,
     simulate,
 )
+from flowgraph.blocks.alignment import rest_seconds
 from flowgraph.blocks.calibration import silence_frozen_gyro
 from flowgraph.blocks.euler import angles_from_quaternion
 from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply, to_rotation_vector
 from flowgraph.blocks.metrics import orientation_errors
-from flowgraph.blocks.orientation import STATE, rest_seconds, roll_pitch_attitude, see_rate_and_gravity
+from flowgraph.blocks.orientation import STATE, roll_pitch_attitude, see_rate_and_gravity
 from flowgraph.blocks.signals import Attitude, Imu
 from flowgraph.graphs import gyro_integration, quaternion_ukf, roll_pitch
 from flowgraph.graphs.benches.ese650 import PUBLISHED
