@@ -23,7 +23,7 @@ from flowgraph import (
     lower,
     simulate,
 )
-from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.metrics import interpolate_pose, pose_errors, within_truth
 from flowgraph.blocks.vision.pnp import as_measurements
 from flowgraph.graphs import ins_ekf_pose, ins_particle, ins_ukf_pose, ins_ukf_velocity, tag_pose
 from flowgraph.graphs.benches.apriltag import apriltag, held_out, odd_reprojection, withheld
@@ -99,6 +99,7 @@ def test_a_whole_flight_of_the_course():
         assert score["position_rmse_m"] < 0.5 * raw
         assert score["attitude_rmse_deg"] < 0.12
         assert min(score["position_3sigma"], score["tilt_3sigma"], score["heading_3sigma"]) > 0.97
+        assert {"nees_mean", "nis_mean", "position_max_m", "least_cosine"} <= set(score)
     case = ins_ukf_pose.case(made)
     belief = simulate(case.graph, case.inputs)["belief"]
     raw_gyro, assumed = made.streams["imu"], made.truth
@@ -235,12 +236,43 @@ def test_recorded_poses_are_bettered(number):
 
 
 @VICON
+@pytest.mark.parametrize(("number", "other"), [(1, 4), (4, 1)])
+def test_the_shift_between_the_worlds_may_come_from_the_other_flight(number, other):
+    """Nothing of a flight's own truth then goes into its poses; 0.7 is reached all the same."""
+    raw = {
+        n: load_flight(f"rob6213:{DATA / 'nyu_rob6213' / f'proj2_dataset{n}.mat'}", settings={"frame": "raw"})
+        for n in (number, other)
+    }
+    pose, truth = raw[other].streams["pose"], raw[other].truth
+    assert truth is not None
+    seen = within_truth(pose, truth, 0.0)
+    shift = (interpolate_pose(truth, seen.time)[0] - seen["position"]).mean(axis=0)
+    made = raw[number]
+    pose = made.streams["pose"]
+    moved = Series(pose.time, as_measurements(pose["position"] + shift, pose["attitude"]))
+    used = Flight(made.name, {**made.streams, "pose": moved}, made.truth, made.info)
+    assert run(ins_ukf_pose, used, order="zyx")["position_rmse_m"] <= 0.7 * raw_error(made)
+
+
+@VICON
 @pytest.mark.parametrize("number", [1, 4])
 def test_recorded_velocities_do_not_diverge(number):
+    """The place in the horizontal plane drifts less with the gyroscope's rate than with the camera's.
+
+    Not so the height: the optical flow's own error, 0.03 m/s for all of flight 4, outweighs the rate there.
+    """
+    made, drift = recorded(number), {}
+    assert made.truth is not None
     for rate in ("gyro", "camera"):
-        score = run(ins_ukf_velocity, recorded(number), rate=rate)
-        assert score["position_rmse_m"] < 0.3
-        assert score["tilt_rmse_deg"] < 1.0
+        case = case_of(ins_ukf_velocity, made, rate=rate)
+        result = simulate(case.graph, case.inputs)
+        score = case.score(result)
+        assert score["position_rmse_m"] < 0.2
+        assert score["tilt_rmse_deg"] < 0.5
+        belief = within_truth(result["belief"], made.truth, 1.0)
+        apart = belief["position"] - interpolate_pose(made.truth, belief.time)[0]
+        drift[rate] = np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1)))
+    assert drift["gyro"] < drift["camera"] < 0.07
 
 
 @MAT
