@@ -385,9 +385,8 @@ def _by_axis(counts: np.ndarray, force: np.ndarray, rounds: int) -> np.ndarray:
     """beta (4, 3) of c_k = f_k / s_k + z_k, an axis at a time."""
     beta = np.zeros((4, 3))
     for k in range(3):
-        per_force, zero = _weighted(
-            np.column_stack([force[:, k], np.ones(len(force))]), counts[:, k], rounds
-        ).tolist()
+        A = np.column_stack([force[:, k], np.ones(len(force))])
+        per_force, zero = _weighted(A, counts[:, k], rounds).tolist()
         beta[k, k], beta[3, k] = 1.0 / per_force, -zero / per_force
     return beta
 

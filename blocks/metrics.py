@@ -196,8 +196,8 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
 
     Returns:
         attitude_rmse_deg (geodesic) with mean and max, tilt_rmse_deg, heading_rmse_deg, attitude_end_deg
-        (geodesic, at the last tick) and compared_ticks; with a covariance (3, 3) also tilt_3sigma,
-        heading_3sigma and the `nees_summary` of its three numbers.
+        (geodesic, at the last tick), compared_ticks and the figures of `orientation_errors`; with a
+        covariance (3, 3) also tilt_3sigma, heading_3sigma and the `nees_summary` of its three numbers.
 
     Raises:
         DataError: when no tick of the estimate lies within the truth.
@@ -206,6 +206,7 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
     q, attitude = chosen["attitude"], _between(truth, "attitude", chosen.time)
     found = {
         **_angles(q, attitude),
+        **_axes_and_parts(q, attitude),
         "attitude_end_deg": float(geodesic_angle(q[-1:], attitude[-1:])[0]),
         "compared_ticks": float(len(chosen)),
     }
@@ -263,15 +264,18 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
     """
     chosen = within_truth(estimate, truth, settle)
     q = _between(truth, "attitude", chosen.time)
-    a, b = (np.asarray(angles_from_quaternion(x, order="zyx", xp=np)) for x in (chosen["attitude"], q))
+    return {**_axes_and_parts(chosen["attitude"], q), "compared_ticks": float(len(chosen))}
+
+
+def _axes_and_parts(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    a, b = (np.asarray(angles_from_quaternion(x, order="zyx", xp=np)) for x in (estimate, truth))
     apart = wrapped(a - b)
-    tilt, heading = tilt_and_heading(chosen["attitude"], q)
+    tilt, heading = tilt_and_heading(estimate, truth)
     return {
         **{f"{n}_rmse_rad": _rms(apart[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
-        "total_rmse_deg": _rms(geodesic_angle(chosen["attitude"], q)),
+        "total_rmse_deg": _rms(geodesic_angle(estimate, truth)),
         "heading_rmse_deg": _rms(heading),
         "inclination_rmse_deg": _rms(tilt),
-        "compared_ticks": float(len(chosen)),
     }
 
 

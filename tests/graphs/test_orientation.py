@@ -266,5 +266,5 @@ def test_where_the_truth_is_unknown_nothing_is_compared():
     assert found["total_rmse_deg"] == 0.0
     assert found["compared_ticks"] < 30
     gappy[:] = np.nan
-    with pytest.raises(DataError, match=r"no tick of the estimate[\s\S]*the truth is known"):
+    with pytest.raises(DataError, match=r"no tick of the estimate[\s\S]*where the truth is known"):
         orientation_errors(a_series(estimate), a_series(gappy))
