@@ -200,7 +200,7 @@ class Compiled:
             yield Piece(count, self._leaves(outputs, made[:count], kept)), self._after(state)
 
     def _room(self, ticks: int) -> Structs:
-        """This thread's memory for the outputs of a stretch; new pages a run cost as much as a filter."""
+        """This thread's memory for the outputs of a stretch: new pages for each run cost time."""
         kept: Structs = getattr(self._rooms, "outputs", [])
         if not kept or len(kept[0]) <= ticks:
             kept = [np.empty(ticks + 1, s) for s in self._outputs]  # one more: written, though absent

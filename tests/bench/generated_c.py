@@ -19,7 +19,7 @@ import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
 from flowgraph.c.engine import Compiled
-from flowgraph.inputs import prepare, tape
+from flowgraph.inputs import Inputs, prepare, tape
 from flowgraph.optimise import DEFAULT, for_engine
 from flowgraph.playback import real_leaves
 from flowgraph.random import ROUNDS, Site, seed_words, segments
@@ -56,9 +56,7 @@ def floor(name: str, *defines: str) -> ctypes.CDLL:
         shutil.rmtree(folder)
 
 
-def loop(
-    built: Graph, inputs: dict[str, Series], passes: Collection[str] | None = None
-) -> Callable[[], float]:
+def loop(built: Graph, inputs: Inputs, passes: Collection[str] | None = None) -> Callable[[], float]:
     """A call that plays the inputs once in C, after these passes, and returns the seconds spent there."""
     pipeline = lower(built)
     events = tape(prepare(built, inputs), built)

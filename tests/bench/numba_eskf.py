@@ -185,10 +185,17 @@ def loop(
 
 
 def run(
-    time: np.ndarray, imu_index: np.ndarray, position_index: np.ndarray, imu: np.ndarray,
-    positions: np.ndarray, *, start: tuple[np.ndarray, ...], densities: tuple[float, ...],
-    position_noise: float, lever: tuple[float, ...],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    time: np.ndarray,
+    imu_index: np.ndarray,
+    position_index: np.ndarray,
+    imu: np.ndarray,
+    positions: np.ndarray,
+    *,
+    start: tuple[np.ndarray, ...],
+    densities: tuple[float, ...],
+    position_noise: float,
+    lever: tuple[float, ...],
+) -> tuple[np.ndarray, np.ndarray]:
     """States and covariances, from the arguments of `direct_eskf.run`."""
     gyro, accelerometer, gyro_walk, accelerometer_walk = np.square(densities)
     power = np.repeat([0.0, accelerometer, gyro, gyro_walk, accelerometer_walk], 3)
