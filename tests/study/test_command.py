@@ -63,7 +63,7 @@ class Terminal:
 
 def test_ctrl_c_in_a_terminal_stops_cleanly_and_says_how_to_continue(tmp_path):
     file, out = tmp_path / "study.toml", tmp_path / "out"
-    file.write_text(SHORT.format(seeds=400))
+    file.write_text(SHORT.format(seeds=2000))
     terminal = Terminal("batch", file, "--out", out, "--workers", 2)
     try:
         wait_for(lambda: len(list(out.glob("runs/*/*.json"))) >= 5 or terminal.process.poll() is not None)
@@ -72,16 +72,16 @@ def test_ctrl_c_in_a_terminal_stops_cleanly_and_says_how_to_continue(tmp_path):
     finally:
         terminal.process.kill()
     assert status == 130
-    assert "of 400" in shown
+    assert "of 2000" in shown
     assert "a second" in shown  # the live table
     assert "Traceback" not in shown
     (line,) = [x for x in shown.splitlines() if "to continue" in x]
     again = shlex.split(line.partition("to continue: ")[2])
     assert again == ["flowgraph", "batch", str(file), "--out", str(out), "--workers", "2"]
     rows = read_table(out)
-    assert 5 <= len(rows) < 400
+    assert 5 <= len(rows) < 2000
     assert not list(out.rglob("*.part"))
-    file.write_text(SHORT.format(seeds=len(rows)))  # not all 400: the seeds that there may be
+    file.write_text(SHORT.format(seeds=len(rows)))  # not all 2000: the seeds that there may be
     done = flowgraph(*again[1:], "--json")
     assert done.returncode == 0
     found = json.loads(done.stdout)
