@@ -32,6 +32,7 @@ from flowgraph.errors import DataError
 __all__ = [
     "attitude_errors",
     "error_summary",
+    "interpolate",
     "interpolate_pose",
     "nees",
     "nees_summary",
@@ -43,15 +44,15 @@ __all__ = [
 
 
 def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The truth's position (n, 3) and attitude (n, 4) at `time` (n,) int64 ns: linear and slerp.
+    """The truth's position (n, 3) and attitude (n, 4) at `time` (n,) int64 ns: `interpolate` of both."""
+    return interpolate(truth, "position", time), interpolate(truth, "attitude", time)
+
+
+def interpolate(truth: Series, name: str, time: np.ndarray) -> np.ndarray:
+    """A field of the truth at `time` (n,) int64 ns: linear, and slerp for the attitude.
 
     A time outside the truth gets its first or last value.
     """
-    return _between(truth, "position", time), _between(truth, "attitude", time)
-
-
-def _between(truth: Series, name: str, time: np.ndarray) -> np.ndarray:
-    """A field of the truth at `time` (n,): linear, and slerp for the attitude."""
     right = np.clip(np.searchsorted(truth.time, time), 1, max(len(truth) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(truth) - 1)
@@ -75,7 +76,7 @@ def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
         chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
         known = np.ones(len(chosen), dtype=bool)
         for name in {"position", "attitude"} & set(truth.leaves):
-            known &= np.isfinite(_between(truth, name, chosen.time)).all(axis=-1)
+            known &= np.isfinite(interpolate(truth, name, chosen.time)).all(axis=-1)
         chosen = chosen if known.all() else chosen[known]
     if not len(truth) or not len(chosen):
         raise DataError(
@@ -203,7 +204,7 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
         DataError: when no tick of the estimate lies within the truth.
     """
     chosen = within_truth(estimate, truth, settle)
-    q, attitude = chosen["attitude"], _between(truth, "attitude", chosen.time)
+    q, attitude = chosen["attitude"], interpolate(truth, "attitude", chosen.time)
     found = {
         **_angles(q, attitude),
         **_axes_and_parts(q, attitude),
@@ -263,7 +264,7 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
         DataError: when no tick of the estimate lies within the truth.
     """
     chosen = within_truth(estimate, truth, settle)
-    q = _between(truth, "attitude", chosen.time)
+    q = interpolate(truth, "attitude", chosen.time)
     return {**_axes_and_parts(chosen["attitude"], q), "compared_ticks": float(len(chosen))}
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, Flight, Scalar, Series, Signal, block, real
+from flowgraph.blocks.metrics import error_summary, interpolate, nees_summary, within_truth
 from flowgraph.blocks.particles import log_sum_exp
 from flowgraph.blocks.resampling import ancestor_index
 from flowgraph.blocks.signals import Ancestors
@@ -30,6 +31,7 @@ __all__ = [
     "average_plane",
     "exact",
     "move_plane",
+    "plane_errors",
     "plane_sample_size",
     "resample_plane",
     "start_plane",
@@ -164,3 +166,22 @@ def exact(flight: Flight, *, spread: float) -> Series:
         variances.append(p * np.eye(2))
     belief = PlaneBelief(position=np.array(means), covariance=np.array(variances))
     return Series(time, belief, name="exact")
+
+
+def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare `PlaneBelief`s with the truth, where it covers them and after `settle` seconds.
+
+    Returns:
+        position_rmse_m, position_mean_m, position_max_m, the `nees_summary` (2 on average in a consistent
+        filter) and compared_ticks.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    error = interpolate(truth, "position", chosen.time) - chosen["position"]
+    return {
+        **{f"position_{name}_m": value for name, value in error_summary(error).items()},
+        **nees_summary(error, chosen["covariance"]),
+        "compared_ticks": float(len(chosen)),
+    }

@@ -11,6 +11,8 @@ sec. 6.2.2 (white noise acceleration).
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 import numpy.typing as npt
 
@@ -36,9 +38,14 @@ __all__ = [
 
 
 class WorldAcceleration(Signal):
-    """The second derivative of position, m/s^2, in world coordinates: zero at rest."""
+    """The second derivative of position, m/s^2, in world coordinates."""
 
     acceleration: Array = real(3, unit="m/s^2", frame="world")
+
+    @classmethod
+    def at_rest(cls) -> Self:
+        """None."""
+        return cls(acceleration=np.zeros(3))
 
 
 class PointReading(Signal):

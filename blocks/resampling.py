@@ -26,10 +26,13 @@ from flowgraph import Array, Scalar, block
 from flowgraph.blocks.signals import Ancestors, Cloud
 from flowgraph.errors import UnknownNameError
 
-__all__ = ["SCHEMES", "ancestor_index", "draw_ancestors", "quantised", "take_ancestors"]
+__all__ = ["MOST_PARTICLES", "SCHEMES", "ancestor_index", "draw_ancestors", "quantised", "take_ancestors"]
 
 WEIGHT_BITS = 38
 """A weight is a multiple of 2^-38: n times the sum of all then fits int64, for n up to 2^24."""
+
+MOST_PARTICLES = 2**20
+"""As many as a graph may be set to."""
 
 
 def quantised(weight: Array, *, xp: Any) -> Array:

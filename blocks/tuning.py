@@ -26,6 +26,7 @@ __all__ = [
     "imu_noise_of",
     "noise_of",
     "reading_of",
+    "unbiased_noise_of",
     "with_imu",
 ]
 
@@ -89,6 +90,20 @@ def imu_noise_of(
             fix="give the Flight info={'imu_noise': ImuNoise(...)}",
         )
     return noise.scaled(gyro=gyro_factor, accelerometer=accelerometer_factor)
+
+
+def unbiased_noise_of(
+    graph: str, flight: Flight, gyro_factor: float | None, accelerometer_factor: float | None
+) -> ImuNoise:
+    """`imu_noise_of` for a filter that knows no biases.
+
+    A factor left out is 20 for a unit whose biases walk, and 1 for one that has none.
+    """
+    noise = imu_noise_of(graph, flight)
+    otherwise = 20.0 if noise.gyro_bias or noise.accelerometer_bias else 1.0
+    return noise.scaled(
+        gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
+    )
 
 
 def reading_of(flight: Flight) -> str:

@@ -41,13 +41,13 @@ def need_streams(join: str, **given: Any) -> None:
             )
 
 
-def need_count(operation: str, name: str, n: object, *, least: int) -> int:
-    """`n` as a whole number of at least `least`."""
-    if not isinstance(n, int) or isinstance(n, bool) or not least <= n < 2**31:
+def need_count(operation: str, name: str, n: object, *, least: int, most: int = 2**31 - 1) -> int:
+    """`n` as a whole number from `least` to `most`."""
+    if not isinstance(n, int) or isinstance(n, bool) or not least <= n <= most:
         raise DeclarationError(
             f"{operation} needs a whole number as {name!r}",
             path=operation,
-            expected=f"{name} >= {least}, below 2^31",
+            expected=f"{name} from {least} to {most}",
             got=f"{name}={n!r}",
             fix=f"write {name}={max(least, 5)}",
         )

@@ -13,12 +13,13 @@ holds dt.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from flowgraph import (
     Case,
     Flight,
-    Result,
     Series,
     Stream,
     clocks_of,
@@ -39,10 +40,8 @@ from flowgraph.blocks.point import (
 )  # fmt: skip
 from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Position, Velocity
-from flowgraph.blocks.smoothing import Steps, point_steps
+from flowgraph.blocks.smoothing import point_steps
 from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
-
-_AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
 
 @graph
@@ -66,8 +65,8 @@ def async_kalman(
     """
     ticks = acceleration | position if velocity is None else acceleration | position | velocity
     belief = delay(start, name="belief")
-    last = delay(_AT_REST, name="last_control")
-    now = latest(acceleration, init=_AT_REST, at=ticks, name="control")
+    last = delay(WorldAcceleration.at_rest(), name="last_control")
+    now = latest(acceleration, init=WorldAcceleration.at_rest(), at=ticks, name="control")
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
     posterior, innovation = update_linear(
@@ -114,10 +113,7 @@ def for_flight(
         control=reading_of(flight),
         gate=gate,
     )
-
-    def steps(result: Result) -> Steps:
-        return point_steps(result, point_model(density))
-
+    steps = partial(point_steps, model=point_model(density))
     score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
     return Case(built, inputs, score)
 

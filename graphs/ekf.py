@@ -32,13 +32,12 @@ from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.blocks.smoothing import pose_steps
 from flowgraph.blocks.tuning import (
     check_settings,
-    given,
     gravity_of,
-    imu_noise_of,
     noise_of,
     reading_of,
+    unbiased_noise_of,
     with_imu,
-)  # fmt: skip
+)
 
 
 @graph
@@ -108,14 +107,11 @@ def for_flight(
     check_settings("ekf", {**factors, **noises, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
     flight = with_imu(flight)
     inputs = flight.need("ekf", "imu", "vicon")
-    first, unit = inputs["vicon"][0], imu_noise_of("ekf", flight)
-    otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
+    first = inputs["vicon"][0]
     built = ekf.build(
         **clocks_of(inputs),
         start=start_pose(first.position, first.attitude),
-        noise=unit.scaled(
-            gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
-        ),
+        noise=unbiased_noise_of("ekf", flight, gyro_factor, accelerometer_factor),
         position_noise=noise_of("ekf", flight, "position_noise", position_noise, 0.004),
         attitude_noise=noise_of("ekf", flight, "attitude_noise", attitude_noise, 0.01),
         lever=tuple(flight.info.get("vicon_lever", (0.0, 0.0, 0.0))),

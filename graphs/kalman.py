@@ -15,13 +15,14 @@ for S), and the control matrix holds dt. Where the positions have a clock of the
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from flowgraph import (
     Case,
     DataError,
     Flight,
-    Result,
     Series,
     Stream,
     arrays,
@@ -42,10 +43,8 @@ from flowgraph.blocks.point import (
     told_acceleration,
 )  # fmt: skip
 from flowgraph.blocks.scores import scorer
-from flowgraph.blocks.smoothing import Steps, point_steps
+from flowgraph.blocks.smoothing import point_steps
 from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
-
-_AT_REST = WorldAcceleration(acceleration=np.zeros(3))
 
 
 @graph
@@ -67,7 +66,7 @@ def kalman(
     measured.
     """
     belief = delay(start, name="belief")
-    last = delay(_AT_REST, name="last_control")
+    last = delay(WorldAcceleration.at_rest(), name="last_control")
     now = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
@@ -117,10 +116,7 @@ def for_flight(
         control=reading_of(flight),
         gate=gate,
     )
-
-    def steps(result: Result) -> Steps:
-        return point_steps(result, point_model(density))
-
+    steps = partial(point_steps, model=point_model(density))
     score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
     return Case(built, {"reading": reading}, score)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Stream, collect, delay, graph, latest, timing_of
+from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.kalman import Gaussian, update_extended
 from flowgraph.blocks.metrics import pose_errors
@@ -33,6 +33,7 @@ from flowgraph.blocks.outdoor_belief import (
     predict_clone,
     start_outdoor,
 )
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
 from flowgraph.checks import need_numbers
 
@@ -98,12 +99,5 @@ def for_flight(flight: Flight, *, settle: float = 1.0) -> Case:
     """
     need_numbers("outdoor_eskf", not_negative={"settle": settle})
     inputs, sensors, first = outdoor_flight(flight, "outdoor_eskf")
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
-    start = start_outdoor(first)
-    built = outdoor_eskf.build(**clocks, start=start, sensors=sensors)
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["belief"], truth, settle=settle)
-
-    return Case(built, inputs, score)
+    built = outdoor_eskf.build(**clocks_of(inputs), start=start_outdoor(first), sensors=sensors)
+    return Case(built, inputs, scorer(flight, pose_errors, settle=settle))

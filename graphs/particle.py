@@ -14,33 +14,24 @@ Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stan
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from flowgraph import (
-    Case,
-    DeclarationError,
-    Flight,
-    Result,
-    Stream,
-    delay,
-    graph,
-    latest,
-    merge,
-    timing_of,
-)  # fmt: skip
+from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
 from flowgraph.blocks.plane import (
     PlaneCloud,
     PlanePosition,
     PlaneVelocity,
     average_plane,
     move_plane,
+    plane_errors,
     plane_sample_size,
     resample_plane,
     start_plane,
     weigh_plane,
 )
+from flowgraph.blocks.resampling import MOST_PARTICLES
+from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.tuning import noise_of
 from flowgraph.checks import need_count, need_numbers
 
 
@@ -85,17 +76,21 @@ def for_flight(
     seed: int = 0,
     resample_below: float = 0.5,
     scheme: str = "systematic",
+    velocity_noise: float | None = None,
+    position_noise: float | None = None,
     spread: float = 1.0,
     settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
 
     Args:
-        flight: with the streams `velocity` and `position`; info: `velocity_noise`, `position_noise`.
+        flight: with the streams `velocity` and `position`.
         particles: how many.
         seed: of the start's draws; that of the run is given to `simulate`.
         resample_below: resample when the effective sample size is below this fraction of the particles.
         scheme: systematic, stratified, residual or multinomial.
+        velocity_noise, position_noise: density in m/s/sqrt(Hz) and standard deviation in m; the flight's own
+            if left out.
         spread: standard deviation of the start, m.
         settle: seconds at the start that the error leaves out.
 
@@ -104,37 +99,17 @@ def for_flight(
     """
     need_numbers(
         "particle",
-        positive={"spread": spread},
+        positive={"velocity_noise": velocity_noise, "position_noise": position_noise, "spread": spread},
         not_negative={"resample_below": resample_below, "settle": settle},
     )
-    need_count("particle", "particles", particles, least=1)
+    need_count("particle", "particles", particles, least=1, most=MOST_PARTICLES)
     inputs = flight.need("particle", "velocity", "position")
-    if not {"velocity_noise", "position_noise"} <= set(flight.info):
-        raise DeclarationError(
-            "this flight does not say how noisy it is",
-            path=flight.name,
-            expected="info with velocity_noise and position_noise",
-            got=", ".join(flight.info) or "nothing",
-            fix="choose sim:plane, or build particle with your own sources",
-        )
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
     built = particle.build(
-        **clocks,
+        **clocks_of(inputs),
         start=start_plane(particles, seed=seed, spread=spread),
-        velocity_noise=flight.info["velocity_noise"],
-        position_noise=flight.info["position_noise"],
+        velocity_noise=noise_of("particle", flight, "velocity_noise", velocity_noise),
+        position_noise=noise_of("particle", flight, "position_noise", position_noise),
         resample_below=resample_below,
         scheme=scheme,
     )
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        if truth is None:
-            return {}
-        belief = result["belief"]
-        late = belief.time - belief.time[0] >= round(settle * 1e9)
-        there = truth["position"][np.searchsorted(truth.time, belief.time[late])]
-        apart = np.sum((belief["position"][late] - there) ** 2, axis=-1)
-        return {"position_rmse_m": float(np.sqrt(np.mean(apart)))}
-
-    return Case(built, inputs, score)
+    return Case(built, inputs, scorer(flight, plane_errors, settle=settle))

@@ -17,7 +17,6 @@ import numpy as np
 
 from flowgraph import (
     Case,
-    DeclarationError,
     Flight,
     Series,
     Stream,
@@ -44,13 +43,11 @@ from flowgraph.blocks.particles import (
     weights,
 )
 from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
-from flowgraph.blocks.resampling import draw_ancestors, take_ancestors
+from flowgraph.blocks.resampling import MOST_PARTICLES, draw_ancestors, take_ancestors
 from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Cloud, Imu, Pose
 from flowgraph.blocks.tuning import given, imu_noise_of, noise_of
-from flowgraph.checks import need_numbers
-
-MOST_PARTICLES = 2**20
+from flowgraph.checks import need_count, need_numbers
 
 
 @graph
@@ -196,14 +193,7 @@ def for_flight(
         },
         not_negative={"still": still, "settle": settle, "resample_below": resample_below},
     )
-    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
-        raise DeclarationError(
-            "setting 'particles' is out of range",
-            path="rbpf_indoor.particles",
-            expected=f"a whole number from 1 to {MOST_PARTICLES}",
-            got=repr(particles),
-            fix="write particles=1000",
-        )
+    need_count("rbpf_indoor", "particles", particles, least=1, most=MOST_PARTICLES)
     inputs = flight.need("rbpf_indoor", "imu", "vicon")
     imu, vicon = inputs.values()
     simulated = "position_noise" in flight.info

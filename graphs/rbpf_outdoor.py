@@ -14,20 +14,7 @@ q_1, in the world). The equations stand in `blocks/outdoor_cloud.py`.
 
 from __future__ import annotations
 
-from typing import Any
-
-from flowgraph import (
-    Case,
-    DeclarationError,
-    Flight,
-    Result,
-    Stream,
-    delay,
-    graph,
-    latest,
-    merge,
-    timing_of,
-)  # fmt: skip
+from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
@@ -44,11 +31,10 @@ from flowgraph.blocks.outdoor_cloud import (
     take_picture,
 )
 from flowgraph.blocks.particles import average_attitude, average_pose, effective_sample_size, weights
-from flowgraph.blocks.resampling import draw_ancestors
+from flowgraph.blocks.resampling import MOST_PARTICLES, draw_ancestors
+from flowgraph.blocks.scores import scorer
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.checks import need_numbers
-
-MOST_PARTICLES = 2**20
+from flowgraph.checks import need_count, need_numbers
 
 
 @graph
@@ -131,26 +117,14 @@ def for_flight(
         UnknownNameError: for a scheme that is not there.
     """
     need_numbers("rbpf_outdoor", not_negative={"settle": settle, "resample_below": resample_below})
-    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
-        raise DeclarationError(
-            "setting 'particles' is out of range",
-            path="rbpf_outdoor.particles",
-            expected=f"a whole number from 1 to {MOST_PARTICLES}",
-            got=repr(particles),
-            fix="write particles=1000",
-        )
+    need_count("rbpf_outdoor", "particles", particles, least=1, most=MOST_PARTICLES)
     inputs, sensors, first = outdoor_flight(flight, "rbpf_outdoor")
-    clocks: dict[str, Any] = {name: timing_of(series) for name, series in inputs.items()}
     built = rbpf_outdoor.build(
-        **clocks,
+        **clocks_of(inputs),
         start=start_outdoor_cloud(particles, first, seed=seed),
         sensors=sensors,
         resample_below=resample_below,
         scheme=scheme,
     )
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else pose_errors(result["pose"], truth, settle=settle)
-
+    score = scorer(flight, pose_errors, estimate="pose", settle=settle)
     return Case(built, inputs, score, estimate="pose")

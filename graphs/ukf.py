@@ -44,13 +44,12 @@ from flowgraph.blocks.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.blocks.tuning import (
     check_settings,
-    given,
     gravity_of,
-    imu_noise_of,
     noise_of,
     reading_of,
+    unbiased_noise_of,
     with_imu,
-)  # fmt: skip
+)
 from flowgraph.blocks.unscented import predict_unscented, update_unscented
 
 _NONE = (0.0, 0.0, 0.0)
@@ -141,14 +140,11 @@ def for_flight(
     check_settings("ukf", {**factors, **noises, "alpha": alpha, "gate": gate}, settle=settle)
     flight = with_imu(flight)
     inputs = flight.need("ukf", "imu", "vicon")
-    first, unit = inputs["vicon"][0], imu_noise_of("ukf", flight)
-    otherwise = 20.0 if unit.gyro_bias or unit.accelerometer_bias else 1.0
+    first = inputs["vicon"][0]
     built = ukf.build(
         **clocks_of(inputs),
         start=start_state(first.position, first.attitude),
-        noise=unit.scaled(
-            gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
-        ),
+        noise=unbiased_noise_of("ukf", flight, gyro_factor, accelerometer_factor),
         position_noise=noise_of("ukf", flight, "position_noise", position_noise, 0.004),
         attitude_noise=noise_of("ukf", flight, "attitude_noise", attitude_noise, 0.01),
         lever=tuple(flight.info.get("vicon_lever", _NONE)),

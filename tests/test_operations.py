@@ -643,9 +643,9 @@ add = lambda a, v: a + v
             lambda x: take_while(x, lambda v: v + 1.0),
             ["take_while", "does not give a truth value", "got real"],
         ),
-        (lambda x: drop(-1, x), ["drop needs a whole number as 'n'", "n >= 0", "n=-1"]),
+        (lambda x: drop(-1, x), ["drop needs a whole number as 'n'", "n from 0", "n=-1"]),
         (lambda x: drop(1.5, x), ["drop needs a whole number as 'n'", "n=1.5"]),  # type: ignore[arg-type]
-        (lambda x: batch(0, x), ["batch needs a whole number as 'n'", "n >= 1"]),
+        (lambda x: batch(0, x), ["batch needs a whole number as 'n'", "n from 1"]),
         (lambda x: batch(True, x), ["batch needs a whole number as 'n'"]),
         (lambda x: window(x, at=x), ["window needs a whole number as 'size'", "size=None"]),
         (lambda x: window(x, at=x, size=0), ["window needs a whole number as 'size'", "size=0"]),

@@ -6,7 +6,6 @@ filter, for the Rao-Blackwellized ones an error-state filter on the same streams
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ import numpy as np
 
 from flowgraph import Case, DeclarationError, Flight, Report, UnknownNameError, simulate
 from flowgraph.blocks.flights import simulated
-from flowgraph.blocks.plane import exact
+from flowgraph.blocks.plane import exact, plane_errors
 from flowgraph.checks import need_count
+from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.particle import particle
@@ -41,7 +41,7 @@ def particles(
     most: int = 10_000,
     flights: int = 2,
     duration: float = 5.0,
-    engine: str = "",
+    engine: str = "auto",
     seed: int = 0,
 ) -> Report:
     """Error and time of a particle filter against the number of particles, from 10 to 10,000.
@@ -51,7 +51,7 @@ def particles(
         least, most: particles; between them three sizes a decade.
         flights: simulated ones, over which the squared errors are averaged.
         duration: of a flight, s.
-        engine: python, reference or xla; xla if it is installed and this is left out.
+        engine: "auto" is xla where JAX is installed, else python.
         seed: of the first flight; the next has the next.
 
     Returns:
@@ -75,7 +75,7 @@ def particles(
             got=f"least={least}, most={most}",
             fix="write least=10 and most=10000",
         )
-    engine = engine or ("xla" if importlib.util.find_spec("jax") else "python")
+    engine = engine_of(engine)
     graph, reference, world, settings, extra = FILTERS[filter]
     some = [
         simulated.load(world, seed=seed + k, settings={**settings, "duration": duration})
@@ -118,8 +118,8 @@ def sizes(least: int, most: int) -> list[int]:
 def _reference(graph: Any, flight: Flight) -> float:
     """The position RMSE of the reference on a flight, m."""
     if graph is None:
-        case = particle.case(flight, particles=1)
-        return case.score({"belief": exact(flight, spread=1.0)})["position_rmse_m"]  # type: ignore[arg-type]
+        assert flight.truth is not None  # simulated
+        return plane_errors(exact(flight, spread=1.0), flight.truth)["position_rmse_m"]
     case = graph.case(flight)
     return case.score(simulate(case.graph, case.inputs))["position_rmse_m"]
 

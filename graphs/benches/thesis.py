@@ -14,7 +14,6 @@ Source: R. Fiszel, thesis (2017), the tables of its results.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ from flowgraph.blocks.tuning import WEIGHTLESS, with_imu
 from flowgraph.checks import need_count
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
+from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.kalman import kalman, readings
@@ -219,7 +219,7 @@ def thesis(
     seed: int = 0,
     settings: str = ",".join(SETTINGS),
     filters: str = ",".join(FILTERS),
-    engine: str | None = None,
+    engine: str = "auto",
 ) -> Report:
     """The thesis's table: ACF, EKF, UKF, RBPF and an error-state filter in six settings of noise.
 
@@ -229,7 +229,7 @@ def thesis(
         duration: of a flight, s, at most 20.
         seed: of the first flight; the others follow.
         settings, filters: those to run, with commas between.
-        engine: as for `simulate_many`; xla where JAX is installed, else python.
+        engine: as for `simulate_many`; "auto" is xla where JAX is installed, else python.
 
     Returns:
         A row a setting and filter: the errors, the 95 % interval of the position RMSE (bootstrap over
@@ -237,7 +237,7 @@ def thesis(
     """
     need_count("thesis", "flights", flights, least=1)
     need_count("thesis", "particles", particles, least=1)
-    engine = engine or ("xla" if importlib.util.find_spec("jax") else "python")
+    engine = engine_of(engine)
     names, codes = _listed("filter", filters, FILTERS), _listed("setting", settings, SETTINGS)
     rows = []
     for code in codes:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, DeclarationError, Flight, UnknownNameError, load_flight, simulate
-from flowgraph.blocks.plane import exact
+from flowgraph.blocks.plane import exact, plane_errors
 from flowgraph.graphs.particle import particle
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
@@ -39,7 +39,9 @@ def test_it_is_nearly_as_good_as_the_exact_filter():
     for seed in range(5):
         made = case(1000, seed)
         ours.append(made.score(simulate(made.graph, made.inputs, seed=seed))["position_rmse_m"])
-        best.append(made.score({"belief": exact(flight(seed), spread=1.0)})["position_rmse_m"])  # type: ignore[arg-type]
+        truth = flight(seed).truth
+        assert truth is not None
+        best.append(plane_errors(exact(flight(seed), spread=1.0), truth)["position_rmse_m"])
     assert np.mean(best) < 0.35
     assert np.mean(ours) < 1.03 * np.mean(best)
 
@@ -86,7 +88,7 @@ def test_a_flight_without_velocity_is_refused():
 
 
 def test_a_flight_of_unknown_noise_is_refused():
-    with pytest.raises(DeclarationError, match="does not say how noisy it is"):
+    with pytest.raises(DataError, match=r"does not say its velocity_noise[\s\S]*--set velocity_noise=0.1"):
         particle.case(Flight("bare", flight().streams))
 
 
