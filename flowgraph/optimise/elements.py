@@ -73,6 +73,9 @@ class Elements:
             return None
         if i.op in ELEMENTWISE:
             return self._elementwise(i, tables)
+        made = self.laned(i.spec) and not any(self.laned(self.specs[a]) for a in i.args)
+        if made and i.op != "broadcast_to":
+            return None  # an axis that was taken apart would have to be put together
         if i.op in MOVES:
             return self._move(i, tables)
         rule = getattr(self, f"_{i.op}", self._chain if i.op in _CHAINS else None)

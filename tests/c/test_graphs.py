@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from flowgraph import simulate
-from flowgraph.cli.options import case_of
+from tests.graphs.library import LIBRARY, library_case
 from tests.support import same
-
-PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-HOST = {"tag_pose", "imu_calibration"}
-"""Run in Python: PnP is on the host, and the calibration needs a recording of raw counts."""
-GRAPHS = sorted(set(PROJECT["entry-points"]["flowgraph.graphs"]) - HOST)
-"""The graphs of the library; each must have a line below for single precision."""
 
 SINGLE = {
     "kalman": 1e-4,
@@ -39,43 +30,22 @@ SINGLE = {
     "ins_particle": 0.2,  # of 60 particles; one that is drawn in place of another moves the mean
     "rbpf_indoor": 5e-2,
     "rbpf_outdoor": 5e-2,
+    "imu_calibration": 0.05,  # counts of 1024, means of growing sums
 }
 """Largest difference of the estimate in single precision, in its own units, over a second of flight."""
 
-OWN = {
-    "orientation_complementary": ("sim:thesis", ["sensors=gyro,coordinate_acceleration,thrust"]),
-    "outdoor_eskf": ("sim:thesis", ["sensors=imu,gps,gps2,altimeter,magnetometer,optical_flow"]),
-    "rbpf_outdoor": (
-        "sim:thesis",
-        ["sensors=imu,gps,gps2,altimeter,magnetometer,optical_flow", "particles=60"],
-    ),
-    "rbpf_indoor": ("sim", ["particles=60"]),
-    "marg": ("sim:thesis", ["sensors=imu,magnetometer"]),
-    "particle": ("sim:plane", ["particles=60"]),
-    "ins_ekf_pose": ("course", []),
-    "ins_ukf_pose": ("course", []),
-    "ins_ukf_velocity": ("course", []),
-    "ins_particle": ("course", ["particles=60"]),
-}
-"""The flight of a graph, and settings, where it is not a second of `sim`."""
 
-
-def case(name: str):
-    data, settings = OWN.get(name, ("sim", []))
-    return case_of(name, data, ["duration=1", *settings], 0)[0]
-
-
-@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.parametrize("name", LIBRARY)
 def test_all_engines_agree(name):
-    given = case(name)
+    given = library_case(name)
     wanted = simulate(given.graph, given.inputs)
     for engine in ("reference", "xla", "c"):
         same(wanted, simulate(given.graph, given.inputs, engine=engine), exact=False)
 
 
-@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.parametrize("name", LIBRARY)
 def test_single_precision_stays_near(name):
-    given = case(name)
+    given = library_case(name)
     double = simulate(given.graph, given.inputs, engine="c")[given.estimate]
     single = simulate(given.graph, given.inputs, engine="c", dtype="float32")[given.estimate]
     np.testing.assert_array_equal(double.time, single.time)

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 
 from flowgraph import (
-    Case,
-    DataError,
     DeclarationError,
     Result,
     UnknownNameError,
-    find_graph,
-    load_flight,
     lower,
     simulate,
     simulate_many,
@@ -23,74 +19,57 @@ from flowgraph import (
 from flowgraph.optimise import DEFAULT, PASSES, optimise, without
 from flowgraph.pipeline import Pipeline
 from flowgraph.program import specialise
-from flowgraph.registry import graph_names
 from tests.graphs.estimation import compare
-
-FLIGHTS: dict[str, tuple[str, dict[str, str]]] = {
-    "orientation_complementary": ("sim:thesis", {"sensors": "gyro,coordinate_acceleration,thrust"}),
-}
-"""Where "sim" lacks what a graph needs."""
-
-SETTINGS: dict[str, dict[str, Any]] = {"rbpf_indoor": {"particles": 60}}
+from tests.graphs.library import LIBRARY, library_case
 
 REWRITING = [name for name in PASSES if name not in ("reuse", "layout")]
 
 
 @cache
-def case_of(name: str, duration: str = "1.5") -> Case:
-    spec, settings = FLIGHTS.get(name, ("sim", {}))
-    flight = load_flight(spec, seed=0, settings={**settings, "duration": duration})
-    try:
-        return find_graph(name).case(flight, **SETTINGS.get(name, {}))
-    except DataError as error:
-        pytest.skip(f"no flight in FLIGHTS suits {name}: {error}")
-
-
-@cache
 def plain(name: str) -> Result:
-    case = case_of(name)
+    case = library_case(name)
     return simulate(case.graph, case.inputs, engine="reference")
 
 
 def agrees(name: str, passes: tuple[str, ...], engine: str = "reference") -> None:
-    case = case_of(name)
+    case = library_case(name)
     found = simulate(case.graph, case.inputs, engine=engine, passes=passes)
     assert list(found.series) == list(plain(name).series)
     for output, series in plain(name).series.items():
         compare(series, found[output])
 
 
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", LIBRARY)
 def test_optimised_it_gives_the_same(name):
     agrees(name, DEFAULT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("left_out", REWRITING)
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", LIBRARY)
 def test_each_pass_can_be_left_out(name, left_out):
     agrees(name, without(left_out))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("alone", REWRITING)
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", LIBRARY)
 def test_each_pass_does_alone(name, alone):
     agrees(name, (alone,))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", LIBRARY)
 def test_xla_plays_the_optimised_list(name):
     agrees(name, without("unroll"), engine="xla")  # unrolled it takes minutes to compile
 
 
 def programs(name: str) -> list[Any]:
-    pipeline: Pipeline = lower(case_of(name).graph)
+    pipeline: Pipeline = lower(library_case(name).graph)
     return [specialise(pipeline, key) for key in (*range(1, 2 ** len(pipeline.inputs)), None)]
 
 
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", LIBRARY)
 def test_the_list_stays_in_single_assignment_form(name):
     for program in programs(name):
         found = optimise(program)
@@ -112,7 +91,7 @@ def test_less_is_left_of_the_work():
 
 
 def test_a_run_that_sets_a_covariance_otherwise_goes_without_symmetry():
-    case = case_of("kalman")
+    case = library_case("kalman")
     belief = case.graph.registers[0][1]
     assert belief.path == "belief"
     start = belief.initial
@@ -126,7 +105,7 @@ def test_a_run_that_sets_a_covariance_otherwise_goes_without_symmetry():
 
 
 def test_the_python_engine_has_no_list_to_optimise():
-    case = case_of("kalman")
+    case = library_case("kalman")
     with pytest.raises(DeclarationError, match="the Python engine runs the blocks themselves"):
         simulate(case.graph, case.inputs, passes=DEFAULT)
     with pytest.raises(UnknownNameError, match="no pass is called 'magic'"):
@@ -135,7 +114,7 @@ def test_the_python_engine_has_no_list_to_optimise():
 
 @pytest.mark.parametrize("engine", ["reference", "xla"])
 def test_many_runs_take_passes_too(engine):
-    case = case_of("kalman")
+    case = library_case("kalman")
     pytest.importorskip("jax")
     runs = simulate_many(case.graph, case.inputs, [0, 1], engine=engine, passes=without("unroll"))
     for output, series in plain("kalman").series.items():
