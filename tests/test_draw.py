@@ -9,70 +9,29 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from flowgraph import (
-    Array,
     DeclarationError,
     FlowgraphError,
     Graph,
     MissingDependencyError,
-    Signal,
     Stream,
     UnknownNameError,
     aperiodic,
-    block,
-    delay,
     every,
     graph,
     latest,
     match,
     merge,
     periodic,
-    real,
     sink,
 )
 from flowgraph.draw import dot_source, draw, to_networkx
 from flowgraph.types import Scalar
+from tests.drawn import Fix, Imu, core
 
 SVG = "{http://www.w3.org/2000/svg}"
-
-
-class Imu(Signal):
-    gyro: Array = real(3, unit="rad/s", frame="body")
-
-
-class Fix(Signal):
-    position: Array = real(3, unit="m", frame="world")
-
-
-class Belief(Signal):
-    position: Array = real(3, unit="m", frame="world")
-
-
-@block
-def predict(belief: Belief, control: Imu, *, dt) -> Belief:
-    """Carry the belief to now."""
-    return Belief(belief.position + dt * control.gyro)
-
-
-@block
-def aid(prior: Belief, measured: Fix | None = None) -> tuple[Belief, Array | None]:
-    """Use a fix, where there is one."""
-    if measured is None:
-        return prior, None
-    gap = measured.position - prior.position
-    return Belief(prior.position + 0.5 * gap), gap
-
-
-@graph
-def core(imu: Stream[Imu], fix: Stream[Fix]):
-    belief = delay(Belief(np.zeros(3)), name="belief")
-    control = latest(imu, init=Imu(np.ones(3)), name="control")
-    posterior, innovation = aid(predict(belief, control, at=imu | fix), fix)
-    belief.feed(posterior)
-    return posterior, innovation
 
 
 @graph

@@ -8,59 +8,21 @@ import numpy as np
 import pytest
 
 from flowgraph import (
-    Array,
-    Signal,
     Stream,
     aperiodic,
-    block,
-    delay,
     every,
     graph,
     latest,
     match,
     merge,
     periodic,
-    real,
     sink,
     zip_latest,
 )
 from flowgraph.draw_text import draw_text, duration_words, initial_words, shorten, type_words
 from flowgraph.graph import RegisterNode
 from flowgraph.types import ArrayType, Scalar, type_of
-
-
-class Imu(Signal):
-    gyro: Array = real(3, unit="rad/s", frame="body")
-
-
-class Fix(Signal):
-    position: Array = real(3, unit="m", frame="world")
-
-
-class Belief(Signal):
-    position: Array = real(3, unit="m", frame="world")
-
-
-@block
-def predict(belief: Belief, control: Imu, *, dt) -> Belief:
-    return Belief(belief.position + dt * control.gyro)
-
-
-@block
-def aid(prior: Belief, measured: Fix | None = None) -> tuple[Belief, Array | None]:
-    if measured is None:
-        return prior, None
-    gap = measured.position - prior.position
-    return Belief(prior.position + 0.5 * gap), gap
-
-
-@graph
-def core(imu: Stream[Imu], fix: Stream[Fix]):
-    belief = delay(Belief(np.zeros(3)), name="belief")
-    control = latest(imu, init=Imu(np.ones(3)), name="control")
-    posterior, innovation = aid(predict(belief, control, at=imu | fix), fix)
-    belief.feed(posterior)
-    return posterior, innovation
+from tests.drawn import Fix, Imu, core
 
 
 @graph
