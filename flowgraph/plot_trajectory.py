@@ -172,7 +172,8 @@ def _angles(
     """Roll, pitch or yaw (Z-Y-X), degrees, without jumps of a turn; the band is that of the body's axis."""
 
     def drawn(series: Series) -> np.ndarray:
-        return np.degrees(np.unwrap(_rotations(series).as_euler("ZYX")[:, 2 - k]))
+        turned: np.ndarray = _rotations(series).as_euler("ZYX")
+        return np.degrees(np.unwrap(turned[:, 2 - k]))
 
     value = drawn(estimate)
     wide = 3.0 * np.degrees(sigma)
