@@ -23,7 +23,8 @@ from mkdocs.structure.files import File
 sys.path.insert(0, str(Path(__file__).parent))
 import library
 
-from flowgraph import FlowgraphError, find_graph, load_flight
+from flowgraph import FlowgraphError
+from flowgraph.cli.options import graph_of
 from flowgraph.registry import graph_names
 
 matplotlib.use("Agg")
@@ -50,18 +51,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def graphs() -> Iterator[tuple[str, bytes]]:
     """The diagram of each installed graph."""
-    flights = [
-        load_flight("sim", seed=0),
-        load_flight("sim:thesis", settings={"sensors": "all"}),
-        load_flight("course", settings={"duration": "1"}),
-    ]
     for name in graph_names():
-        for flight in flights:
-            try:
-                yield name, find_graph(name).case(flight).graph.draw().encode()
-                break
-            except FlowgraphError as error:  # such as a graph that needs another flight
-                log.info("no diagram of %s on %s: %s", name, flight.name, error)
+        try:
+            yield name, graph_of(name)[0].draw().encode()
+        except FlowgraphError as error:
+            log.warning("no diagram of %s: %s", name, error)
 
 
 def written_by_pages(docs: Path) -> Iterator[tuple[str, bytes]]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, DataOrNone, Name, Seed, Settings, case_of, example_of
+from flowgraph.cli.options import AsJson, Data, DataOrNone, Name, Seed, Settings, case_of, graph_of
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -58,12 +58,12 @@ def show(
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file."""
-    case, _ = example_of(graph, settings, seed) if data is None else case_of(graph, data, settings, seed)
+    built, _ = graph_of(graph, data, settings, seed)
     if output is None:
-        print(case.graph.text())
+        print(built.text())
         return
     with writing(output), without_font_warnings():
-        case.graph.draw(str(output))
+        built.draw(str(output))
 
 
 @app.command()

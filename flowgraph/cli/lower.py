@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, case_of, example_of
+from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, graph_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.errors import UnknownNameError
 from flowgraph.lowering import lower as lower_graph
@@ -50,8 +50,8 @@ def lower(
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()), passes=COMPILED if target == "c" else DEFAULT)
-    case, _ = example_of(graph, settings, seed) if data is None else case_of(graph, data, settings, seed)
-    pipeline = lower_graph(case.graph, dtype=dtype)
+    built, inputs = graph_of(graph, data, settings, seed)
+    pipeline = lower_graph(built, dtype=dtype)
     pipeline.save(output)
     if target == "c":
         from flowgraph.c import write_c, write_events
@@ -59,7 +59,7 @@ def lower(
         for file in write_c(pipeline, output, dtype, passes=passes).values():
             err_console.print(f"wrote {file}", markup=False)
         if events is not None:
-            ticks = write_events(pipeline, case.inputs, events)
+            ticks = write_events(pipeline, inputs, events)
             err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from flowgraph.errors import DataError, DeclarationError
+from flowgraph.graph import Graph
+from flowgraph.inputs import Inputs
 from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.series import Flight
 
@@ -55,17 +57,34 @@ def case_of(name: str, spec: str, settings: list[str] | None, seed: int) -> tupl
     return graph.case(flight, **mine), flight
 
 
-def example_of(name: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
-    """`case_of` on the first of `EXAMPLES` that has what the graph needs; if none has, the first's error."""
+def graph_of(
+    name: str, data: str | None = None, settings: list[str] | None = None, seed: int = 0
+) -> tuple[Graph, Inputs]:
+    """The graph on a flight, and what it is fed there; without `data`, on the first of `EXAMPLES` that fits.
+
+    If none fits, a graph that needs no settings is built on sources that nothing feeds.
+
+    Raises:
+        DataError: the first flight's, where a graph neither fits a flight nor builds without one.
+    """
+    if data is not None:
+        case, _ = case_of(name, data, settings, seed)
+        return case.graph, case.inputs
     first: DataError | None = None
     for spec, more in EXAMPLES:
         chosen = {**more, **pairs(settings)}
         try:
-            return case_of(name, spec, [f"{key}={value}" for key, value in chosen.items()], seed)
+            case, _ = case_of(name, spec, [f"{key}={value}" for key, value in chosen.items()], seed)
+            return case.graph, case.inputs
         except DataError as error:
             first = first or error
     assert first is not None
-    raise first
+    if settings:
+        raise first
+    try:
+        return find_graph(name).build(), {}
+    except DeclarationError:
+        raise first from None
 
 
 def _pair(text: str) -> tuple[str, str]:
