@@ -28,7 +28,7 @@ test: $(VENV)/.with-test
 	$(PYTEST) $(WORKERS) $(ARGS)
 
 test-slow: $(VENV)/.with-test
-	$(PYTEST) $(WORKERS) -m slow $(ARGS)
+	$(PYTEST) $(WORKERS) -m slow --durations=20 $(ARGS)
 
 lint: $(VENV)/.with-test
 	$(BIN)/ruff check $(SOURCES)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Case, DataError, DeclarationError, Flight, Series, simulate
+from flowgraph import DataError, DeclarationError, Flight, Series, simulate
 from flowgraph.blocks.flights.worlds import load_world
 from flowgraph.blocks.geometry import geodesic_angle
 from flowgraph.blocks.outdoor import OutdoorSensors, attitude_of_two, outdoor_flight
@@ -24,6 +24,7 @@ from flowgraph.blocks.outdoor_belief import (
 )
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
+from flowgraph.study import Study, read_table, run_study
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
 SENSORS = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
@@ -35,33 +36,45 @@ def flight(seed: int = 0, duration: float = 3.0, world: str = "thesis", **settin
     return load_world(world, seed=seed, settings={"sensors": SENSORS, "duration": duration, **named})
 
 
-def both(seeds: range, particles: int, duration: float, engine: str = "python") -> dict[str, float]:
+def ratios(particles: list[dict[str, float]], reference: list[dict[str, float]]) -> dict[str, float]:
     """How many times the error of the error-state filter ours is, over all flights."""
-    squares = {name: np.zeros(2) for name in ("rbpf", "eskf")}
-    for seed in seeds:
-        cases: dict[str, Case] = {
-            "rbpf": rbpf_outdoor.case(flight(seed, duration), particles=particles, seed=seed),
-            "eskf": outdoor_eskf.case(flight(seed, duration)),
-        }
-        for name, case in cases.items():
-            score = case.score(simulate(case.graph, case.inputs, engine=engine, seed=seed))
-            squares[name] += np.square([score["position_rmse_m"], score["attitude_rmse_deg"]])
-    position, attitude = np.sqrt(squares["rbpf"] / squares["eskf"])
-    return {"position": float(position), "attitude": float(attitude)}
+    root = {
+        name: [np.sqrt(np.mean([score[name] ** 2 for score in scores])) for scores in (particles, reference)]
+        for name in ("position_rmse_m", "attitude_rmse_deg")
+    }
+    return {name: ours / theirs for name, (ours, theirs) in root.items()}
 
 
 def test_particles_follow_the_error_state_filter():
-    ratio = both(range(2), particles=300, duration=4.0)
-    assert ratio["position"] < 1.25
-    assert ratio["attitude"] < 1.25
+    flown = [flight(seed, 4.0) for seed in range(2)]
+    ours = [rbpf_outdoor.case(f, particles=300, seed=k) for k, f in enumerate(flown)]
+    theirs = [outdoor_eskf.case(f) for f in flown]
+    scores = [
+        [case.score(simulate(case.graph, case.inputs, seed=k)) for k, case in enumerate(cases)]
+        for cases in (ours, theirs)
+    ]
+    for ratio in ratios(*scores).values():
+        assert ratio < 1.25
 
 
 @pytest.mark.slow
-def test_on_twenty_flights_particles_are_nearly_as_good_as_the_error_state_filter():
+def test_on_twenty_flights_particles_are_nearly_as_good_as_the_error_state_filter(tmp_path):
     """With every sensor as noisy as the simulated flights have it when left out."""
-    ratio = both(range(20), particles=1000, duration=10.0, engine="c")
-    assert ratio["position"] < 1.15
-    assert ratio["attitude"] < 1.15
+    pytest.importorskip("pyarrow")
+    study = Study(
+        graphs=["rbpf_outdoor", "outdoor_eskf"],
+        data=["sim:thesis"],
+        seeds=20,
+        parameters={"sensors": SENSORS, "duration": 5.0},
+        engine="c",
+        chunk=20,
+    )
+    assert run_study(study, tmp_path).done == 40
+    rows: dict[str, list[Any]] = {name: [] for name in study.graphs}
+    for row in read_table(tmp_path):
+        rows[row["graph"]].append(row)
+    for ratio in ratios(*rows.values()).values():
+        assert ratio < 1.15
 
 
 def test_the_error_state_filter_knows_how_wrong_it_is():
