@@ -179,6 +179,7 @@ class _File:
             if i.out in sites:
                 values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
             else:
+                expander.tell(program.elements, i)
                 expander.play(i)
         roots: list[Any] = []
         flags: list[tuple[int, Node]] = []

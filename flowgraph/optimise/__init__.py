@@ -23,6 +23,7 @@ from flowgraph.optimise.algebra import simplify
 from flowgraph.optimise.loops import gather
 from flowgraph.optimise.memory import Plan, plan
 from flowgraph.optimise.simple import drop, fold, share
+from flowgraph.optimise.sparse import tell_zeros
 from flowgraph.optimise.structure import split_products
 from flowgraph.optimise.symmetry import halve_products
 from flowgraph.optimise.unroll import LARGEST_WORK, unroll
@@ -51,6 +52,7 @@ PASSES = {
     "algebra": "leave out what has no effect: x + 0, 1 x, 0 x, moves to and fro",
     "symmetry": "compute one half of A P A^T",
     "structure": "split products along zero and identity blocks",
+    "sparse": "tell which elements of larger factors are zero",
     "unroll": "take small arrays apart into scalars",
     "reuse": "let arrays share memory whose times do not overlap",
     "layout": "lay the axis of particles out innermost",
@@ -96,6 +98,7 @@ def optimise(
         ("share", share, {}),
         ("drop", drop, {}),
         ("loops", gather, {}),
+        ("sparse", tell_zeros, {}),
     ]
     for name, step, settings in steps:
         if name in chosen:
