@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph.c.nodes import Node, View
-from flowgraph.c.shapes import ELEMENTWISE, JOINS, Shapes, host_kind, within, without_zeros
+from flowgraph.c.shapes import JOINS, Shapes, host_kind, within, without_zeros
 from flowgraph.c.values import Value, lanes, space_of, unrolled
 from flowgraph.errors import LoweringError
-from flowgraph.ops import OPS, Spec, broadcast
+from flowgraph.ops import ELEMENTWISE, OPS, Spec, broadcast
 from flowgraph.symbolic import Instruction
 
 MOST_PRODUCTS = 600
@@ -34,10 +34,10 @@ class Expander(Shapes):
         """
         self.tape.origin = i.line
         args = [self.known[a] for a in i.args]
-        if i.op in ELEMENTWISE:
+        rule = _RULES.get(i.op)
+        if rule is None and i.op in ELEMENTWISE:
             self.known[i.out] = self.elementwise(i.op, i.spec, args)
             return
-        rule = _RULES.get(i.op)
         if rule is None:
             raise LoweringError(
                 f"the C backend has no operation {i.op}",
@@ -185,7 +185,8 @@ class Expander(Shapes):
         if isinstance(name, float):
             return self.tape.const(name, x.spec.dtype)
         if name is not None:
-            return self.form.elements(self.known[name]).item()
+            node: Node = self.form.elements(self.known[name]).item()
+            return node
         view = self.form.stored(x)
         offset = view.offset + sum(k * s for k, s in zip(place, view.strides, strict=True))
         return self.tape.load(view.buffer, offset, (), ())

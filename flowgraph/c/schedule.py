@@ -27,7 +27,7 @@ class Schedule:
     Args:
         items: all that is needed, in order; those of a group have its level and space.
         uses: how often a node is named.
-        spills: the memory that keeps a node of one loop for later ones: its own, or where it is stored anyway.
+        spills: the memory that keeps a node of one loop for later ones; where it is stored anyway, that.
         late: state buffers that cannot be written in place, with the work buffer that stands in.
         span: first and last level at which a work buffer is in use.
     """
@@ -177,16 +177,23 @@ def _spans(made: Schedule, users: dict[Node, list[Group]]) -> None:
 
 
 def is_flat(items: Iterable[Node | Store], space: Space) -> bool:
-    """Whether all that a nest of loops reads and writes lies in the loops' order, so that one loop will do."""
+    """Whether all that a nest of loops reads and writes lies in their order, so that one loop will do."""
     for item in items:
         for part in (item, *arguments(item)):
             if isinstance(part, Node) and part.op in ("iota", "gather", "search"):
                 return False
-            strides = part.strides if isinstance(part, Store) else part.extra[2] if part.op == "load" else ()
+            strides = _strides(part)
             steps = zip(strides, strides[1:], space[1:], strict=False)
             if any(wide != step * n for wide, step, n in steps):
                 return False
     return True
+
+
+def _strides(part: Node | Store) -> tuple[int, ...]:
+    """Its steps through memory in the loops around it."""
+    if isinstance(part, Store):
+        return part.strides
+    return part.extra[2] if part.op == "load" else ()
 
 
 def strides_of(space: Space) -> tuple[int, ...]:
