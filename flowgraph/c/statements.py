@@ -11,6 +11,7 @@ from flowgraph.c.macros import write_macro
 from flowgraph.c.nodes import Buffer, Macro, Node, Space, Store
 from flowgraph.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
 from flowgraph.c.syntax import comment, ctype, number
+from flowgraph.ops import FUNCTIONS
 
 _SHORT = 50  # characters of an expression that is written where it is used
 
@@ -91,6 +92,7 @@ class Writer:
             and node not in self.kept
             and node not in self.plan.spills
             and not self._reads_memory(node)
+            and (node.space or node.op not in FUNCTIONS)  # once, not in each turn of a loop
         )
         if inline:
             names[node] = text if node.op in ("load", "given") or _closed(text) else f"({text})"
