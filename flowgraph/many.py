@@ -19,7 +19,7 @@ from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.graph import Graph
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
-from flowgraph.optimise import for_engine, without
+from flowgraph.optimise import RELYING, for_engine, without
 from flowgraph.pipeline import Pipeline, Port
 from flowgraph.playback import check_faults, dense, real_leaves
 from flowgraph.random import seed_words
@@ -269,7 +269,7 @@ def _vectorised(
     ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
     chosen = for_engine("xla", passes)
     if init is not None:
-        chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
+        chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
     which = (keys, real.name, ticks, runs_at_once, shared, repr(kept), tuple(chosen))
     compiled: dict[Any, Scan] = whole.__dict__.setdefault("_batched", {})  # they live as long as it does
     if which not in compiled:

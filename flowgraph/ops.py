@@ -36,12 +36,14 @@ class Op:
         rule: `(specs of the arguments, attributes) -> Spec` of the result; raises `ShapeError`.
         run: `(namespace, *arrays, **attributes) -> array`.
         operands: kind to which the arguments are brought first: "same", "real", "bool", "int" or "as is".
+        local: whether the result at a place depends on the arguments at that place only.
     """
 
     name: str
     rule: Callable[..., Spec]
     run: Callable[..., Any]
     operands: str = "as is"
+    local: bool = False
 
     @property
     def count(self) -> int | None:
@@ -52,8 +54,13 @@ class Op:
         return None if self.name in ("concat", "stack") else 1 if self.name in _UNARY.split() else 2
 
 
-_UNARY = """abs negative sign square positive sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh
-cosh tanh floor ceil round trunc logical_not isfinite isnan bitwise_invert"""
+_OF_ONE = "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh"
+_OF_TWO = "atan2 hypot copysign"
+FUNCTIONS = frozenset(f"{_OF_ONE} {_OF_TWO}".split())
+"""Functions of real numbers; C has them under the same names."""
+
+_UNARY = f"""abs negative sign square positive {_OF_ONE} floor ceil round trunc logical_not isfinite isnan
+bitwise_invert"""
 """Those among the operations element by element that take one argument; the others take two."""
 
 
@@ -312,23 +319,26 @@ def _table() -> dict[str, Op]:
         for name in names.split():
             ops[name] = Op(name, rule, run(name), operands)
 
-    add("add multiply maximum minimum abs", _elementwise(None), "same")
-    add("subtract remainder floor_divide pow negative sign square positive", _numeric, "same")
-    add("divide atan2 hypot copysign", _elementwise("real"), "real")
-    add(
-        "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh",
-        _elementwise("real"),
-        "real",
-    )
-    add("floor ceil round trunc", _numeric, "same")
-    add("equal not_equal less less_equal greater greater_equal", _elementwise("bool"), "same")
-    add("logical_and logical_or logical_xor logical_not", _elementwise("bool"), "bool")
-    add("isfinite isnan", _elementwise("bool"), "real")
-    add(
+    def each(names: str, rule: Callable[..., Spec], operands: str) -> None:
+        for name in names.split():
+            ops[name] = Op(name, rule, _namespace(name), operands, local=True)
+
+    each("add multiply maximum minimum abs", _elementwise(None), "same")
+    each("subtract remainder floor_divide pow negative sign square positive", _numeric, "same")
+    each(f"divide {_OF_TWO} {_OF_ONE}", _elementwise("real"), "real")
+    each("floor ceil round trunc", _numeric, "same")
+    each("equal not_equal less less_equal greater greater_equal", _elementwise("bool"), "same")
+    each("logical_and logical_or logical_xor logical_not", _elementwise("bool"), "bool")
+    each("isfinite isnan", _elementwise("bool"), "real")
+    each(
         "bitwise_and bitwise_or bitwise_xor bitwise_invert bitwise_left_shift bitwise_right_shift",
         _elementwise(None),
         "int",
     )
+    each("where", _where, "as is")
+    each("float32_bits", _float32_bits, "as is")
+    each("materialise", _same, "as is")
+    ops["astype"] = Op("astype", _astype, _run_astype, local=True)
     add("sum prod", _reduction(None, counted=True), "as is", _run_reduce)
     add("max min", _reduction(None), "as is", _run_reduce)
     add("mean", _reduction("real"), "real", _run_reduce)
@@ -354,20 +364,19 @@ def _table() -> dict[str, Op]:
     add("outer", _outer, "same", _linalg)
     add("searchsorted", _int_of, "same", _run_int64)
     add("tril triu", lambda x, *, k=0: x, "as is")
-    ops["where"] = Op("where", _where, _namespace("where"))
     ops["permute_dims"] = Op("permute_dims", _permute, _run_axes)
     ops["reshape"] = Op("reshape", _reshape, _run_shape("reshape"))
     ops["broadcast_to"] = Op("broadcast_to", _broadcast_to, _run_shape("broadcast_to"))
     ops["getitem"] = Op("getitem", _getitem, _run_getitem)
     ops["take"] = Op("take", _take, lambda xp, x, i, *, axis: xp.take(x, i, axis=axis, mode="clip"))
-    ops["float32_bits"] = Op("float32_bits", _float32_bits, _namespace("float32_bits"))
-    ops["materialise"] = Op("materialise", _same, _namespace("materialise"))
-    ops["astype"] = Op("astype", _astype, _run_astype)
     return ops
 
 
 OPS = _table()
 """All instructions by name."""
+
+ELEMENTWISE = frozenset(name for name, op in OPS.items() if op.local)
+"""Operations whose result at a place depends on the arguments at that place only."""
 
 
 def bound_attrs(op: str, attrs: dict[str, Any], real: Any) -> dict[str, Any]:

@@ -30,6 +30,8 @@ class Program:
         symmetric: of those, the square matrices that are symmetric at reset.
         lanes: sizes of axes along which the same is done many times, such as particles.
         origin: for a value that an optimisation has added, the value of the pipeline that it serves.
+        elements: for factors of products that are mostly zero, what each element is: a float that is known,
+            the number of the scalar value that it equals, or None.
     """
 
     constants: Mapping[int, np.ndarray]
@@ -41,6 +43,7 @@ class Program:
     symmetric: frozenset[int] = frozenset()
     lanes: frozenset[int] = frozenset()
     origin: Mapping[int, int] = field(default_factory=dict)
+    elements: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def work(self) -> int:

@@ -19,7 +19,7 @@ from flowgraph.graph import Graph
 from flowgraph.inputs import Tape, prepare, tape
 from flowgraph.lowering import lower
 from flowgraph.many import Batch, cells_of, is_shared, joined, leaf_type, of_run
-from flowgraph.optimise import for_engine, without
+from flowgraph.optimise import RELYING, for_engine, without
 from flowgraph.pipeline import Port
 from flowgraph.playback import check_faults, real_leaves
 from flowgraph.random import seed_words
@@ -36,7 +36,7 @@ def threaded(
     pipeline, real = lower(graph, dtype=dtype), np.dtype(dtype)
     chosen = for_engine("c", passes)
     if init is not None:
-        chosen = without("symmetry", passes=chosen)  # it relies on the values at reset
+        chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
     shared = tape(prepare(graph, inputs), graph) if is_shared(inputs) else None
     library = None if shared is None else compiled(pipeline, real, shared.patterns, chosen)
     shared_rows = None if library is None or shared is None else library.rows(_reals(shared, real))

@@ -7,16 +7,16 @@ table of all rules. What needs loops of its own becomes a macro.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from flowgraph.c.nodes import View
-from flowgraph.c.shapes import ELEMENTWISE, JOINS, Shapes, host_kind, within, without_zeros
+from flowgraph.c.nodes import Node, View
+from flowgraph.c.shapes import JOINS, Shapes, host_kind, within, without_zeros
 from flowgraph.c.values import Value, lanes, space_of, unrolled
 from flowgraph.errors import LoweringError
-from flowgraph.ops import OPS, Spec, broadcast
+from flowgraph.ops import ELEMENTWISE, OPS, Spec, broadcast
 from flowgraph.symbolic import Instruction
 
 MOST_PRODUCTS = 600
@@ -34,10 +34,10 @@ class Expander(Shapes):
         """
         self.tape.origin = i.line
         args = [self.known[a] for a in i.args]
-        if i.op in ELEMENTWISE:
+        rule = _RULES.get(i.op)
+        if rule is None and i.op in ELEMENTWISE:
             self.known[i.out] = self.elementwise(i.op, i.spec, args)
             return
-        rule = _RULES.get(i.op)
         if rule is None:
             raise LoweringError(
                 f"the C backend has no operation {i.op}",
@@ -47,6 +47,12 @@ class Expander(Shapes):
                 fix='write the step with these, or use engine="xla"',
             )
         self.known[i.out] = rule(self, i.spec, *args, **i.attrs)
+
+    def tell(self, elements: Mapping[int, np.ndarray], i: Instruction) -> None:
+        """Say of an instruction's arguments what is known of their elements."""
+        for a in i.args:
+            if a in elements:
+                self.known[a].told = elements[a]
 
     def like(self, op: str, *args: Value, **attrs: Any) -> Value:
         """An operation of the pipeline's own list, with the shape that its rule gives."""
@@ -109,36 +115,52 @@ class Expander(Shapes):
     def _sparse(self, spec: Spec, a: Value, b: Value) -> Value | None:
         """A product with a matrix whose places are known and mostly zero: only the others are multiplied.
 
-        Along the other side's free axis there is one loop, in which all that is left of the product is done.
+        A product with few others is unrolled. Else along the other side's free axis there is one loop, in
+        which all that is left of the product is done.
         """
         known, free, right = self._mostly_zero(a), b, False
         if known is None:
             known, free, right = self._mostly_zero(b), a, True
         if known is None:
             return None
-        out, view = self.fresh(spec), self.form.stored(free)
         if right:
             known = known.T
+        terms = [[(k, node) for k, node in enumerate(row) if not _is_zero(node)] for row in known]
+        columns = free.shape[0 if right else 1]
+        few = sum(len(row) for row in terms) * columns <= MOST_PRODUCTS
+        if few and not any(lanes(spec.shape)) and not any(lanes(free.shape)):
+            elements = self.form.elements(free)
+            made = np.empty(spec.shape, object)
+            for i, row in enumerate(terms):
+                for j in range(columns):
+                    loaded = [(n, elements[(j, k) if right else (k, j)]) for k, n in row]
+                    made[(j, i) if right else (i, j)] = self._total(spec.dtype, loaded)
+            return Value(spec, made)
+        out, view = self.fresh(spec), self.form.stored(free)
+        if right:
             view = View(view.buffer, view.shape[::-1], view.offset, view.strides[::-1])
         step, along = (out.strides[1], out.strides[0]) if right else out.strides
         space = (view.shape[1],)
-        for i, row in enumerate(known):
-            terms = [
-                self.tape.op(
-                    "multiply",
-                    spec.dtype,
-                    node,
-                    self.form.load(view.buffer, view.offset + k * view.strides[0], (view.strides[1],), space),
-                )
-                for k, node in enumerate(row)
-                if not (node.op == "const" and node.extra[0] == 0)
+        for i, row in enumerate(terms):
+            loaded = [
+                (n, self.form.load(view.buffer, view.offset + k * view.strides[0], (view.strides[1],), space))
+                for k, n in row
             ]
-            total = self.balanced("add", spec.dtype, terms or [self.tape.const(0, spec.dtype)])
-            self.tape.store(out.buffer, i * step, (along,), total, space)
+            self.tape.store(out.buffer, i * step, (along,), self._total(spec.dtype, loaded), space)
         return self.from_view(spec, out)
 
+    def _total(self, dtype: str, pairs: list[tuple[Node, Node]]) -> Node:
+        """The sum of products of these pairs."""
+        terms = [self.tape.op("multiply", dtype, p, q) for p, q in pairs]
+        return self.balanced("add", dtype, terms or [self.tape.const(0, dtype)])
+
     def _mostly_zero(self, x: Value) -> Any:
-        """The elements of a matrix in memory, if all are known and three in five or more are zero."""
+        """The elements of a matrix, if all are known and half or more of them are zero."""
+        if x.told is not None:
+            made = np.empty(x.shape, object)
+            for place in np.ndindex(x.shape):
+                made[place] = self._told(x, place)
+            return made
         view = self.form.stored(x)
         places = [
             view.offset + i * view.strides[0] + j * view.strides[1]
@@ -151,12 +173,23 @@ class Expander(Shapes):
         elif view.buffer.kind != "const":
             return None
         found = [self.tape.load(view.buffer, p, (), ()) for p in places]
-        zeros = sum(n.op == "const" and n.extra[0] == 0 for n in found)
-        if 5 * zeros < 3 * len(found):
+        if 2 * sum(_is_zero(n) for n in found) < len(found):
             return None
         made = np.empty(x.shape, object)
         made.ravel()[:] = found
         return made
+
+    def _told(self, x: Value, place: tuple[int, ...]) -> Node:
+        """An element as the optimiser names it: a number, a scalar that is there, or what lies in memory."""
+        name = x.told[place]
+        if isinstance(name, float):
+            return self.tape.const(name, x.spec.dtype)
+        if name is not None:
+            node: Node = self.form.elements(self.known[name]).item()
+            return node
+        view = self.form.stored(x)
+        offset = view.offset + sum(k * s for k, s in zip(place, view.strides, strict=True))
+        return self.tape.load(view.buffer, offset, (), ())
 
     def _lanes_fit(self, shape: tuple[int, ...], a: Value, b: Value) -> bool:
         """Whether the lanes of both sides are those of the product, at the same axes."""
@@ -240,6 +273,10 @@ class Expander(Shapes):
 
 
 UNROLLED_SUMS = 64
+
+
+def _is_zero(node: Node) -> bool:
+    return node.op == "const" and node.extra[0] == 0
 
 
 def _method(name: str) -> Callable[..., Value]:

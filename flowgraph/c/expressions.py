@@ -8,6 +8,7 @@ from typing import Any
 from flowgraph.c.nodes import Node
 from flowgraph.c.syntax import ctype, number
 from flowgraph.errors import LoweringError
+from flowgraph.ops import FUNCTIONS
 
 _INFIX = {
     "equal": "==",
@@ -23,31 +24,9 @@ _INFIX = {
     "bitwise_or": "|",
     "bitwise_xor": "^",
 }
-_LIBM = [
-    "sqrt",
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "log2",
-    "sin",
-    "cos",
-    "tan",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "floor",
-    "ceil",
-    "trunc",
-    "atan2",
-    "hypot",
-    "copysign",
-]
+_LIBM = FUNCTIONS | {"floor", "ceil", "trunc"}
 _IN_LANES = ("exp", "log", "sin", "cos", "atan2")
-"""Functions that have a form without branches, which vectorises (double only)."""
+"""Functions that have a form without branches, which vectorises: see `vector_math`."""
 _ARITHMETIC = {"add": "+", "subtract": "-", "multiply": "*"}
 
 
@@ -113,7 +92,7 @@ class Expressions:
                 return args[0]
             return f"{args[0]} < 0 ? {self._arithmetic('subtract', dtype, ('0', args[0]))} : {args[0]}"
         if op in _LIBM and dtype == "real":
-            if node.space and op in _IN_LANES and self.real == "double":
+            if node.space and op in _IN_LANES:
                 return f"{self.helper('fg_' + op)}({', '.join(args)})"
             return f"{self.libm(op)}({', '.join(args)})"
         if op in ("floor", "ceil", "trunc", "round"):
@@ -150,7 +129,7 @@ class Expressions:
         if dtype == "bool":
             return f"{arg} != 0"
         if kind == "real" and dtype != "real":
-            whole = f"{self.helper('fg_whole')}((double){arg})"
+            whole = f"{self.helper('fg_whole')}({arg})"
             return f"({ctype(dtype, self.real)}){whole}"
         return f"({ctype(dtype, self.real)}){arg}"
 

@@ -10,7 +10,7 @@ from flowgraph.c.syntax import comment, ctype
 from flowgraph.pipeline import Cell, Leaf, Pipeline
 
 if TYPE_CHECKING:
-    from flowgraph.c.source import Names
+    from flowgraph.c.names import Names
 
 
 def header(

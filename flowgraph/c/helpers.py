@@ -1,42 +1,16 @@
 """Functions that generated C calls, each written out only where it is needed.
 
-`exp`, `log`, `sin`, `cos` and `atan2` are here a second time, without branches and library calls, for
-loops: a compiler turns them into vector instructions. They are Taylor series after a reduction of the
-argument, good to about two units in the last place. Sine and cosine are for arguments up to 1.6e6, and NaN
-beyond: in straight code they are those of math.h.
+Those that a loop calls in place of math.h are in `vector_math`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
-from fractions import Fraction
 from typing import Any
 
+from flowgraph.c.syntax import number
+from flowgraph.c.vector_math import vector_texts
 from flowgraph.random import ROUNDS, segments
-
-_PI = Fraction(31415926535897932384626433832795028841971693993751, 10**49)
-_LN2 = Fraction(69314718055994530941723212145817656807550013436025, 10**50)
-
-
-def _parts(value: Fraction, bits: tuple[int, ...]) -> list[str]:
-    """A number as a sum of doubles with few bits each, so that products with small integers are exact."""
-    found = []
-    for b in bits:
-        exponent = math.floor(math.log2(abs(float(value)))) if value else 0
-        scale = Fraction(2) ** (b - 1 - exponent)
-        part = Fraction(round(value * scale)) / scale
-        found.append(repr(float(part)))
-        value -= part
-    return found
-
-
-def _series(terms: list[Fraction], variable: str) -> str:
-    """A polynomial in Horner's form."""
-    text = repr(float(terms[-1]))
-    for term in reversed(terms[:-1]):
-        text = f"({text}) * {variable} + {float(term)!r}"
-    return text.replace("+ -", "- ")
 
 
 def _array(values: Any) -> str:
@@ -47,117 +21,17 @@ def _array(values: Any) -> str:
 
 def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
     """Helper -> (what it needs, text)."""
-    half_pi = _parts(_PI / 2, (33, 33, 53))
-    ln2 = _parts(_LN2, (32, 53))
-    factorial = [Fraction(1, math.factorial(k)) for k in range(20)]
-    exp = _series(factorial[:14], "r")
-    sine = _series([(-1) ** k * factorial[2 * k + 1] for k in range(9)], "z")
-    cosine = _series([(-1) ** k * factorial[2 * k] for k in range(9)], "z")
-    artanh = _series([Fraction(1, 2 * k + 3) for k in range(11)], "z")
-    arctan = _series([Fraction((-1) ** k, 2 * k + 1) for k in range(21)], "z")
     start, slope = segments()
     f = "" if real == "double" else "f"
+    least, unit, step = (number(x, "real", real) for x in (-(2.0**63), 2.0**-22, 2.0**-24))
     found: dict[str, tuple[tuple[str, ...], str]] = {
-        "fg_bits": (
-            (),
-            """static inline uint64_t fg_bits(double x) {
-    union { double number; uint64_t bits; } both;
-    both.number = x;
-    return both.bits;
-}
-static inline double fg_from_bits(uint64_t x) {
-    union { uint64_t bits; double number; } both;
-    both.bits = x;
-    return both.number;
-}
-""",
-        ),
-        "fg_exp": (
-            ("fg_bits",),
-            f"""/* exp(x): x = k log 2 + r, and the series of exp(r) */
-static FG_INLINE double fg_exp(double x) {{
-    const double c = x < -708.0 ? -708.0 : (x > 709.79 ? 709.79 : x);
-    const double t = c * {1 / math.log(2)!r} + 6755399441055744.0;
-    const double k = t - 6755399441055744.0;
-    const double r = (c - k * {ln2[0]}) - k * {ln2[1]};
-    const double p = {exp};
-    const double y = p * fg_from_bits((fg_bits(t) + UINT64_C(1022)) << 52) * 2.0;
-    return x < -708.0 ? 0.0 : y;
-}}
-""",
-        ),
-        "fg_log": (
-            ("fg_bits",),
-            f"""/* log(x): x = 2^k m with m near 1, and log(m) = 2 artanh((m - 1) / (m + 1)) */
-static FG_INLINE double fg_log(double x) {{
-    const bool small = x < 2.2250738585072014e-308;
-    const uint64_t u = fg_bits(small ? x * 18014398509481984.0 : x);
-    const uint64_t m = (u & UINT64_C(0xFFFFFFFFFFFFF)) | UINT64_C(0x3FF0000000000000);
-    const double e = fg_from_bits((u >> 52) | UINT64_C(0x4330000000000000)) - 4503599627370496.0;
-    const double a = fg_from_bits(m);
-    const bool high = a > 1.4142135623730951;
-    const double b = high ? 0.5 * a : a;
-    const double k = e - 1023.0 + (high ? 1.0 : 0.0) - (small ? 54.0 : 0.0);
-    const double s = (b - 1.0) / (b + 1.0);
-    const double z = s * s;
-    const double y = k * {ln2[0]} + (2.0 * s + (2.0 * s * z * ({artanh}) + k * {ln2[1]}));
-    return x > 0.0 ? (x < INFINITY ? y : x) : (x == 0.0 ? -INFINITY : NAN);
-}}
-""",
-        ),
-        "fg_sincos": (
-            ("fg_bits",),
-            f"""/* sine and cosine on the quarter turn nearest to x; NaN where that cannot be told exactly */
-static FG_INLINE double fg_sine(double r) {{
-    const double z = r * r;
-    return r * ({sine});
-}}
-static FG_INLINE double fg_cosine(double r) {{
-    const double z = r * r;
-    return {cosine};
-}}
-static FG_INLINE double fg_quarter(double x, uint64_t more) {{
-    const double t = x * {2 / math.pi!r} + 6755399441055744.0;
-    const double k = t - 6755399441055744.0;
-    const double r = ((x - k * {half_pi[0]}) - k * {half_pi[1]}) - k * {half_pi[2]};
-    const uint64_t q = fg_bits(t) + more;
-    const double y = (q & 1u) ? fg_cosine(r) : fg_sine(r);
-    return fabs(x) <= 1.6e6 ? ((q & 2u) ? -y : y) : NAN;
-}}
-""",
-        ),
-        "fg_sin": (
-            ("fg_sincos",),
-            "static FG_INLINE double fg_sin(double x) { return fg_quarter(x, 0u); }\n",
-        ),
-        "fg_cos": (
-            ("fg_sincos",),
-            "static FG_INLINE double fg_cos(double x) { return fg_quarter(x, 1u); }\n",
-        ),
-        "fg_atan2": (
-            (),
-            f"""/* atan2: the ratio in [0, 1], about 0 or about 45 degrees, and the series of arctan */
-static FG_INLINE double fg_atan2(double y, double x) {{
-    const double p = fabs(x), q = fabs(y);
-    const double low = p < q ? p : q, high = p < q ? q : p;
-    const bool both = !(high < INFINITY) && low == high;
-    const double a = both ? 1.0 : low / (high > 0.0 ? high : 1.0);
-    const bool upper = a > {math.tan(math.pi / 8)!r};
-    const double b = upper ? (a - 1.0) / (a + 1.0) : a;
-    const double z = b * b;
-    const double c = b * ({arctan}) + (upper ? {math.pi / 4!r} : 0.0);
-    const double d = p < q ? {math.pi / 2!r} - c : c;
-    const double e = copysign(1.0, x) < 0.0 ? {math.pi!r} - d : d;
-    return x != x || y != y ? NAN : copysign(e, y);
-}}
-""",
-        ),
+        **vector_texts(real),
         "fg_whole": (
             (),
-            """/* a whole number from a real one, without undefined behaviour outside the range */
-static inline int64_t fg_whole(double x) {
-    return (x >= -9223372036854775808.0 && x < 9223372036854775808.0) ? (int64_t)x : INT64_MIN;
-}
+            f"""/* a whole number from a real one, without undefined behaviour outside the range */
+static inline int64_t fg_whole({real} x) {{
+    return (x >= {least} && x < -{least}) ? (int64_t)x : INT64_MIN;
+}}
 """,
         ),
         "fg_clip": (
@@ -312,14 +186,14 @@ static FG_INLINE void fg_philox(uint32_t even[2], uint32_t odd[2], uint32_t key0
     const int32_t place = (form & 0x1FFFF) >> 3;
     const int32_t fall = (fg_normal_fall[segment] * place + 8192) >> 14;
     const int32_t size = fg_normal_start[segment] - fall;
-    return ({real})((bits & 1u) ? -size : size) * ({real})2.384185791015625e-07;
+    return ({real})((bits & 1u) ? -size : size) * {unit};
 }}
 """,
         ),
         "fg_one_uniform": (
             (),
             f"""static FG_INLINE {real} fg_one_uniform(uint32_t bits) {{
-    return ({real})(int32_t)(bits >> 8) * ({real})5.9604644775390625e-08;
+    return ({real})(int32_t)(bits >> 8) * {step};
 }}
 """,
         ),

@@ -27,7 +27,7 @@ class Schedule:
     Args:
         items: all that is needed, in order; those of a group have its level and space.
         uses: how often a node is named.
-        spills: the memory that keeps a node of one loop for later ones.
+        spills: the memory that keeps a node of one loop for later ones; where it is stored anyway, that.
         late: state buffers that cannot be written in place, with the work buffer that stands in.
         span: first and last level at which a work buffer is in use.
     """
@@ -73,12 +73,19 @@ def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
         for node in arguments(item):
             made.uses[node] += 1
             users[node].append(group_of(item))
+    kept = {i.node: i.buffer for i in made.items if isinstance(i, Store) and _is_whole(i)}
     for node, groups in users.items():
         if node.space and node.op not in REPEATED and any(g[0] > node.level for g in groups):
-            made.spills[node] = Buffer("", node.dtype, _size(node.space), "work")
+            made.spills[node] = kept.get(node) or Buffer("", node.dtype, _size(node.space), "work")
     _write_state(made, users)
     _spans(made, users)
     return made
+
+
+def _is_whole(store: Store) -> bool:
+    """Whether it keeps its node as a spill would: all of it, in C's order."""
+    plain = store.buffer.kind == "work" and not store.offset and store.space == store.node.space != ()
+    return plain and store.strides == row_major(store.space)
 
 
 def _size(space: Space) -> int:
@@ -167,6 +174,26 @@ def _spans(made: Schedule, users: dict[Node, list[Group]]) -> None:
                     extend(buffer, *(g[0] for g in users[item]))
     for node, buffer in made.spills.items():
         extend(buffer, node.level, *(g[0] for g in users[node]))
+
+
+def is_flat(items: Iterable[Node | Store], space: Space) -> bool:
+    """Whether all that a nest of loops reads and writes lies in their order, so that one loop will do."""
+    for item in items:
+        for part in (item, *arguments(item)):
+            if isinstance(part, Node) and part.op in ("iota", "gather", "search"):
+                return False
+            strides = _strides(part)
+            steps = zip(strides, strides[1:], space[1:], strict=False)
+            if any(wide != step * n for wide, step, n in steps):
+                return False
+    return True
+
+
+def _strides(part: Node | Store) -> tuple[int, ...]:
+    """Its steps through memory in the loops around it."""
+    if isinstance(part, Store):
+        return part.strides
+    return part.extra[2] if part.op == "load" else ()
 
 
 def strides_of(space: Space) -> tuple[int, ...]:

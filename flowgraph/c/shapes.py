@@ -16,66 +16,6 @@ from flowgraph.c.nodes import Node, Tape, View
 from flowgraph.c.values import Value, Values, lanes, row_major, space_of, unrolled
 from flowgraph.ops import Spec
 
-ELEMENTWISE = [
-    "add",
-    "subtract",
-    "multiply",
-    "divide",
-    "maximum",
-    "minimum",
-    "abs",
-    "remainder",
-    "floor_divide",
-    "pow",
-    "negative",
-    "sign",
-    "positive",
-    "atan2",
-    "hypot",
-    "copysign",
-    "sqrt",
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "log2",
-    "sin",
-    "cos",
-    "tan",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "floor",
-    "ceil",
-    "round",
-    "trunc",
-    "equal",
-    "not_equal",
-    "less",
-    "less_equal",
-    "greater",
-    "greater_equal",
-    "logical_and",
-    "logical_or",
-    "logical_xor",
-    "logical_not",
-    "isfinite",
-    "isnan",
-    "bitwise_and",
-    "bitwise_or",
-    "bitwise_xor",
-    "bitwise_invert",
-    "bitwise_left_shift",
-    "bitwise_right_shift",
-    "where",
-    "float32_bits",
-    "astype",
-    "square",
-]
-
 
 class Shapes:
     """Rules for what works element by element, and for what selects, moves and joins.
@@ -153,6 +93,8 @@ class Shapes:
 
     def reshape(self, spec: Spec, x: Value, *, shape: Any = None) -> Value:
         old, new = x.shape, spec.shape
+        if old == new:
+            return x
         if _same_lanes(old, new):
             return Value(spec, self.form.elements(x).reshape(unrolled(new)))
         return self.from_view(spec, self.form.packed(x)._replace(shape=new, strides=row_major(new)))

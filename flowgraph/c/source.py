@@ -16,10 +16,11 @@ import numpy as np
 from flowgraph.c.expand import Expander
 from flowgraph.c.expressions import Expressions
 from flowgraph.c.helpers import helper_text
+from flowgraph.c.names import Names, names_of
 from flowgraph.c.nodes import Buffer, Node, Store, Tape, View
 from flowgraph.c.schedule import schedule
 from flowgraph.c.statements import Writer
-from flowgraph.c.syntax import comment, ctype, identifier, number, unique
+from flowgraph.c.syntax import comment, ctype, number
 from flowgraph.c.values import Value, row_major
 from flowgraph.errors import LoweringError
 from flowgraph.ops import Spec
@@ -29,32 +30,6 @@ from flowgraph.program import Program, specialise
 MOST_PATTERNS = 8
 _LOCAL_BYTES = 512
 _BYTES = {"bool": 1, "int32": 4, "uint32": 4, "int64": 8, "uint64": 8}
-_RESERVED = (
-    "s",
-    "time",
-    "present",
-    "made",
-    "seed",
-    "work",
-    "registers",
-    "order",
-    "item",
-    "hole",
-    "top",
-    "end",
-)
-
-
-@dataclass(frozen=True)
-class Names:
-    """What the parts of a pipeline are called in C."""
-
-    module: str
-    inputs: tuple[str, ...]
-    input_leaves: tuple[tuple[str, ...], ...]
-    outputs: tuple[str, ...]
-    output_leaves: tuple[tuple[str, ...], ...]
-    registers: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -73,26 +48,6 @@ class Source:
     header: str
     source: str
     patterns: tuple[int, ...] | None
-
-
-def names_of(pipeline: Pipeline) -> Names:
-    """Identifiers for everything in a pipeline, each once in its scope."""
-    ports = unique([p.name for p in (*pipeline.inputs, *pipeline.outputs)], _RESERVED)
-    split = len(pipeline.inputs)
-    cells = unique(_cell_name(r.path, c.name) for r in pipeline.registers for c in r.cells)
-    places = iter(cells)
-    return Names(
-        identifier(pipeline.name),
-        tuple(ports[:split]),
-        tuple(tuple(unique(leaf.name for leaf in p.leaves)) for p in pipeline.inputs),
-        tuple(ports[split:]),
-        tuple(tuple(unique(leaf.name for leaf in p.leaves)) for p in pipeline.outputs),
-        tuple(tuple(next(places) for _ in r.cells) for r in pipeline.registers),
-    )
-
-
-def _cell_name(path: str, cell: str) -> str:
-    return path if cell == "value" else f"{path}_{cell}"
 
 
 def generate(
@@ -179,6 +134,7 @@ class _File:
             if i.out in sites:
                 values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
             else:
+                expander.tell(program.elements, i)
                 expander.play(i)
         roots: list[Any] = []
         flags: list[tuple[int, Node]] = []

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 
 from flowgraph.c.expressions import Expressions
 from flowgraph.c.macros import write_macro
 from flowgraph.c.nodes import Buffer, Macro, Node, Space, Store
-from flowgraph.c.schedule import REPEATED, Schedule, group_of, strides_of
+from flowgraph.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
 from flowgraph.c.syntax import comment, ctype, number
+from flowgraph.ops import FUNCTIONS
 
 _SHORT = 50  # characters of an expression that is written where it is used
 
@@ -29,7 +31,7 @@ class Writer:
         self.depth = 1
         self.uniform: dict[Node, str] = {}
         self.local: dict[Node, str] = {}
-        self.place = ""
+        self.place, self.flat = "", False
         self.kept = {i.node for i in plan.items if isinstance(i, Store) and i.buffer.kind == "state"}
         self.groups: dict[tuple[int, Space], list[Node | Store]] = defaultdict(list)
         self.straight: dict[int, list[Node | Store | Macro]] = defaultdict(list)
@@ -90,6 +92,7 @@ class Writer:
             and node not in self.kept
             and node not in self.plan.spills
             and not self._reads_memory(node)
+            and (node.space or node.op not in FUNCTIONS)  # once, not in each turn of a loop
         )
         if inline:
             names[node] = text if node.op in ("load", "given") or _closed(text) else f"({text})"
@@ -117,11 +120,13 @@ class Writer:
                 self.line(f"int n{node.order} = 0;")
         clauses = "".join(self._clause(n) for n in reductions)
         gathers = any(isinstance(i, Node) and i.op == "search" for i in items)
-        if len(space) == 1 and clauses:
+        self.flat = len(space) > 1 and is_flat(items, space)
+        sizes = (math.prod(space),) if self.flat else space
+        if len(sizes) == 1 and clauses:
             self.line(f"FG_SIMD(omp simd{clauses})")
-        elif len(space) == 1 and not gathers:
+        elif len(sizes) == 1 and not gathers:
             self.line("FG_SIMD(omp simd)")
-        for k, n in enumerate(space):
+        for k, n in enumerate(sizes):
             self.line(f"for (int32_t i{k} = 0; i{k} < {n}; i{k}++) {{")
             self.depth += 1
         self.local = {}
@@ -138,12 +143,14 @@ class Writer:
             else:
                 self._compute(item, self.local)
         for node in [n for n in items if isinstance(n, Node) and n in self.plan.spills]:
-            self.line(f"{self._spilled(node)} = {self.local[node]};")
+            if not self.plan.spills[node].writers:
+                self.line(f"{self._spilled(node)} = {self.local[node]};")
         for item in late:
             self._store(item)
-        for _ in space:
+        for _ in sizes:
             self.depth -= 1
             self.line("}")
+        self.flat = False
         for node in reductions:
             if node.extra[0] in ("max", "min") and node.dtype == "real":
                 self.line(f"if (n{node.order}) v{node.order} = NAN;")
@@ -211,7 +218,8 @@ class Writer:
     # -- names ---------------------------------------------------------------------------------------
 
     def index(self, offset: int, strides: tuple[int, ...]) -> str:
-        """An index in the loops at hand."""
+        """An index in the loops at hand; where one loop stands for all, its steps are those of the last."""
+        strides = strides[-1:] if self.flat else strides
         terms = [f"i{k}" if s == 1 else f"{s} * i{k}" for k, s in enumerate(strides) if s]
         if offset or not terms:
             terms = [str(offset), *terms] if offset >= 0 or not terms else [*terms, f"({offset})"]

@@ -49,7 +49,17 @@ def row_major(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 class Value:
-    """An array of known shape and kind of number."""
+    """An array of known shape and kind of number.
+
+    Args:
+        spec: its shape and kind.
+        elements: the operations that make it, lanes of size one.
+        view: where it lies in memory.
+
+    `told` is what the optimiser says of each element, as in `Program.elements`.
+    """
+
+    told: Any = None
 
     def __init__(self, spec: Spec, elements: Any = None, view: View | None = None) -> None:
         self.spec, self.view = spec, view

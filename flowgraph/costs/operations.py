@@ -11,8 +11,8 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
-from flowgraph.ops import Spec
-from flowgraph.optimise.elements import ELEMENTWISE, MOVES
+from flowgraph.ops import ELEMENTWISE, Spec
+from flowgraph.optimise.elements import MOVES
 from flowgraph.symbolic import Instruction
 
 KINDS = (

@@ -7,6 +7,7 @@ remembers the one of the pipeline that it serves, so that costs can be told by s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -75,8 +76,12 @@ class Draft:
             self.specs[out] = Spec(array.shape, kind_of(array))
         return self._interned[key]
 
-    def done(self) -> Program:
-        """The program with the new list, its ends renamed; unused constants stay behind."""
+    def done(self, elements: Mapping[int, np.ndarray] | None = None) -> Program:
+        """The program with the new list, its ends renamed; unused constants stay behind.
+
+        Args:
+            elements: of the new list's factors; those of the old list if left out.
+        """
         p = self.program
         outputs = tuple(
             (None if flag is None else self.now(flag), tuple(self.now(x) for x in leaves))
@@ -94,6 +99,7 @@ class Draft:
             p.symmetric,
             p.lanes,
             self.origin,
+            p.elements if elements is None else elements,
         )
 
 

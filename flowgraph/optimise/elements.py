@@ -17,22 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.ops import OPS, Spec
+from flowgraph.ops import ELEMENTWISE, OPS, Spec
 from flowgraph.symbolic import Instruction
 
 Table = np.ndarray
 """Of objects: an entry for each element of an array, without its axis of lanes."""
 
-_ELEMENTWISE = """
-add subtract multiply divide remainder floor_divide pow negative positive abs sign square maximum minimum
-floor ceil round trunc sqrt exp expm1 log log1p log2 sin cos tan asin acos atan atan2 sinh cosh tanh hypot
-copysign equal not_equal less less_equal greater greater_equal isfinite isnan logical_and logical_or
-logical_xor logical_not where bitwise_and bitwise_or bitwise_xor bitwise_invert bitwise_left_shift
-bitwise_right_shift float32_bits astype materialise"""
 _MOVES = "reshape broadcast_to permute_dims matrix_transpose concat stack flip roll getitem tril triu"
-
-ELEMENTWISE = frozenset(_ELEMENTWISE.split())
-"""Operations whose result at a place depends on the arguments at that place only."""
 
 MOVES = frozenset(_MOVES.split())
 """Operations that compute nothing."""
@@ -153,7 +144,7 @@ class Elements:
         rank, axis = len(spec.shape), i.attrs.get("axis")
         axes = range(rank) if axis is None else [axis] if isinstance(axis, int) else axis
         gone = sorted({a % rank for a in axes}) if rank else []
-        if self.laned(spec) and rank - 1 in gone:
+        if (self.laned(spec) and rank - 1 in gone) or self.laned(spec) != self.laned(i.spec):
             return None
         kept = [k for k in range(table.ndim) if k not in gone]
         rows = table.transpose([*kept, *gone]).reshape(-1, math.prod(table.shape[k] for k in gone))
@@ -178,7 +169,7 @@ class Elements:
 
     def _matmul(self, i: Instruction, tables: list[Table]) -> Table | None:
         (a, b), (left, right) = (self.specs[n] for n in i.args), tables
-        if self.laned(a) or (self.laned(b) and len(b.shape) < 2):
+        if self.laned(a) or (self.laned(b) and len(b.shape) < 2) or self.laned(b) != self.laned(i.spec):
             return None
         if a.dtype == "bool":
             return None

@@ -26,13 +26,19 @@ class _Names(Elements):
 
     def __init__(self, program: Program) -> None:
         self._numbers: dict[object, int] = {("constant", 0.0): ZERO, ("constant", 1.0): ONE}
+        self._constants: dict[int, float] = {ZERO: 0.0, ONE: 1.0}
         super().__init__(program.specs, program.lanes, self.name)
 
     def number(self, key: object) -> int:
         return self._numbers.setdefault(key, len(self._numbers))
 
+    def known(self, name: int) -> float | None:
+        return self._constants.get(name)
+
     def constant(self, value: float) -> int:
-        return self.number(("constant", value) if value == value else ("not a number",))
+        name = self.number(("constant", value) if value == value else ("not a number",))
+        self._constants[name] = value
+        return name
 
     def name(self, op: str, *entries: int, **attrs: object) -> int:
         if op == "constant":
@@ -114,6 +120,10 @@ class Facts:
         for at in np.ndindex(table.shape):
             table[at] = self._names.number(("element", value, at))
         return table
+
+    def number(self, name: int) -> float | None:
+        """The number that elements of a name are, where it is known."""
+        return self._names.known(name)
 
     def scalar(self, name: int, draft: Draft) -> int | None:
         """A scalar of that name which a draft has by now, as its number there."""

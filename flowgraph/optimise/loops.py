@@ -10,8 +10,8 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 
+from flowgraph.ops import ELEMENTWISE
 from flowgraph.optimise.draft import Draft, ends
-from flowgraph.optimise.elements import ELEMENTWISE
 from flowgraph.program import Program
 from flowgraph.symbolic import Instruction
 

@@ -72,7 +72,8 @@ def show(rows: list[Row]) -> None:
         table.add_column(heading)
     marks = {True: "[green]met[/]", False: "[bold red]MISSED[/]", None: ""}
     for r in rows:
-        numbers = (f"{r.ours:.3g}", _figure(r.peer, ".3g"), _figure(r.ratio, ".2f"))
+        small = r.ratio is not None and r.ratio < 0.1
+        numbers = (f"{r.ours:.3g}", _figure(r.peer, ".3g"), _figure(r.ratio, ".4f" if small else ".2f"))
         table.add_row(r.name, *numbers, r.unit, r.against, r.bound or "", marks[r.met])
     console = Console(width=None if sys.stdout.isatty() else 150)
     console.print(table)

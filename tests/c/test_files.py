@@ -102,6 +102,29 @@ def test_no_heap_no_library_but_math(tmp_path):
     assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|printf)\b", text)
 
 
+@pytest.mark.parametrize("name", ["rbpf_indoor", "ins_eskf", "ins_particle"])
+def test_single_precision_computes_nothing_in_double(name):
+    """A double among floats makes a compiler convert to and fro, and give a loop up."""
+    data, settings = ("course", ["particles=40"]) if name == "ins_particle" else ("sim", [])
+    made = generate(lower(case_of(name, data, settings, 0)[0].graph), "float32")
+    text = re.sub(r"/\*.*?\*/", "", made.source + made.header, flags=re.DOTALL)
+    assert "float" in text
+    assert not re.search(r"\bdouble\b", text)
+    number = r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+(?=[eE]))(?:[eE][+-]?\d+)?"
+    assert not [n for n in re.findall(number + r"(?![\w.])", text)]
+    functions = "exp log sin cos tan asin acos atan atan2 sqrt fabs floor ceil rint fmod copysign pow hypot"
+    assert not re.findall(rf"\b(?:{functions.replace(' ', '|')})\(", text)
+
+
+def test_loops_over_particles_call_no_function_of_math():
+    """What a loop calls is written out, in both precisions: a call keeps it from being vectorised."""
+    pipeline = lower(case_of("rbpf_indoor", "sim", ["particles=40"], 0)[0].graph)
+    for dtype in ("float64", "float32"):
+        loops = re.findall(r"i0 < 40; i0\+\+\) \{(.*?)\n    \}", generate(pipeline, dtype).source, re.DOTALL)
+        assert any("fg_exp(" in text for text in loops)
+        assert not [text for text in loops if re.search(r"\b(?:exp|log|sin|cos|atan2)f?\(", text)]
+
+
 def test_the_header_says_units_frames_and_shapes(tmp_path):
     files = write_c(lower(case_of("ins_eskf", "sim", None, 0)[0].graph), tmp_path)
     text = files["ins_eskf.h"].read_text()

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowgraph import UnknownNameError
-from flowgraph.optimise import DEFAULT, PASSES, check_passes, optimise, without
+from flowgraph import Stream, UnknownNameError, block, delay, graph, lower, real
+from flowgraph.optimise import DEFAULT, PASSES, RELYING, check_passes, optimise, usable, without
 from flowgraph.optimise.algebra import simplify
 from flowgraph.optimise.loops import gather, loops
 from flowgraph.optimise.simple import drop, share
+from flowgraph.optimise.sparse import mirror_products, tell_zeros
 from flowgraph.optimise.structure import split_products
 from flowgraph.optimise.symmetry import halve_products
 from flowgraph.optimise.unroll import unroll
@@ -209,6 +210,77 @@ def test_without_a_proof_nothing_is_halved(symmetric):
 def test_a_product_of_two_different_matrices_is_not_halved():
     program = record(lambda xp, A, B, P: A @ (P + P.mT) @ B.mT, (4, 4), (4, 4), (4, 4))
     assert halve_products(program).instructions == program.instructions
+
+
+# -- zeros of larger factors ----------------------------------------------------------------------------
+
+
+def carried(xp, dt, P):
+    """A covariance carried on by F = [[I, dt I], [0, I]], kept symmetric, and written back."""
+    F = transition(xp, dt)
+    Q = F @ P @ F.mT
+    return Q, 0.5 * (Q + Q.mT)
+
+
+def test_a_factor_is_told_element_by_element():
+    program = tell_zeros(record(carried, (), (6, 6), memory=(1,)))
+    tables = {n: t.tolist() for n, t in program.elements.items()}
+    left, right = [i for i in program.instructions if i.op == "matmul"]
+    assert set(tables) == {left.args[0], right.args[1]}
+    dt = program.instructions[0].args[1]  # the number of the first argument
+    assert dt == 0
+    first = [1.0, 0.0, 0.0, dt, 0.0, 0.0]
+    assert tables[left.args[0]][0] == first
+    assert [row[0] for row in tables[right.args[1]]] == first
+    assert [type(e) for e in tables[left.args[0]][0]] == [float] * 3 + [int] + [float] * 2
+
+
+def test_what_no_scalar_is_named_after_is_left_open():
+    program = tell_zeros(record(lambda xp, x, P: (np.eye(6) * x) @ P, (6,), (6, 6)))
+    (table,) = program.elements.values()
+    assert [table[k, k] for k in range(6)] == [None] * 6
+    assert table[0, 1] == 0.0
+
+
+def test_a_dense_or_small_factor_is_not_told():
+    dense = record(lambda xp, x, P: x @ P, (6, 6), (6, 6))
+    small = record(lambda xp, dt, P: (np.eye(3) * dt) @ P, (), (3, 3))
+    assert not tell_zeros(dense).elements
+    assert not tell_zeros(small).elements
+
+
+def test_a_symmetric_product_is_mirrored_where_the_factor_has_zeros():
+    program = record(carried, (), (6, 6), memory=(1,), symmetric=(1,))
+    mirrored = drop(mirror_products(program))
+    sides = {i.args[0] for i in tell_zeros(mirrored).instructions if i.op == "matmul"}
+    assert sides <= set(tell_zeros(mirrored).elements)  # the zeros are at the left of both
+    same(program, mirrored, 0.3, covariance(6))
+    skew = numbers(6, 6)  # what the proof excludes is where the two differ
+    assert not np.allclose(play(program, 0.3, skew)[0], play(mirrored, 0.3, skew)[0])
+
+
+def test_without_a_proof_nothing_is_mirrored():
+    program = record(carried, (), (6, 6), memory=(1,))
+    assert mirror_products(program).instructions == program.instructions
+
+
+def test_a_run_that_begins_without_symmetry_goes_without_what_relies_on_it():
+    @block
+    def carry(z: real(6), P: real(6, 6), *, xp):  # type: ignore[valid-type]
+        return 0.5 * (P + P.mT) + xp.eye(6) * z
+
+    @graph
+    def g(z: Stream[real(6)]):  # type: ignore[valid-type]
+        before = delay(np.eye(6), name="P")
+        after = carry(z, before)
+        before.feed(after)
+        return after
+
+    pipeline = lower(g.build())
+    cells = [c.reset for r in pipeline.registers for c in r.cells]
+    assert usable(pipeline, DEFAULT, cells) == DEFAULT
+    odd = [np.triu(np.ones((6, 6))) if np.shape(c) == (6, 6) else c for c in cells]
+    assert usable(pipeline, DEFAULT, odd) == without(*RELYING)
 
 
 # -- unrolling ------------------------------------------------------------------------------------------
