@@ -26,7 +26,7 @@ from flowgraph.random import seed_words
 from flowgraph.run import Meter
 from flowgraph.series import Series
 from flowgraph.state import initial_registers
-from flowgraph.types import ArrayType, StructType, Type, dtype_name, flatten, leaves_of
+from flowgraph.types import ArrayType, StructType, dtype_name, flatten, leaves_of
 
 if TYPE_CHECKING:
     from flowgraph.xla import Chunk
@@ -282,7 +282,7 @@ def _vectorised(
         columns = (
             dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
         )
-        last = cells = cells_of(graph, init, seeds, members)
+        last = cells = _cells_of(graph, init, seeds, members)
         words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
@@ -343,13 +343,16 @@ def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
     )
 
 
-def cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
+def initial_cells(graph: Graph, init: Any) -> list[np.ndarray]:
+    """The register cells that a run starts from."""
+    slots = initial_registers(graph, init)
+    return [np.asarray(leaf) for index, node in graph.registers for leaf in flatten(slots[index], node.type)]
+
+
+def _cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
     """Register cells with a leading axis of runs."""
-    made = {run: initial_registers(graph, of_run(init, run, seeds[run])) for run in set(members)}
-    slots = [made[run] for run in members]
-    types: list[tuple[int, Type]] = [(index, node.type) for index, node in graph.registers]
-    rows = [[leaf for index, type_ in types for leaf in flatten(slot[index], type_)] for slot in slots]
-    return [np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*rows, strict=True)]
+    made = {run: initial_cells(graph, of_run(init, run, seeds[run])) for run in set(members)}
+    return [np.stack(column) for column in zip(*(made[run] for run in members), strict=True)]
 
 
 def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray]]:
