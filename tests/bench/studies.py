@@ -8,7 +8,6 @@ compiled within the time that counts. Of the peer's runs only a sample is done.
 
 from __future__ import annotations
 
-import resource
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -160,30 +159,3 @@ def _pool(sample: int, duration: float) -> float:
     with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
         list(pool.map(scored, range(WORKERS), [min(duration, 1.5)] * WORKERS))
         return sample / seconds(lambda: list(pool.map(scored, range(sample), [duration] * sample)))
-
-
-def memory_of_particles(*, runs: int = 10_000, fewer: int = 500, duration: float = 20.0) -> list[Row]:
-    """Peak memory of many seeds of `rbpf_indoor`, and the cost of a run beside that in a smaller study."""
-    small, _ = _particles(fewer, duration)
-    cost, peak = _particles(runs, duration)
-    name = f"{runs:,} seeds of rbpf_indoor, N = 100"
-    against = f"a study of {fewer:,}"
-    return [
-        Row(f"{name}: memory", peak, None, "MiB", "none: a bound", None, "ours < 2048 MiB", peak < 2048.0),
-        Row(f"{name}: cost of a run", cost, small, "ms", against, cost / small, "ratio <= 1.2",
-            cost <= 1.2 * small),
-    ]  # fmt: skip
-
-
-def _particles(runs: int, duration: float) -> tuple[float, float]:
-    """Milliseconds a run, and the largest peak of any process in MiB."""
-    study = Study(
-        graphs=["rbpf_indoor"], data=["sim"], seeds=runs, engine="c",
-        parameters={"particles": 100, "duration": duration},
-    )  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        start = perf_counter()
-        assert not run_study(study, folder, workers=WORKERS).failed
-        spent = 1e3 * (perf_counter() - start) / runs
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return spent, max(resource.getrusage(k).ru_maxrss for k in kinds) / 1024
