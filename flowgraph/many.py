@@ -44,7 +44,8 @@ class Runs:
         name: of the stream.
         time: (n,) int64 ns, the same in all runs.
         present: (runs, n): whether the stream was present; all true unless its clock depends on data.
-        leaves: by dotted name, (runs, n, ...); zero where absent. Also attributes and items.
+        leaves: by dotted name, (runs, n, ...), in XLA and C of the `dtype` that was asked for; zero where
+            absent. Also attributes and items.
     """
 
     name: str

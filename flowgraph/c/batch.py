@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -100,6 +101,7 @@ class _Output:
         count, certain = library.most(first.key)[port]
         self.time = first.time[library.present(first.key, port)] if certain else None
         self.whole = library.room(port, runs, count, kept=self.leaves) if certain and self.kept else None
+        self.kinds = library.room(port, 0)
         self.apart: dict[int, Series] = {}
 
     def room(self, n: int, library: Compiled, events: Tape) -> Room:
@@ -124,7 +126,9 @@ class _Output:
             fields = {n: a for n, a in zip(self.names, self.whole, strict=True) if a is not None}
             return Runs(self.name, self.time, present, {n: fields[n] for n in self.leaves})
         parts = [self.apart[n] if n in self.apart else self._placed(n) for n in range(self.count)]
-        return joined(self.name, parts, self.leaves)
+        found = joined(self.name, parts, self.leaves)
+        kinds = {n: a.dtype for n, a in zip(self.names, self.kinds, strict=True) if a is not None}
+        return replace(found, leaves={n: a.astype(kinds[n], copy=False) for n, a in found.leaves.items()})
 
     def _placed(self, n: int) -> Series:
         assert self.whole is not None

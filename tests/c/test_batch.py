@@ -85,7 +85,8 @@ def test_runs_of_the_same_ticks(built, dtype, keep):
         assert batch["now"].present.all()
         assert batch["b"].value.shape == (5, 18)
         assert not batch["high"].present.all()
-    elif "b" not in keep:
+    assert all(a.dtype == dtype for runs in batch.series.values() for a in runs.leaves.values())
+    if keep and "b" not in keep:
         assert list(batch["now"].leaves) == ["total"]
         with pytest.raises(UnknownNameError, match="place"):
             batch["now"]["place"]
