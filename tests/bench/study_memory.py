@@ -93,6 +93,10 @@ def rows(*, sizes: tuple[int, ...] = (500, 2000, 10_000), duration: float = 4.0)
         speed = one["runs"] / one["seconds"]
         made.append(Row(f"{name}: speed", speed, None, "runs/s", "none: for information", None))
         cost, small = (1e3 * x["cpu_s"] / x["runs"] for x in (one, found[0]))
+        beyond = zip(found[1:], found[:-1], strict=True)  # without what starting costs
+        one["cpu_ms_of_a_further_run"] = [
+            1e3 * (b["cpu_s"] - a["cpu_s"]) / (b["runs"] - a["runs"]) for b, a in beyond if b is one
+        ]
         made.append(
             Row(f"{name}: cost of a run", cost, small, "CPU ms", f"a study of {found[0]['runs']:,}",
                 cost / small, "ratio <= 1.1" if last else None, cost <= 1.1 * small if last else None)
