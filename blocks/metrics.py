@@ -71,13 +71,14 @@ def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
     Raises:
         DataError: when there is none.
     """
-    chosen = estimate[estimate.time - estimate.time[:1] >= round(settle * 1e9)]
+    time = estimate.time
+    held = time - time[:1] >= round(settle * 1e9)
     if len(truth):
-        chosen = chosen[(chosen.time >= truth.time[0]) & (chosen.time <= truth.time[-1])]
-        known = np.ones(len(chosen), dtype=bool)
+        held &= (time >= truth.time[0]) & (time <= truth.time[-1])
         for name in {"position", "attitude"} & set(truth.leaves):
-            known &= np.isfinite(interpolate(truth, name, chosen.time)).all(axis=-1)
-        chosen = chosen if known.all() else chosen[known]
+            if not np.isfinite(truth[name]).all():  # unknown at some time, and so between its neighbours
+                held[held] = np.isfinite(interpolate(truth, name, time[held])).all(axis=-1)
+    chosen = estimate[_rows(held)]
     if not len(truth) or not len(chosen):
         raise DataError(
             "no tick of the estimate lies within the truth",
@@ -87,6 +88,13 @@ def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
             fix="check the time offsets, or make settle smaller",
         )
     return chosen
+
+
+def _rows(held: np.ndarray) -> slice | np.ndarray:
+    """The rows of a mask, as a slice where nothing lies between them: that copies nothing."""
+    rows = np.flatnonzero(held)
+    whole = len(rows) and rows[-1] - rows[0] + 1 == len(rows)
+    return slice(int(rows[0]), int(rows[-1]) + 1) if whole else held
 
 
 def error_summary(error: npt.ArrayLike) -> dict[str, float]:
@@ -230,7 +238,7 @@ def _angles(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 def _turn_3sigma(estimate: np.ndarray, truth: np.ndarray, P: np.ndarray) -> dict[str, float]:
     """How often tilt and heading are within three deviations, given the covariance (n, 3, 3) in the body."""
     R = to_matrix(estimate, xp=np)
-    sigma = np.sqrt(np.einsum("nii->ni", R @ P @ R.mT))
+    sigma = np.sqrt(((R @ P) * R).sum(axis=-1))  # the diagonal of R P R^T
     held = np.abs(world_error(estimate, truth)) <= 3.0 * sigma
     return {"tilt_3sigma": float(np.mean(held[:, :2])), "heading_3sigma": float(np.mean(held[:, 2]))}
 

@@ -347,12 +347,22 @@ def _events(
         yield before, value
 
 
-def tape(prepared: Mapping[str, Series | Iterator[tuple[int, Any]]], graph: Graph) -> Tape:
-    """All events as a tape; iterables are read to their end first."""
+def tape(
+    prepared: Mapping[str, Series | Iterator[tuple[int, Any]]], graph: Graph, *, like: Tape | None = None
+) -> Tape:
+    """All events as a tape; iterables are read to their end first.
+
+    With `like`, a tape of the same graph, its arrays of ticks are taken where all times are the same.
+    """
     series = tuple(
         s if isinstance(s, Series) else read_all(name, s, graph.sources[name].type)
         for name, s in prepared.items()
     )
+    if like is not None and all(
+        s.time is other.time or np.array_equal(s.time, other.time)
+        for s, other in zip(series, like.series, strict=True)
+    ):
+        return Tape(like.time, like.key, series)
     return Tape.of(series)
 
 

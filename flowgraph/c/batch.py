@@ -1,7 +1,9 @@
 """Many runs in C: as many at once as there are processors, for a call into C lets other threads go on.
 
-What is the same for all runs, the compiled library and, where they share them, the inputs' structs, is made
-once; of the outputs only what is kept leaves the structs.
+What is the same for all runs is made once: the compiled library, the order of the ticks, and the inputs where
+they are shared. An output whose presence follows from its inputs' is written by C straight to its place in an
+array of all runs; of one that depends on data, or where runs have other ticks, the runs are put together
+afterwards. Only what is kept of the outputs leaves the filter.
 """
 
 from __future__ import annotations
@@ -9,23 +11,23 @@ from __future__ import annotations
 import os
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from flowgraph.c.engine import compiled
+from flowgraph.c.engine import Compiled, Room, State, Structs, compiled, shrunk
 from flowgraph.graph import Graph
 from flowgraph.inputs import Tape, prepare, tape
 from flowgraph.lowering import lower
-from flowgraph.many import Batch, cells_of, is_shared, joined, leaf_type, of_run
+from flowgraph.many import Batch, Runs, initial_cells, is_shared, joined, leaf_type, of_run
 from flowgraph.optimise import RELYING, for_engine, without
-from flowgraph.pipeline import Port
 from flowgraph.playback import check_faults, real_leaves
 from flowgraph.random import seed_words
 from flowgraph.run import Meter
 from flowgraph.series import Series
-from flowgraph.types import DTYPES, StructType
+from flowgraph.types import StructType
 
 
 def threaded(
@@ -37,64 +39,105 @@ def threaded(
     chosen = for_engine("c", passes)
     if init is not None:
         chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
-    shared = tape(prepare(graph, inputs), graph) if is_shared(inputs) else None
-    library = None if shared is None else compiled(pipeline, real, shared.patterns, chosen)
-    shared_rows = None if library is None or shared is None else library.rows(_reals(shared, real))
+    shared = is_shared(inputs)
+    first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
+    library = compiled(pipeline, real, first.patterns, chosen)
+    rows = _rows(library, first, real) if shared else None
+    cells = initial_cells(graph, init) if is_shared(init) else None
+    ports = enumerate(pipeline.outputs)
+    outputs = [_Output(library, k, first, kept.get(p.name), len(seeds)) for k, p in ports]
 
-    def run(n: int) -> tuple[dict[str, Series], int]:
-        events = shared or tape(prepare(graph, of_run(inputs, n, seeds[n])), graph)
-        c = library if library is not None else compiled(pipeline, real, events.patterns, chosen)
-        rows = shared_rows if shared_rows is not None else c.rows(_reals(events, real))
-        cells = [cell[0] for cell in cells_of(graph, init, seeds, (n,))]
-        found: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {name: [] for name in kept}
-        done = 0
-        for part, after in c.play(cells, seed_words(seeds[n]), events.time, events.key, rows, kept):
-            cells = after
-            times = events.time[done : done + part.ticks]
-            for port, (mask, leaves) in zip(pipeline.outputs, part.outputs, strict=True):
-                if port.name in kept:
-                    found[port.name].append((times[mask], leaves))
-            done += part.ticks
-        check_faults(pipeline, cells)
-        ports = [p for p in pipeline.outputs if p.name in kept]
-        return {p.name: _series(p, kept[p.name], found[p.name]) for p in ports}, done
+    def run(n: int) -> int:
+        events, c = first, library
+        if not shared and n:
+            events = tape(prepare(graph, of_run(inputs, n, seeds[n])), graph, like=first)
+            if events.time is not first.time:
+                c = compiled(pipeline, real, events.patterns, chosen)
+        start = cells if cells is not None else initial_cells(graph, of_run(init, n, seeds[n]))
+        state = State(c, start, seed_words(seeds[n]))
+        given = rows if rows is not None else _rows(c, events, real)
+        rooms = [output.room(n, c, events) for output in outputs]
+        counts, made = c.advance(state, events.time, events.key, given, rooms)
+        if pipeline.faults:
+            check_faults(pipeline, state.after())
+        for output, room, count in zip(outputs, rooms, counts, strict=False):
+            output.came(n, events, room, count, made)
+        return len(events.time)
 
-    if shared is None:  # made here, so that threads do not compile the same thing at once
-        first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
-        compiled(pipeline, real, first.patterns, chosen)
-    parts: dict[str, list[Series]] = {name: [] for name in kept}
-    ticks = 0
+    ticks = len(first.time)
     start = perf_counter()
     with ThreadPoolExecutor(min(len(seeds), os.cpu_count() or 1)) as pool:
-        for n, (series, done) in enumerate(pool.map(run, range(len(seeds)))):
-            ticks = done
-            for name in kept:
-                parts[name].append(series[name])
+        for n, played in enumerate(pool.map(run, range(len(seeds)))):
+            ticks = played
             if progress is not None:
                 progress.update(n + 1, 0)
     wall = perf_counter() - start
-    return Batch(graph.name, "c", seeds, {n: joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall)
+    series = {o.name: o.runs() for o in outputs if o.kept}
+    return Batch(graph.name, "c", seeds, {name: series[name] for name in kept}, ticks, wall)
 
 
-def _reals(events: Tape, real: Any) -> list[list[np.ndarray]]:
-    return [real_leaves(s, real) for s in events.series]
+def _rows(library: Compiled, events: Tape, real: Any) -> Structs:
+    return library.rows([real_leaves(s, real) for s in events.series])
 
 
-def _series(port: Port, names: list[str], parts: list[tuple[np.ndarray, list[np.ndarray]]]) -> Series:
-    """Stretches of one output in one, with the leaves of these names."""
-    leaves = [leaf for leaf in port.leaves if leaf.name in names]
-    time = _whole([t for t, _ in parts]) if parts else np.zeros(0, np.int64)
-    fields = {
-        leaf.name: _whole([x[k] for _, x in parts])
-        if parts
-        else np.zeros((0, *leaf.shape), DTYPES[leaf.dtype])
-        for k, leaf in enumerate(leaves)
-    }
-    if list(fields) == ["value"]:
-        return Series(time, fields["value"], name=port.name)
-    type_ = StructType(port.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
-    return Series(time, fields, type=type_, name=port.name)
+class _Output:
+    """Where one output of all runs goes.
 
+    Args:
+        library: of the first run.
+        port: its place.
+        first: the ticks of the first run.
+        leaves: the names that are kept; None where the output is not.
+        runs: how many.
+    """
 
-def _whole(parts: list[np.ndarray]) -> np.ndarray:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    def __init__(
+        self, library: Compiled, port: int, first: Tape, leaves: list[str] | None, runs: int
+    ) -> None:
+        self.port, self.first, self.count = port, first, runs
+        self.leaves, self.kept = leaves or [], leaves is not None
+        self.name = library.pipeline.outputs[port].name
+        self.names = [leaf.name for leaf in library.pipeline.outputs[port].leaves]
+        count, certain = library.most(first.key)[port]
+        self.time = first.time[library.present(first.key, port)] if certain else None
+        self.whole = library.room(port, runs, count, kept=self.leaves) if certain and self.kept else None
+        self.kinds = library.room(port, 0)
+        self.apart: dict[int, Series] = {}
+
+    def room(self, n: int, library: Compiled, events: Tape) -> Room:
+        """Arrays for a run."""
+        if not self.kept:
+            return [None] * len(self.names)
+        if self.whole is not None and events.time is self.first.time:
+            return [None if leaf is None else leaf[n] for leaf in self.whole]
+        return library.room(self.port, library.most(events.key)[self.port][0], kept=self.leaves)
+
+    def came(self, n: int, events: Tape, room: Room, count: int, made: np.ndarray) -> None:
+        """A run has filled its arrays."""
+        if self.kept and (self.whole is None or events.time is not self.first.time):
+            there = (made >> np.uint64(self.port) & np.uint64(1)).astype(bool)
+            leaves = [None if leaf is None else shrunk(leaf, count) for leaf in room]
+            self.apart[n] = self._series(events.time[there], leaves)
+
+    def runs(self) -> Runs:
+        """All runs of the output."""
+        if self.whole is not None and self.time is not None and not self.apart:
+            present = np.ones((self.count, len(self.time)), bool)
+            fields = {n: a for n, a in zip(self.names, self.whole, strict=True) if a is not None}
+            return Runs(self.name, self.time, present, {n: fields[n] for n in self.leaves})
+        parts = [self.apart[n] if n in self.apart else self._placed(n) for n in range(self.count)]
+        found = joined(self.name, parts, self.leaves)
+        kinds = {n: a.dtype for n, a in zip(self.names, self.kinds, strict=True) if a is not None}
+        return replace(found, leaves={n: a.astype(kinds[n], copy=False) for n, a in found.leaves.items()})
+
+    def _placed(self, n: int) -> Series:
+        assert self.whole is not None
+        assert self.time is not None
+        return self._series(self.time, [None if leaf is None else leaf[n] for leaf in self.whole])
+
+    def _series(self, time: np.ndarray, leaves: Room) -> Series:
+        fields = {n: a for n, a in zip(self.names, leaves, strict=True) if a is not None}
+        if list(fields) == ["value"]:
+            return Series(time, fields["value"], name=self.name)
+        type_ = StructType(self.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
+        return Series(time, fields, type=type_, name=self.name)

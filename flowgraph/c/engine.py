@@ -1,22 +1,23 @@
 """The C engine: a pipeline compiled by the system's compiler and called in this process.
 
-Events and outputs are arrays of the structs that the generated header declares, so nothing is converted a
-tick. A call plays a stretch of ticks and lets other threads run meanwhile: many runs go on as many threads.
+Events are arrays of the structs that the generated header declares, and of the outputs the leaves that are
+asked for are written to arrays that the caller provides, so nothing is converted a tick. A call plays a
+stretch of ticks and lets other threads run meanwhile: many runs go on as many threads.
 """
 
 from __future__ import annotations
 
 import ctypes
 import math
-import threading
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from flowgraph.c.compile import FLAGS, build
-from flowgraph.c.source import MOST_PATTERNS, Source, generate
+from flowgraph.c.loop import loop_text
+from flowgraph.c.source import MOST_PATTERNS, generate
 from flowgraph.optimise import optimise
 from flowgraph.pipeline import Cell, Leaf, Pipeline
 from flowgraph.program import specialise
@@ -24,39 +25,7 @@ from flowgraph.program import specialise
 _CHUNK_BYTES = 16 * 2**20
 _MOST_TICKS = 65536
 Structs = list[np.ndarray]
-
-
-def loop_text(pipeline: Pipeline, source: Source) -> str:
-    """C that plays a stretch of ticks; a part of the engine, not of the filter."""
-    names = source.names
-    m = names.module
-    inputs = [f"present >> {k} & 1u ? in{k}++ : NULL" for k in range(len(names.inputs))]
-    lines = [
-        f'#include "{m}.h"',
-        "#include <stddef.h>",
-        f"size_t flowgraph_size(void) {{ return sizeof({m}_state); }}",
-        "void flowgraph_play(void *state, int64_t ticks, const int64_t *time, const int64_t *key,",
-        "                    const void *const *inputs, void *const *outputs, uint64_t *made)",
-        "{",
-        f"    {m}_state *const s = state;",
-    ]
-    for k, n in enumerate(names.inputs):
-        lines.append(f"    const {m}_{n} *in{k} = inputs[{k}];")
-    for k, n in enumerate(names.outputs):
-        lines.append(f"    {m}_{n} *out{k} = outputs[{k}];")
-    if not names.inputs:
-        lines.append("    (void)inputs;")
-    if not names.outputs:
-        lines.append("    (void)outputs;")
-    call = ", ".join(["s", "time[t]", "present", *inputs, *(f"out{k}" for k in range(len(names.outputs)))])
-    lines += [
-        "    for (int64_t t = 0; t < ticks; t++) {",
-        "        const uint64_t present = (uint64_t)key[t];",
-        f"        const uint64_t there = {m}_react({call});",
-    ]
-    lines += [f"        out{k} += there >> {k} & 1u;" for k in range(len(names.outputs))]
-    lines += ["        made[t] = there;", "    }", "}", ""]
-    return "\n".join(lines)
+Room = list[np.ndarray | None]
 
 
 @dataclass(frozen=True)
@@ -65,6 +34,37 @@ class Piece:
 
     ticks: int
     outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+
+
+class State:
+    """What one run remembers between ticks, as C lays it out.
+
+    Args:
+        library: of the run.
+        cells: register cells before the first tick.
+        seed: (2,) uint32.
+    """
+
+    def __init__(self, library: Compiled, cells: Sequence[Any], seed: np.ndarray) -> None:
+        self._memory = np.zeros(library.size + 64, np.uint8)
+        start = -self._memory.ctypes.data % 64
+        self.address = self._memory.ctypes.data + start
+        self._struct = library.cells
+        self._held = [c for r in library.pipeline.registers for c in r.cells]
+        self._seen = self._memory[start : start + self._struct.itemsize].view(self._struct)
+        for name, cell, value in zip(self._struct.names or (), self._held, cells, strict=False):
+            if math.prod(cell.shape):
+                self._seen[name] = np.asarray(value).reshape(self._seen[name].shape)
+        self._seen["fg_seed"] = seed
+
+    def after(self) -> list[np.ndarray]:
+        """Copies of the register cells as they are now."""
+        return [
+            np.array(self._seen[name][0]).reshape(cell.shape)
+            if math.prod(cell.shape)
+            else np.zeros(cell.shape, self._seen.dtype[name].base)
+            for name, cell in zip(self._struct.names or (), self._held, strict=False)
+        ]
 
 
 class Compiled:
@@ -105,10 +105,10 @@ class Compiled:
         }
         self._library = ctypes.CDLL(str(build(files, flags)))
         self._play = self._library.flowgraph_play
-        self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 5]
+        self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self._play.restype = None
         self._library.flowgraph_size.restype = ctypes.c_size_t
-        self._size = int(self._library.flowgraph_size())
+        self.size = int(self._library.flowgraph_size())
         names = self.source.names
         self._inputs = [
             self._struct(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)
@@ -118,8 +118,7 @@ class Compiled:
         ]
         cells = [c for r in pipeline.registers for c in r.cells]
         flat = [n for r in names.registers for n in r]
-        self._cells = self._struct(cells, [*flat, "seed"], seed=True)
-        self._rooms = threading.local()
+        self.cells = self._struct(cells, [*flat, "seed"], seed=True)
         per_tick = sum(s.itemsize for s in self._outputs) + 8
         self.chunk = int(max(1, min(_MOST_TICKS, _CHUNK_BYTES // per_tick)))
 
@@ -150,6 +149,56 @@ class Compiled:
             made.append(rows)
         return made
 
+    def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
+        """For each output in how many ticks of these patterns it can be present, and whether it then is."""
+        counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
+        found = []
+        for port in range(len(self.pipeline.outputs)):
+            bits = [(n, *(p >> port & 1 for p in self.source.presence_of(k))) for k, n in counts.items()]
+            found.append((sum(n for n, _, may in bits if may), all(m == must for _, must, m in bits)))
+        return found
+
+    def present(self, key: np.ndarray, port: int) -> np.ndarray:
+        """(T,) bool: where an output is whose presence follows from the patterns alone."""
+        there = {int(k): bool(self.source.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
+        if len(set(there.values())) == 1:
+            return np.full(len(key), next(iter(there.values())))
+        return np.isin(key, [k for k, holds in there.items() if holds])
+
+    def room(self, port: int, *size: int, kept: Collection[str] | None = None) -> Room:
+        """Arrays (*size, ...) for the leaves of an output; None for one that is not among `kept`."""
+        return [
+            np.empty((*size, *leaf.shape), self._kind(leaf.dtype))
+            if kept is None or leaf.name in kept
+            else None
+            for leaf in self.pipeline.outputs[port].leaves
+        ]
+
+    def advance(
+        self, state: State, time: np.ndarray, key: np.ndarray, rows: Structs, rooms: Sequence[Room]
+    ) -> tuple[list[int], np.ndarray]:
+        """Play ticks in one call; the outputs are written to `rooms`, which must have the rows for them.
+
+        Returns:
+            How many rows each output has now, and (T,) uint64 with bit k set where output k was present.
+        """
+        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
+        made, counts = np.empty(len(time), np.uint64), np.zeros(max(len(rooms), 1), np.int64)
+        scratch = [np.empty(1, s) for s in self._outputs]
+        leaves = [None if leaf is None else leaf.ctypes.data for room in rooms for leaf in room]
+        self._play(
+            state.address,
+            len(time),
+            time.ctypes.data,
+            key.ctypes.data,
+            _pointers([r.ctypes.data for r in rows]),
+            _pointers([s.ctypes.data for s in scratch]),
+            _pointers(leaves),
+            made.ctypes.data,
+            counts.ctypes.data,
+        )
+        return counts.tolist(), made
+
     def play(
         self,
         cells: Sequence[Any],
@@ -157,7 +206,6 @@ class Compiled:
         time: np.ndarray,
         key: np.ndarray,
         rows: Structs,
-        kept: Mapping[str, Collection[str]] | None = None,
     ) -> Iterator[tuple[Piece, list[np.ndarray]]]:
         """Play ticks; yields stretches of outputs, with the register cells after each.
 
@@ -166,73 +214,28 @@ class Compiled:
             seed: (2,) uint32.
             time, key: (T,) int64.
             rows: events of each port, from `rows`.
-            kept: the leaves that are wanted of each output; all if left out.
         """
-        memory = np.zeros(self._size + 64, np.uint8)
-        start = -memory.ctypes.data % 64
-        state = memory[start : start + self._cells.itemsize].view(self._cells)
-        held = [c for r in self.pipeline.registers for c in r.cells]
-        for name, cell, value in zip(self._cells.names or (), held, cells, strict=False):
-            if math.prod(cell.shape):
-                state[name] = np.asarray(value).reshape(state[name].shape)
-        state["fg_seed"] = seed
-        done = [0] * len(rows)
-        most = min(self.chunk, len(time))
-        outputs = self._room(most)
-        made = np.zeros(most, np.uint64)
-        out = (ctypes.c_void_p * max(len(outputs), 1))(*(o.ctypes.data for o in outputs))
-        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
+        state = State(self, cells, seed)
+        rows = list(rows)
         for first in range(0, len(time), self.chunk):
-            count = min(self.chunk, len(time) - first)
-            here = key[first : first + count]
-            places = [r.ctypes.data + n * r.itemsize for r, n in zip(rows, done, strict=True)]
-            given = (ctypes.c_void_p * max(len(rows), 1))(*places)
-            self._play(
-                memory.ctypes.data + start,
-                count,
-                time[first:].ctypes.data,
-                here.ctypes.data,
-                ctypes.addressof(given),
-                ctypes.addressof(out),
-                made.ctypes.data,
-            )
-            done = [n + int((here >> k & 1).sum()) for k, n in enumerate(done)]
-            yield Piece(count, self._leaves(outputs, made[:count], kept)), self._after(state)
+            here = key[first : first + self.chunk]
+            rooms = [self.room(k, n) for k, (n, _) in enumerate(self.most(here))]
+            counts, made = self.advance(state, time[first : first + self.chunk], here, rows, rooms)
+            rows = [r[int((here >> k & 1).sum()) :] for k, r in enumerate(rows)]
+            outputs = []
+            for k, (room, n) in enumerate(zip(rooms, counts, strict=False)):
+                mask = (made >> np.uint64(k) & np.uint64(1)).astype(bool)
+                outputs.append((mask, [shrunk(leaf, n) for leaf in room if leaf is not None]))
+            yield Piece(len(here), outputs), state.after()
 
-    def _room(self, ticks: int) -> Structs:
-        """This thread's memory for the outputs of a stretch: new pages for each run cost time."""
-        kept: Structs = getattr(self._rooms, "outputs", [])
-        if not kept or len(kept[0]) <= ticks:
-            kept = [np.empty(ticks + 1, s) for s in self._outputs]  # one more: written, though absent
-            self._rooms.outputs = kept
-        return kept
 
-    def _leaves(
-        self, outputs: Structs, made: np.ndarray, kept: Mapping[str, Collection[str]] | None
-    ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
-        """Of each output where it is present, and a copy of its leaves there."""
-        found = []
-        for k, (port, rows) in enumerate(zip(self.pipeline.outputs, outputs, strict=True)):
-            mask = (made >> np.uint64(k) & np.uint64(1)).astype(bool)
-            n = int(mask.sum())
-            leaves = [
-                rows[name][:n].copy().reshape(n, *leaf.shape)
-                if math.prod(leaf.shape)
-                else np.zeros((n, *leaf.shape), self._kind(leaf.dtype))
-                for name, leaf in zip(rows.dtype.names or (), port.leaves, strict=False)
-                if kept is None or leaf.name in kept.get(port.name, ())
-            ]
-            found.append((mask, leaves))
-        return found
+def shrunk(leaf: np.ndarray, n: int) -> np.ndarray:
+    """The first n rows, without the memory of the others."""
+    return leaf if len(leaf) == n else leaf[:n].copy()
 
-    def _after(self, state: np.ndarray) -> list[np.ndarray]:
-        held = [c for r in self.pipeline.registers for c in r.cells]
-        return [
-            np.array(state[name][0]).reshape(cell.shape)
-            if math.prod(cell.shape)
-            else np.zeros(cell.shape, self._kind(cell.dtype))
-            for name, cell in zip(self._cells.names or (), held, strict=False)
-        ]
+
+def _pointers(places: Sequence[int | None]) -> Any:
+    return (ctypes.c_void_p * max(len(places), 1))(*places)
 
 
 def compiled(pipeline: Pipeline, real: Any, keys: Sequence[int], passes: tuple[str, ...] = ()) -> Compiled:

@@ -7,7 +7,7 @@ folded away. Beyond `MOST_PATTERNS` there is one reaction in which presence is d
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +41,8 @@ class Source:
         real: "double" or "float".
         header, source: the texts of the two files.
         patterns: the keys that have a reaction of their own, or None where one serves all.
+        presence: by key, or None for all, the outputs that are present for certain and those that can be, a
+            bit each.
     """
 
     names: Names
@@ -48,6 +50,11 @@ class Source:
     header: str
     source: str
     patterns: tuple[int, ...] | None
+    presence: Mapping[int | None, tuple[int, int]]
+
+    def presence_of(self, key: int) -> tuple[int, int]:
+        """The outputs that are present for certain in a tick of this pattern, and those that can be."""
+        return self.presence.get(None if self.patterns is None else key, (0, 0))
 
 
 def generate(
@@ -91,6 +98,7 @@ class _File:
         self.expressions = Expressions(real)
         self.constants: dict[Any, tuple[str, Buffer]] = {}
         self.pool: dict[str, list[int]] = {}
+        self.presence: dict[int | None, tuple[int, int]] = {}
 
     def source(self) -> Source:
         from flowgraph.c.header import header
@@ -119,6 +127,7 @@ class _File:
             header(self.pipeline, self.names, self.real, self.patterns, self.pool),
             text,
             None if self.patterns is None else tuple(self.patterns),
+            self.presence,
         )
 
     # -- one reaction --------------------------------------------------------------------------------
@@ -156,10 +165,13 @@ class _File:
         writer = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
         body = writer.body()
         body += ["    uint64_t made = 0;"]
+        must = may = 0
         for k, present in flags:
             bit = f"made |= UINT64_C({1 << k}); /* {comment(pipeline.outputs[k].name)} */"
             text = writer.ref(present)
             body.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
+            must, may = must | (text == "true") << k, may | 1 << k
+        self.presence[key] = must, may
         body.append("    return made;")
         all_text = "\n".join(body)
         unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]

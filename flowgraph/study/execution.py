@@ -118,10 +118,15 @@ class _Flights:
             return identity, seeded, "", ""
         try:
             case, _ = prepared(graph, data, 0, parameters, flight)
-            pipeline = lower(case.graph)
-            return identity, seeded, keys.graph_digest(pipeline), keys.structure_digest(pipeline)
         except Exception as error:  # the run will raise it again, and say so in its row
             return identity, seeded, keys.failure_digest(error), ""
+        try:
+            pipeline = lower(case.graph)
+            described, program = keys.graph_digest(pipeline), keys.structure_digest(pipeline)
+        except Exception as error:  # the Python engine may run it all the same
+            described, program = keys.failure_digest(error), ""
+        beside = keys.python_digest(case.graph, every=not program)
+        return identity, seeded, keys.digest((described, beside)) if beside else described, program
 
     def _flight(self, data: str, parameters: Mapping[str, Value]) -> tuple[Flight | Exception, str, bool]:
         settings = {n: text(v) for n, v in flight_part(data, parameters).items()}

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.errors import FlowgraphError
+from flowgraph.graph import CallNode, Graph
 from flowgraph.pipeline import Pipeline, Port, Register
 from flowgraph.series import Flight, Series
 
@@ -151,6 +152,15 @@ def graph_digest(pipeline: Pipeline) -> str:
 
 def structure_digest(pipeline: Pipeline) -> str:
     return digest(structure(pipeline))
+
+
+def python_digest(graph: Graph, *, every: bool = False) -> str:
+    """Of the blocks that run as Python and so are not in the pipeline: their modules' code and settings.
+
+    They are those of the host, or, with `every`, all. Empty where there are none.
+    """
+    calls = [n for n in graph.nodes if isinstance(n, CallNode) and (every or n.block.host)]
+    return digest([(n.path, code_digest(n.block.step), dict(n.settings)) for n in calls]) if calls else ""
 
 
 def failure_digest(error: BaseException) -> str:

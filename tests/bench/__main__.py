@@ -15,7 +15,18 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import generated_c, imports, inertial, many, particles, random, studies, toy, unscented_c
+from tests.bench import (
+    generated_c,
+    imports,
+    inertial,
+    many,
+    particles,
+    random,
+    studies,
+    study_memory,
+    toy,
+    unscented_c,
+)
 from tests.bench.rows import Row
 
 Bench = Callable[..., list[Row]]
@@ -39,7 +50,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
         studies.seeds_of_ekf,
         {"runs": 8, "sample": 2, "duration": 2.0, "chunk": 4, "repeats": 1},
     ),
-    "study-memory": (studies.memory_of_particles, {"runs": 8, "fewer": 4, "duration": 1.2}),
+    "study-memory": (study_memory.rows, {"sizes": (4, 8), "duration": 1.2}),
     "import": (imports.import_time, {"repeats": 1}),
 }
 """The benches by name, each with the sizes of `--quick`."""

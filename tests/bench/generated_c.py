@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
-from flowgraph.c.engine import Compiled
+from flowgraph.c.engine import Compiled, State
 from flowgraph.inputs import Inputs, prepare, tape
 from flowgraph.optimise import DEFAULT, for_engine
 from flowgraph.playback import real_leaves
@@ -59,24 +59,20 @@ def floor(name: str, *defines: str) -> ctypes.CDLL:
 def loop(
     built: Graph, inputs: Inputs, passes: Collection[str] | None = None, dtype: str = "float64"
 ) -> Callable[[], float]:
-    """A call that plays the inputs once in C, after these passes, and returns the seconds spent there."""
+    """A call that plays the inputs once in C, after these passes, and returns the seconds spent there.
+
+    In that time all outputs come to lie in arrays, one for each leaf.
+    """
     pipeline, kind = lower(built, dtype=dtype), np.dtype(dtype)
     events = tape(prepare(built, inputs), built)
     library = Compiled(pipeline, kind, events.patterns, passes=for_engine("c", passes))
     rows = library.rows([real_leaves(s, kind) for s in events.series])
     cells = [c.reset for r in pipeline.registers for c in r.cells]
-    play, spent = library._play, [0.0]
-
-    def timed(*arguments: Any) -> None:
-        spent[0] += seconds(lambda: play(*arguments))
-
-    library._play = timed  # type: ignore[assignment]
+    rooms = [library.room(k, n) for k, (n, _) in enumerate(library.most(events.key))]
 
     def once() -> float:
-        spent[0] = 0.0
-        for _ in library.play(cells, seed_words(0), events.time, events.key, rows):
-            pass
-        return spent[0]
+        state = State(library, cells, seed_words(0))
+        return seconds(lambda: library.advance(state, events.time, events.key, rows, rooms))
 
     return once
 

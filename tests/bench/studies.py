@@ -1,14 +1,13 @@
 """Studies: a thousand seeds of one filter, against a process pool over the same filter in filterpy.
 
-There are two comparisons. In the first both are given the recorded flights, are warm, filter each and say
-how far off its last pose is: ours is one call over threads in C. In the second both make each flight, filter
-it and score all of it; ours is the whole study, to a table on disk, its processes started and its program
-compiled within the time that counts. Of the peer's runs only a sample is done.
+There are two comparisons. In the first both are given the recorded flights and are warm: `recorded` says
+what is within the time that counts. In the second both make each flight, filter it and score all of it; ours
+is the whole study, to a table on disk, its processes started and its program compiled within the time that
+counts. Of the peer's runs only a sample is done.
 """
 
 from __future__ import annotations
 
-import resource
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -88,7 +87,7 @@ def check(duration: float) -> None:
 
 
 def seeds_of_ekf(
-    *, runs: int = 1000, sample: int = 16, duration: float = 20.0, chunk: int = 50, repeats: int = 3
+    *, runs: int = 1000, sample: int = 16, duration: float = 20.0, chunk: int = 25, repeats: int = 3
 ) -> list[Row]:
     """Runs a second on recorded flights, and of whole studies, beside a process pool over filterpy."""
     check(duration)
@@ -96,13 +95,19 @@ def seeds_of_ekf(
 
 
 def recorded(runs: int, sample: int, duration: float, chunk: int, repeats: int) -> Row:
-    """Filter and last error of flights that are there: a pool in turn with threads over one program in C.
+    """Filter flights that are there: threads over one program in C, in turn with a pool over filterpy.
 
-    The flights differ in all their noise and in where they start, which is given as `init`.
+    Within the time of either, for each flight: its readings as they were recorded, where its filter starts,
+    every tick of the same filter, the whole trajectory of position, velocity, attitude and covariance (9, 9)
+    in memory, and from it how far off the last pose is, which is all that leaves. Ours checks the readings
+    and merges their times as well; and in C it makes, but does not keep, the filter's other outputs.
+
+    Outside it: making the flights, starting the pool and giving it its flights, compiling, and a first round
+    of both. The flights differ in all their noise and in where they start, which is given as `init`. Before
+    any time is taken the two must say the same of the sample.
     """
     flights = [flight_of(seed, duration) for seed in range(runs)]
     built = find_graph("ekf").case(flights[0]).graph
-    keep = ["belief.position", "belief.attitude"]
 
     def start(flight: Flight) -> dict[str, Any]:
         first = flight.streams["vicon"][0]
@@ -114,7 +119,12 @@ def recorded(runs: int, sample: int, duration: float, chunk: int, repeats: int) 
             part = flights[first : first + chunk]
             seeds = range(first, first + len(part))
             batch = simulate_many(
-                built, [f.streams for f in part], seeds, engine="c", init=[start(f) for f in part], keep=keep
+                built,
+                [f.streams for f in part],
+                seeds,
+                engine="c",
+                init=[start(f) for f in part],
+                keep=["belief"],
             )
             belief = batch["belief"]
             found += [last_error(belief.position[k], belief.attitude[k], f) for k, f in enumerate(part)]
@@ -160,30 +170,3 @@ def _pool(sample: int, duration: float) -> float:
     with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
         list(pool.map(scored, range(WORKERS), [min(duration, 1.5)] * WORKERS))
         return sample / seconds(lambda: list(pool.map(scored, range(sample), [duration] * sample)))
-
-
-def memory_of_particles(*, runs: int = 10_000, fewer: int = 500, duration: float = 20.0) -> list[Row]:
-    """Peak memory of many seeds of `rbpf_indoor`, and the cost of a run beside that in a smaller study."""
-    small, _ = _particles(fewer, duration)
-    cost, peak = _particles(runs, duration)
-    name = f"{runs:,} seeds of rbpf_indoor, N = 100"
-    against = f"a study of {fewer:,}"
-    return [
-        Row(f"{name}: memory", peak, None, "MiB", "none: a bound", None, "ours < 2048 MiB", peak < 2048.0),
-        Row(f"{name}: cost of a run", cost, small, "ms", against, cost / small, "ratio <= 1.2",
-            cost <= 1.2 * small),
-    ]  # fmt: skip
-
-
-def _particles(runs: int, duration: float) -> tuple[float, float]:
-    """Milliseconds a run, and the largest peak of any process in MiB."""
-    study = Study(
-        graphs=["rbpf_indoor"], data=["sim"], seeds=runs, engine="c",
-        parameters={"particles": 100, "duration": duration},
-    )  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        start = perf_counter()
-        assert not run_study(study, folder, workers=WORKERS).failed
-        spent = 1e3 * (perf_counter() - start) / runs
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return spent, max(resource.getrusage(k).ru_maxrss for k in kinds) / 1024
