@@ -127,6 +127,15 @@ class StateSpace:
         self.size, self.tangent = sum(p.size for p in parts), sum(p.tangent for p in parts)
         self._flat = all(isinstance(p, _Euclidean) for p in parts)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StateSpace) and self._kinds() == other._kinds()
+
+    def __hash__(self) -> int:
+        return hash(self._kinds())
+
+    def _kinds(self) -> tuple[tuple[type[Part], int], ...]:
+        return tuple((type(p), p.size) for p in self.parts)
+
     def __repr__(self) -> str:
         inside = ", ".join(f"{type(p).__name__[1:].lower()}({p.size})" for p in self.parts)
         return f"StateSpace({inside})"

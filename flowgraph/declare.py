@@ -18,7 +18,7 @@ from typing import Any
 from flowgraph.block import REQUIRED
 from flowgraph.builder import Builder, builder, building
 from flowgraph.clock import Source, Timing
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError, naming_lines
 from flowgraph.graph import Graph, SourceNode, Wire
 from flowgraph.registry import Case
 from flowgraph.series import Flight
@@ -154,7 +154,7 @@ class GraphFunction:
                 fix=f"write {self.name}.build(..., {missing[0]}=...)",
             )
         build = Builder(self.name)
-        with building(build):
+        with building(build), naming_lines():
             streams = {
                 name: self._source(build, name, type_, optional, declared.get(name), sizes or {})
                 for name, (type_, optional) in sources.items()

@@ -22,7 +22,12 @@ class FlowgraphError(Exception):
         expected: what would have been right.
         got: what came instead.
         fix: what to write or do.
+
+    Attributes:
+        line: module:line of the declaration that is wrong, where an error is due to one.
     """
+
+    line: str | None = None
 
     def __init__(
         self,
@@ -38,7 +43,8 @@ class FlowgraphError(Exception):
 
     def __str__(self) -> str:
         lines = [f"{self.path}: {self.message}" if self.path else self.message]
-        for label, part in (("expected", self.expected), ("got", self.got), ("fix", self.fix)):
+        parts = {"at": self.line, "expected": self.expected, "got": self.got, "fix": self.fix}
+        for label, part in parts.items():
             if part is not None:
                 lines.append(f"  {label + ':':<10}{part}")
         return "\n".join(lines)
@@ -103,6 +109,33 @@ class UnknownNameError(FlowgraphError):
 
 class MissingDependencyError(FlowgraphError):
     """An optional package or program is absent; says what to install."""
+
+
+@contextmanager
+def naming_lines() -> Iterator[None]:
+    """What is refused while a declaration runs gets the line of it that asked, the innermost of the user's.
+
+    A `LoweringError` names a line of the block's step already.
+    """
+    try:
+        yield
+    except FlowgraphError as error:
+        if error.line is None and not isinstance(error, LoweringError):
+            error.line = _declaring_line(error)
+        raise
+
+
+def _declaring_line(error: BaseException) -> str | None:
+    found, step = None, error.__traceback__
+    while step is not None:
+        module = step.tb_frame.f_globals.get("__name__", "?")
+        package, _, rest = module.partition(".")
+        if package not in ("numpy", "contextlib") and (
+            package != "flowgraph" or rest.partition(".")[0] in ("blocks", "graphs")
+        ):
+            found = f"{module}:{step.tb_lineno}"
+        step = step.tb_next
+    return found
 
 
 @contextmanager

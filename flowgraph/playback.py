@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.clock import Source, Timing
-from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
+from flowgraph.errors import ClockError, DataError, FifoOverflowError, UnknownNameError
 from flowgraph.graph import NEVER, Graph, SourceNode
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.lowering import lower
@@ -106,8 +106,32 @@ def run_pipeline(
         found, last, seed = read_tree(state, held, names, name=pipeline.name, of="pipeline")
         cells = [leaf for r in pipeline.registers for leaf in found[r.path]]
     events = tape(prepare(sources, _inputs(pipeline, inputs), last), sources)
+    check_together(pipeline, events)
     types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
     return _result(pipeline, events, cells, last, types, engine, dtype, seed, progress, passes)
+
+
+def check_together(pipeline: Pipeline, events: Tape) -> None:
+    """Refuse recordings of inputs of one clock, such as two outputs of a host block, that come apart.
+
+    The pipeline was made for inputs that are present together: which of them enables a stage is not said.
+
+    Raises:
+        ClockError: naming both inputs and the first time at which one comes without the other.
+    """
+    first: dict[str, int] = {}
+    for k, port in enumerate(pipeline.inputs):
+        other = first.setdefault(port.clock, k)
+        if not np.array_equal(events.series[other].time, events.series[k].time):
+            alone = np.setxor1d(events.series[other].time, events.series[k].time)
+            there = port.name if np.isin(alone[0], events.series[k].time) else pipeline.inputs[other].name
+            raise ClockError(
+                f"{pipeline.inputs[other].name!r} and {port.name!r} have one clock and come apart",
+                path=f"{pipeline.name}, input {port.name}",
+                expected=f"equal stamps of both: their clock is {port.clock}",
+                got=f"only {there!r} at t = {int(alone[0])} ns, the first of {len(alone)} such times",
+                fix="give both the stamps of the events that they are made of",
+            )
 
 
 def sources_of(pipeline: Pipeline, inputs: Any) -> tuple[Graph, dict[str, Any]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import typing
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -91,8 +91,8 @@ def remembering(memory: OrderedDict[Any, Any]) -> Iterator[None]:
     """Within it, a step recorded before with the same settings and types is not recorded again.
 
     For those who build the same graph many times over. Only steps whose settings are plain values, arrays,
-    dataclasses of these and functions without a closure are remembered; the oldest are forgotten beyond a
-    few hundred.
+    dataclasses of these, hashable objects that compare by value and functions without a closure are
+    remembered; the oldest are forgotten beyond a few hundred.
     """
     token = _memory.set(memory)
     try:
@@ -123,6 +123,9 @@ def _fingerprint(value: Any) -> Any:
         return type(value), *(_fingerprint(getattr(value, f.name)) for f in fields(value))
     if isinstance(value, FunctionType) and value.__closure__ is None:
         return FunctionType, value  # as itself; the rule for ties of a `merge` is one
+    kind = type(value)
+    if isinstance(kind.__eq__, FunctionType) and isinstance(value, Hashable):
+        return kind, value  # an immutable value, such as a state space
     raise _NotPlainError
 
 

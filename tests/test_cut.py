@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import (
+    ClockError,
     DataError,
     LoweringError,
     Pipeline,
@@ -27,6 +28,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.tags import Tags
+from flowgraph.c.harness import write_events
 from flowgraph.errors import PipelineError
 from flowgraph.graphs import ins_ukf_pose, tag_pose
 from flowgraph.inputs import clocks_of
@@ -166,6 +168,36 @@ def test_values_of_the_host_at_the_clock_of_a_source():
     events = {"x": scalars(range(5)), "y": scalars(range(2, 9))}
     built = g.build()
     same(simulate(built, events), simulate(built, events, engine="reference"))
+
+
+@block(host=True)
+def corners(x: Scalar) -> tuple[Scalar, Scalar]:
+    return {0.0: 1.0}.get(float(x), float(x)), float(x) + 0.5
+
+
+def test_inputs_of_one_clock_come_together(tmp_path):
+    """Two outputs of a host block that the pipeline reads: without the graph, stamps must agree as well."""
+
+    @graph
+    def g(imu: Stream[Scalar], image: Stream[Scalar]):
+        left, right = corners(image, name="corners")
+        return mixed(imu, latest(mixed(left, right), init=0.0), name="out")
+
+    built = g.build()
+    events = {"imu": scalars(range(12)), "image": scalars(range(1, 12, 2))}
+    pipeline = Pipeline.load(lower(built).save(tmp_path / "p"))
+    first, second = (p.name for p in pipeline.inputs if p.name != "imu")
+    times, seen = events["image"].time, events["image"]["value"]
+    values = {first: scalars(times, seen), second: scalars(times, seen + 0.5)}
+    alone = pipeline.run({"imu": events["imu"], **values})
+    np.testing.assert_array_equal(alone["output"]["value"], simulate(built, events)["output"]["value"])
+    for wrong in (values[second][:-1], scalars(times + 1, np.zeros(len(times)))):
+        with pytest.raises(ClockError, match="have one clock and come apart") as caught:
+            pipeline.run({"imu": events["imu"], **values, second: wrong})
+        assert {repr(first), repr(second)} <= set(caught.value.message.split())
+        assert caught.value.fix
+        with pytest.raises(ClockError, match="come apart"):
+            write_events(pipeline, {"imu": events["imu"], **values, second: wrong}, tmp_path / "e.csv")
 
 
 # -- one graph from the tags to the belief -----------------------------------------------------------------

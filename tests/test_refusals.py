@@ -156,7 +156,14 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         "unequal-rate zip",
         lambda _: build(lambda x, y: zip(x, every(5, x))),
         ClockError,
-        ["zip(x, every)", "unequal", "equal rates", "every(5, x)", "latest(slow, init=...)"],
+        [
+            "zip(x, every)",
+            f"at:       {__name__}:",
+            "unequal",
+            "equal rates",
+            "every(5, x)",
+            "latest(slow, init=...)",
+        ],
     ),
     (
         "two devices of nominally equal rate",
@@ -164,6 +171,7 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         ClockError,
         [
             "zip(x, y)",
+            f"at:       {__name__}:",
             "only nominally equal",
             "one source",
             "x and y",
@@ -174,7 +182,14 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         "unbounded zip",
         lambda _: build(lambda x, y: zip(x, x.filter(lambda v: v > 0.0))),
         ClockError,
-        ["zip(x, filter)", "cannot be proven equal", "x and filter", "match(", "latest("],
+        [
+            "zip(x, filter)",
+            f"at:       {__name__}:",
+            "cannot be proven equal",
+            "x and filter",
+            "match(",
+            "latest(",
+        ],
     ),
     (
         "cycle without delay",
@@ -307,7 +322,7 @@ ROWS: list[tuple[str, Callable[[Path], Any], type[FlowgraphError], list[str]]] =
         "match without size",
         lambda _: build(lambda x, y: match(x, y, tolerance="1ms")),
         DeclarationError,
-        ["match(x, y)", "needs the size", "None", "size=8"],
+        ["match(x, y)", f"at:       {__name__}:", "needs the size", "None", "size=8"],
     ),
     (
         "host block between lowered blocks",
@@ -331,6 +346,31 @@ def test_bad_input_is_refused_in_words(do, error, words, tmp_path):
     for word in (*words, "  expected: ", "  got:      ", "  fix:      "):
         assert word in text, text
     assert caught.value.path or isinstance(caught.value, UnknownNameError), "the message does not say where"
+
+
+def test_a_declaration_that_is_refused_names_its_own_line():
+    """Also inside a nested graph, where it is the inner line; a step that cannot be traced names its own."""
+
+    @graph
+    def inner(x: Stream[Scalar]):
+        return zip(x, x.filter(lambda v: v > 0.0))
+
+    @graph
+    def outer(x: Stream[Scalar]):
+        return inner(x, name="nested")
+
+    with pytest.raises(ClockError) as caught:
+        outer.build()
+    code = inner.function.__code__
+    assert caught.value.line == f"{__name__}:{code.co_firstlineno + 2}"
+    assert f"\n  at:       {caught.value.line}\n" in str(caught.value)
+    with pytest.raises(LoweringError) as traced:
+        build(lambda x, y: x.map(lambda v: v if v > 0.0 else -v))
+    assert traced.value.line is None
+    assert f"{__name__}:" in str(traced.value.path)
+    with pytest.raises(ClockError) as alone:
+        simulate(build(lambda x, y: x, x=periodic(5)), {"x": scalars([0, 6]), "y": scalars([])})
+    assert alone.value.line is None  # what is wrong with data is not wrong with a line
 
 
 # -- the command line --------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from flowgraph.graph import NEVER
 from flowgraph.inputs import Inputs, Tape, prepare, tape
 from flowgraph.optimise import for_engine, optimise
 from flowgraph.pipeline import Leaf, Pipeline, Port
-from flowgraph.playback import sources_of
+from flowgraph.playback import check_together, sources_of
 from flowgraph.program import specialise
 
 
@@ -253,6 +253,7 @@ def write_events(pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: s
     """
     sources, given = sources_of(pipeline, inputs)
     events: Tape = tape(prepare(sources, given, dict.fromkeys(sources.sources, NEVER)), sources)
+    check_together(pipeline, events)
     columns = [_texts(port, s) for port, s in zip(pipeline.inputs, events.series, strict=True)]
     rows = [iter(c) for c in columns]
     with writes(file), open(file, "w") as out:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +22,9 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.errors import DeclarationError
+
+if TYPE_CHECKING:
+    from flowgraph.study.tune import Found, Tuned
 
 
 @app.command()
@@ -38,11 +43,15 @@ def tune(
     held_out_seeds: Annotated[
         int, typer.Option(min=0, help="Seeds after those, of the flights to fit to, to judge by.")
     ] = 0,
+    folds: Annotated[
+        int | None,
+        typer.Option(min=2, metavar="K", help="Hold out each of K parts of the recordings in turn."),
+    ] = None,
     by: Annotated[str, typer.Option(help="likelihood of the innovations, or error")] = "likelihood",
     metric: Annotated[str | None, typer.Option(help="The error; the score's first if left out.")] = None,
     method: Annotated[str | None, typer.Option(help="L-BFGS-B, Nelder-Mead or Powell.")] = None,
-    engine: Annotated[str, typer.Option(help="In xla, recordings go together.")] = "reference",
-    most: Annotated[int, typer.Option(min=1, help="Points to try, about.")] = 200,
+    engine: Annotated[str, typer.Option(help="In xla and c, recordings go together.")] = "reference",
+    most: Annotated[int, typer.Option(min=1, help="Points to try in a search, about.")] = 200,
     settings: Settings = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="For the outcome, as JSON.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it searches.")] = False,
@@ -63,46 +72,102 @@ def tune(
         err_console.print(f"{count} tried: {value:.6g} at {said}", markup=False)
 
     found = search(
-        graph, fits, train, judges, measure=by, metric=metric, settings=dict(pairs(settings)), method=method,
-        engine=engine, most=most, watch=None if hidden else watch,
+        graph, fits, train, judges, folds=folds, measure=by, metric=metric, settings=dict(pairs(settings)),
+        method=method, engine=engine, most=most, watch=None if hidden else watch,
     )  # fmt: skip
-    rows = [
-        {
-            "data": j.recording.data, "seed": j.recording.seed, "held_out": j.held_out,
-            "before": j.before, "after": j.after,
-            "metrics": {n: {"before": b, "after": a} for n, (b, a) in j.metrics.items()},
-        }
-        for j in found.judged
-    ]  # fmt: skip
-    report = {
-        "graph": graph, "parameters": found.parameters, "measure": found.measure, "metric": found.metric,
-        "evaluations": found.evaluations, "converged": found.converged, "message": found.message,
-        "at_bound": list(found.at_bound), "recordings": rows,
-    }  # fmt: skip
+    report = _report(found)
     if out is not None:
         with writing(out) as file:
             file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     if as_json:
         return print_json(report)
+    print_whole(table(_lines(found)))
+    out_console.print(f"before: {_said(found.start)}", markup=False)
+    for k, part in enumerate(found.folds):
+        out_console.print(f"after, without fold {k}: {_said(part.parameters)}", markup=False)
+    whole = "of all: " if found.folds else "after: "
+    out_console.print(whole + " ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()))
+    bounds = {f.name: {"low": f.low, "high": f.high} for f in fits}
+    for label, one in _searches(found):
+        for name, side in one.at_bound.items():
+            err_console.print(
+                f"note: {name} ended at its {side} bound, {bounds[name][side]:g}{label}: the least lies"
+                f" beyond it, or {name} hardly matters; widen --fit {name}=... to see",
+                markup=False,
+            )
+        if not one.converged:
+            err_console.print(
+                f"note: the search{label} stopped early, after {one.evaluations} points; --most is {most}:"
+                f" {one.message}",
+                markup=False,
+            )
+
+
+def _searches(found: Tuned) -> list[tuple[str, Found]]:
+    """Each search with what to call it."""
+    parts = [(f" without fold {k}", part) for k, part in enumerate(found.folds)]
+    return [*parts, (" over all" if parts else "", found)]
+
+
+def _said(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{n}={v:.5g}" for n, v in values.items())
+
+
+def _lines(found: Tuned) -> list[dict[str, Any]]:
+    """A line a recording, and the means: before, after and with the graph's own settings."""
+
+    def line(data: str, seed: int | str, part: str, values: Sequence[Sequence[float]]) -> dict[str, Any]:
+        cells: dict[str, Any] = {"data": data, "seed": seed, "": part}
+        for name, triple in zip(names, values, strict=True):
+            numbers = zip((f"{name} before", "after", "own"), triple, strict=True)
+            cells |= {n + " " * len(cells): f"{v:.5g}" for n, v in numbers}  # columns of one name, told apart
+        return cells
+
+    by_error = found.measure == "error"
     first = found.metric or next((n for j in found.judged for n in j.metrics), None)
+    names = [found.measure] * (not by_error) + [first] * (first is not None)
+    none = (math.nan,) * 3
     lines = []
     for j in found.judged:
-        line = {
-            "data": j.recording.data,
-            "seed": j.recording.seed,
-            "": "held out" if j.held_out else "fitted",
+        part = "fitted" if not j.held_out else "held out" if j.fold is None else f"held out, fold {j.fold}"
+        measure = [] if by_error else [(j.before, j.after, j.own)]
+        shown = [j.metrics.get(first, none)] if first is not None else []
+        lines.append(line(j.recording.data, j.recording.seed, part, [*measure, *shown]))
+    for held_out in (False, True):
+        mean = found.mean(held_out=held_out)
+        if mean is not None:
+            part = "held out" if held_out else "fitted"
+            kind = "geometric mean" if by_error else "mean"
+            values = [[math.exp(min(v, 700.0)) for v in mean]] if by_error else [mean]
+            spare = [none] * (len(names) - 1)
+            lines.append(line(kind, "", part, [*values, *spare]))
+    return [{n: "" if v == "nan" else v for n, v in row.items()} for row in lines]
+
+
+def _report(found: Tuned) -> dict[str, Any]:
+    """The outcome as plain values."""
+    three = ("before", "after", "own")
+    rows = [
+        {
+            "data": j.recording.data, "seed": j.recording.seed, "held_out": j.held_out, "fold": j.fold,
+            "before": j.before, "after": j.after, "own": j.own,
+            "metrics": {n: dict(zip(three, values, strict=True)) for n, values in j.metrics.items()},
         }
-        line |= {f"{by} before": f"{j.before:.5g}", "after": f"{j.after:.5g}"}
-        if first is not None and first in j.metrics:
-            before, after = j.metrics[first]
-            line |= {f"{first} before": f"{before:.4g}", "then": f"{after:.4g}"}
-        lines.append(line)
-    print_whole(table(lines))
-    out_console.print(" ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()), markup=False)
-    for name in found.at_bound:
-        err_console.print(f"note: {name} ended at its bound: the least lies beyond it", markup=False)
-    if not found.converged:
-        err_console.print(f"note: the search stopped early: {found.message}", markup=False)
+        for j in found.judged
+    ]  # fmt: skip
+    means = {name: found.mean(held_out=held) for name, held in (("fitted", False), ("held_out", True))}
+
+    def search(one: Found) -> dict[str, Any]:
+        return {
+            "parameters": one.parameters, "evaluations": one.evaluations, "converged": one.converged,
+            "message": one.message, "at_bound": one.at_bound,
+        }  # fmt: skip
+
+    return {
+        "graph": found.graph, "start": found.start, "measure": found.measure, "metric": found.metric,
+        **search(found), "folds": [search(part) for part in found.folds], "recordings": rows,
+        "mean": {n: dict(zip(three, m, strict=True)) for n, m in means.items() if m is not None},
+    }  # fmt: skip
 
 
 def _span(given: str) -> tuple[str, list[float]]:

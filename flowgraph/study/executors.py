@@ -8,6 +8,7 @@ ends with `lost`, and the rest go on.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -25,6 +26,9 @@ from flowgraph.errors import DeclarationError, MissingDependencyError
 
 DEATHS = 3
 """So many workers may one task take with it before it is given up."""
+
+PATIENCE = 5.0
+"""Seconds that a Dask scheduler may take to answer."""
 
 
 @dataclass(frozen=True)
@@ -240,13 +244,22 @@ class OnDask(_Closing):
     Args:
         scheduler: its address, such as "tcp://host:8786"; None starts a local cluster.
         workers: of the local cluster.
-        deaths: how many workers a task may take with it.
+        deaths: how many workers a task may take with it; a cluster that is there has its own number.
+        patience: s, how long a scheduler may take to answer.
 
     Raises:
         MissingDependencyError: without `distributed`.
+        DeclarationError: where no scheduler answers.
     """
 
-    def __init__(self, scheduler: str | None = None, *, workers: int = 2, deaths: int = DEATHS) -> None:
+    def __init__(
+        self,
+        scheduler: str | None = None,
+        *,
+        workers: int = 2,
+        deaths: int = DEATHS,
+        patience: float = PATIENCE,
+    ) -> None:
         _need_workers(workers)
         try:
             import dask
@@ -268,16 +281,9 @@ class OnDask(_Closing):
                     n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
                     env=dict(_THREADS),
                 )  # fmt: skip
-            try:
-                self._client = distributed.Client(self._cluster or scheduler, set_as_default=False)
-            except (OSError, ValueError) as error:
-                raise DeclarationError(
-                    "no scheduler answers here",
-                    path="--scheduler",
-                    expected="the address of a running scheduler, such as tcp://host:8786",
-                    got=f"{scheduler}: {error}",
-                    fix="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
-                ) from None
+            else:
+                _ask(distributed, scheduler, patience)
+            self._client = distributed.Client(self._cluster or scheduler, set_as_default=False)
         self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
         self._futures: dict[Any, str] = {}
         self._done = distributed.as_completed(loop=self._client.loop)
@@ -309,6 +315,41 @@ class OnDask(_Closing):
         self._client.close(timeout=5)
         if self._cluster is not None:
             self._cluster.close(timeout=10)
+
+
+def _ask(distributed: Any, address: str, patience: float) -> None:
+    """Have a scheduler say who it is, before a client is made, which would try for long and close badly.
+
+    Raises:
+        DeclarationError: where it does not, or is none.
+    """
+
+    async def ask() -> Any:
+        secured = distributed.Security().get_connection_args("client")
+        comm = await distributed.core.connect(address, timeout=patience, **secured)
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            return await comm.read()
+        finally:
+            comm.abort()
+
+    try:
+        answer = asyncio.run(asyncio.wait_for(ask(), patience + 1.0))
+        if isinstance(answer, Mapping) and answer.get("type") == "Scheduler":
+            return
+        said = f"what answers is {answer.get('type') if isinstance(answer, Mapping) else answer!r}"
+    except Exception as error:  # whatever else listens there may say anything
+        late = isinstance(error, TimeoutError | OSError)
+        why = str(error.__cause__ or error)
+        said = f"no answer within {patience:g} s" if late else f"{type(error).__name__}"
+        said += f" ({why})" if why else ""
+    raise DeclarationError(
+        "no scheduler answers here",
+        path="--scheduler",
+        expected="the address of a running scheduler, such as tcp://host:8786",
+        got=f"{address}: {said}",
+        fix="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
+    )
 
 
 _THREADS = {

@@ -30,8 +30,8 @@ PAGE, FIGURES = "report.html", "figures"
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:.7em 0 1.5em;font-variant-numeric:tabular-nums;font-size:90%}
 th,td{padding:.2em .8em;text-align:right;border-bottom:1px solid #ddd}
-th{border-bottom:2px solid #888}th:first-child,td:first-child{text-align:left}
-code{font-size:85%}img{max-width:100%}.error{color:#a00;text-align:left;max-width:45em}.table{overflow-x:auto}
+th{border-bottom:2px solid #888}.text{text-align:left}
+code{font-size:85%}img{max-width:100%}.error{color:#a00;max-width:45em}.table{overflow-x:auto}
 @media(prefers-color-scheme:dark){body{background:#1b1b1b;color:#ddd}th,td{border-color:#444}
 img{background:#fff}.error{color:#f88}}"""
 
@@ -66,8 +66,9 @@ def write_report(folder: str | Path, *, metric: str | None = None) -> Reported:
     summary = quantiles(rows, names, study.metrics)
     parts = [
         f"<h1>Study: {_safe(', '.join(study.graphs))}</h1>",
-        f"<p>{len(rows)} runs over {_safe(', '.join(study.data))}; {len(study.each_seed)} seeds;"
-        f" engine {study.engine}, {study.dtype}. {len(failed)} failed.</p>",
+        f"<p>{_count(len(rows), 'run')} over {_safe(', '.join(study.data))};"
+        f" {_count(len(study.each_seed), 'seed')}; engine {study.engine}, {study.dtype}."
+        f" {len(failed)} failed.</p>",
     ]
     files: list[Path] = []
     if chosen is not None:
@@ -111,7 +112,9 @@ def write_comparison(
     parts = [
         f"<h1>{_safe(str(b))} beside {_safe(str(a))}</h1>",
         "<p>Ratio of the second to the first, the median over runs of the same flight and seed, with its 95 %"
-        " bootstrap interval. Below 1 the second has less.</p>",
+        " bootstrap interval. Below 1 the second has less; in what part of the runs it does is under"
+        " <em>less</em>. Of an error less is better, of a count or of a share within a bound it need not"
+        " be.</p>",
         f'<img alt="ratios" src="data:image/png;base64,{code}">',
         _table(_shown(table)),
     ]
@@ -205,7 +208,7 @@ def _draw_against(figure: Any, rows: Sequence[Mapping[str, Any]], name: str, met
         ax.plot(x, middle, "o-", color=f"C{k}", label=label)
         ax.fill_between(x, low, high, color=f"C{k}", alpha=0.2)
     values = [r[name] for r in rows if isinstance(r.get(name), int | float)]
-    _log_where_wide(ax.xaxis, np.array(values, dtype=float))
+    _log_where_wide(ax.xaxis, np.array(values, dtype=float), wide=9.0)
     _log_where_wide(ax.yaxis, finite_values(rows, metric))
     ax.set_xlabel(name)
     ax.set_ylabel(metric)
@@ -224,8 +227,8 @@ def _draw_ratios(figure: Any, table: Sequence[Mapping[str, Any]]) -> None:
     ax.set_xlabel("ratio")
 
 
-def _log_where_wide(axis: Any, values: np.ndarray) -> None:
-    if len(values) and values.min() > 0 and values.max() > 30 * values.min():
+def _log_where_wide(axis: Any, values: np.ndarray, wide: float = 30.0) -> None:
+    if len(values) and values.min() > 0 and values.max() > wide * values.min():
         getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
 
 
@@ -268,14 +271,33 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     if not rows:
         return "<p>None.</p>"
     names = list(dict.fromkeys(n for row in rows for n in row))
-    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
-    body = "".join("<tr>" + "".join(_cell(n, row.get(n)) for n in names) + "</tr>" for row in rows)
+    words = {n for n in names if any(_is_text(row.get(n)) for row in rows)}
+    head = "".join(
+        f'<th class="text">{_safe(n)}</th>' if n in words else f"<th>{_safe(n)}</th>" for n in names
+    )
+    body = "".join(
+        "<tr>" + "".join(_cell(n, row.get(n), n in words) for n in names) + "</tr>" for row in rows
+    )
     return f'<div class="table"><table><tr>{head}</tr>{body}</table></div>'
 
 
-def _cell(name: str, value: Any) -> str:
+def _cell(name: str, value: Any, words: bool) -> str:
     said = value if isinstance(value, _Raw) else "" if value is None else _safe(str(value))
-    return f'<td class="error">{said}</td>' if name == "error" else f"<td>{said}</td>"
+    kind = "text error" if name == "error" else "text" if words else ""
+    return f'<td class="{kind}">{said}</td>' if kind else f"<td>{said}</td>"
+
+
+def _is_text(value: Any) -> bool:
+    """Whether a cell is words, which stand on the left; numbers, shortened already or not, on the right."""
+    try:
+        float(value if isinstance(value, str) else 0.0)
+    except ValueError:
+        return True
+    return False
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + ("" if number == 1 else "s")
 
 
 def _shown(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -296,5 +318,8 @@ def _safe(words: str) -> str:
 
 
 def _short(data: str) -> str:
-    """The end of a flight's name, which tells it from others."""
-    return data if len(data) <= 24 else "…" + data[-23:]
+    """The end of a flight's name, which tells it from others; from a folder on where there is one."""
+    if len(data) <= 24:
+        return data
+    name = data.rstrip("/").rpartition("/")[2]
+    return "…/" + name if name != data and len(name) <= 30 else "…" + data[-23:]

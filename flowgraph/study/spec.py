@@ -205,9 +205,30 @@ def _engines() -> tuple[str, ...]:
     return ENGINES
 
 
+_EXAMPLES = {
+    "graphs": 'graphs = ["ekf"]',
+    "data": 'data = ["sim"]',
+    "seeds": "seeds = 20",
+    "metrics": 'metrics = ["position_rmse_m"]',
+    "chunk": "chunk = 64",
+    "keep": "keep = true",
+    "out": 'out = "results"',
+    "dtype": 'dtype = "float64"',
+    "sample": "[sample] with count = 64 and, in [sample.parameters], gate = {low = 5, high = 50}",
+    "points": "[[points]] with position_noise = 0.01",
+    "parameters": "[parameters] with position_noise = [0.01, 0.02] or {logspace = [0.005, 0.05, 5]}",
+}
+"""What may stand under each key of a study, for the fixes of errors."""
+
+
 def _wrong(key: str, expected: str, got: object) -> DeclarationError:
+    example = _EXAMPLES.get(key.partition(".")[0].partition("[")[0])
     return DeclarationError(
-        "this key of the study is not usable", path=key, expected=expected, got=repr(got), fix=f"mend {key}"
+        "this key of the study is not usable",
+        path=key,
+        expected=expected,
+        got=repr(got),
+        fix=f"mend {key}" + ("" if example is None else f"; for example {example}"),
     )
 
 
@@ -240,7 +261,9 @@ def _seeds(given: Any) -> tuple[int, ...]:
         if not 1 <= given <= MOST_RUNS:
             raise _wrong("seeds", expected, given)
         return tuple(range(given))
-    found = [given[k] for k in range(len(given))] if isinstance(given, range) else _listed("seeds", given)
+    if not isinstance(given, list | tuple | range):
+        raise _wrong("seeds", expected, given)
+    found = [given[k] for k in range(len(given))]
     bad = [s for s in found if type(s) is not int or not 0 <= s < 2**64]
     if bad or not found or len(set(found)) < len(found):
         raise _wrong("seeds", expected, bad[0] if bad else given)

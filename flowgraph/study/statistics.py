@@ -109,7 +109,7 @@ def compared(
 
     Returns:
         For each, `pairs`, the `ratio` (the median of the pairs' ratios) and its bootstrap interval `low` to
-        `high`, and `better`: the share of pairs in which b is less.
+        `high`, and `less`: the share of pairs in which b is less.
 
     Raises:
         DataError: where nothing can be paired.
@@ -138,7 +138,7 @@ def compared(
                     "ratio": float(np.exp(np.median(logs))),
                     "low": math.exp(low),
                     "high": math.exp(high),
-                    "better": float(np.mean(logs < 0)),
+                    "less": float(np.mean(logs < 0)),
                 }
             )
     if not table:

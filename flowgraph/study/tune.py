@@ -1,52 +1,33 @@
 """Tuning: noise parameters of one graph, fitted to several recordings, and judged by others.
 
-Two measures can be made small. With `likelihood`, the negative logarithm of how likely the innovations r of
-covariance S are, a value read,
-
-    1/2 (r^T S^-1 r + log det S + m log 2 pi)        summed over all, over the number of values
-
-which needs no truth, and has its least where the filter is as sure as it is right (R. Mehra, "On the
-identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control 15(2), 1970; F. C.
-Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11(1),
-1965). With `error`, the mean over recordings of the logarithm of a metric against the truth, so that a
-recording counts by how much better it gets and not by how hard it is.
-
-What is sought is the logarithm of each parameter, between bounds. Recordings that are held out take no part
-in the search; before and after are given for both.
+What is sought is the logarithm of each parameter, between bounds; what is made small stands in
+`flowgraph/study/trials.py`. Recordings that are held out take no part in the search. With folds each
+recording is held out once, of a search over others. Each is judged at the start of the search, with what was
+found, and with the graph's own settings.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError
-from flowgraph.recording import remembering
-from flowgraph.registry import Case, find_graph, parsed_settings
-from flowgraph.result import Result
-from flowgraph.series import Flight
-from flowgraph.simulate import ENGINES, simulate
+from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.registry import find_graph, parsed_settings
+from flowgraph.simulate import ENGINES
 from flowgraph.study.spec import Value, text
-from flowgraph.study.tasks import MANY, flight_part, grouped, prepared, simulate_together
+from flowgraph.study.tasks import flight_part
+from flowgraph.study.trials import Judged, Recording, Trials, surprise
+
+__all__ = ["MEASURES", "METHODS", "Fit", "Found", "Judged", "Recording", "Tuned", "surprise", "tune"]
 
 MEASURES = ("likelihood", "error")
 METHODS = ("L-BFGS-B", "Nelder-Mead", "Powell")
 _STEP = 1e-3
-_ASTRAY = 1e6
-"""What a recording counts on which the filter fails: more than any that works."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A flight to fit to or to judge by, and the seed of it and of the run."""
-
-    data: str
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -60,48 +41,54 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One recording before and after, by the measure that was made small and by the metrics."""
+class Found:
+    """Where a search ended.
 
-    recording: Recording
-    held_out: bool
-    before: float
-    after: float
-    metrics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    Args:
+        parameters: the values found.
+        evaluations: how many points were tried, on all its recordings each.
+        converged: whether the search ended by itself; `message` says how.
+        at_bound: parameters that ended at a bound, so that the least lies beyond it, each with "low" or
+            "high".
+    """
+
+    parameters: dict[str, float]
+    evaluations: int
+    converged: bool
+    message: str
+    at_bound: dict[str, str]
 
 
 @dataclass(frozen=True)
-class Tuned:
+class Tuned(Found):
     """What was found.
 
     Args:
         graph: its name.
-        parameters: the values found.
-        start: those of the search's start; "before" is the graph with its own.
+        start: where the search began.
         measure, metric: what was made small.
-        judged: each recording, before and after.
-        evaluations: how many points were tried, on all recordings each.
-        converged: whether the search ended by itself; `message` says how.
-        at_bound: parameters that ended at a bound, so that the least lies beyond it.
+        judged: each recording before and after. Where there are folds, each once, held out of its own.
+        folds: what each search found that left a part of the recordings out; `parameters` are of the search
+            over all.
     """
 
     graph: str
-    parameters: dict[str, float]
     start: dict[str, float]
     measure: str
     metric: str | None
     judged: tuple[Judged, ...]
-    evaluations: int
-    converged: bool
-    message: str
-    at_bound: tuple[str, ...]
+    folds: tuple[Found, ...] = ()
 
-    def mean(self, *, held_out: bool) -> tuple[float, float] | None:
-        """The measure before and after, over the recordings of one kind; None without any."""
-        found = [(j.before, j.after) for j in self.judged if j.held_out == held_out]
-        return (
-            (float(np.mean([b for b, _ in found])), float(np.mean([a for _, a in found]))) if found else None
-        )
+    def mean(self, *, held_out: bool) -> tuple[float, float, float] | None:
+        """The measure before, after and of the graph's own, over the recordings of one kind; None without.
+
+        Of an error it is the mean logarithm.
+        """
+        found = [(j.before, j.after, j.own) for j in self.judged if j.held_out == held_out]
+        if not found:
+            return None
+        before, after, own = np.mean(found, axis=0).tolist()
+        return before, after, own
 
 
 def tune(
@@ -110,6 +97,7 @@ def tune(
     recordings: Sequence[Recording],
     held_out: Sequence[Recording] = (),
     *,
+    folds: int | None = None,
     measure: str = "likelihood",
     metric: str | None = None,
     settings: Mapping[str, Value] | None = None,
@@ -125,13 +113,16 @@ def tune(
         fits: what to find.
         recordings: to fit to.
         held_out: to judge by only.
+        folds: instead, so many parts of the recordings (the k-th, the k + folds-th ...) are held out in turn
+            of a search over the others, and judged by what that one found. As many as there are recordings
+            leave out one at a time.
         measure: "likelihood" of the innovations or "error" against the truth.
         metric: the error to make small; the first that the graph's score has if left out.
         settings: other settings of graph and flights, as `--set`.
         method: "L-BFGS-B" (by central differences; the default for likelihood), "Nelder-Mead" (the default
             for an error, which may be rough) or "Powell".
-        engine: in "xla" all recordings of the same ticks and all points of a gradient go together.
-        most: points to try at most, about.
+        engine: in "xla" and "c" all recordings of the same ticks and all points of a gradient go together.
+        most: points to try at most, about, in each search.
         watch: told the number of points tried, the best so far and its measure.
 
     Raises:
@@ -145,10 +136,56 @@ def tune(
         if given not in valid:
             raise UnknownNameError(kind, given, valid, path="tune")
     settings = dict(settings or {})
-    _check(graph, fits, recordings, held_out, settings, most)
-    problem = _Problem(graph, [*recordings, *held_out], settings, measure, metric, engine)
+    _check(graph, fits, recordings, held_out, settings, most, folds)
+    problem = Trials(graph, [*recordings, *held_out], settings, measure, metric, engine)
+    start = {f.name: _start(graph, f) for f in fits}
+    whole = range(len(recordings))
+
+    def search(places: Sequence[int]) -> Found:
+        return _search(problem, fits, start, places, method, most, watch)
+
+    parts: list[Found] = []
+    judged: list[Judged] = []
+    for k in range(folds or 0):
+        parts.append(search([i for i in whole if i % (folds or 1) != k]))
+        out = [i for i in whole if i % (folds or 1) == k]
+        judged += problem.judged(out, start, parts[-1].parameters, held_out=True, fold=k)
+    found = search(whole)
+    if not parts:
+        judged = problem.judged(whole, start, found.parameters, held_out=False)
+        later = range(len(recordings), len(recordings) + len(held_out))
+        judged += problem.judged(later, start, found.parameters, held_out=True)
+    judged.sort(key=lambda j: problem.recordings.index(j.recording))
+    return Tuned(
+        found.parameters, found.evaluations, found.converged, found.message, found.at_bound,
+        graph, start, measure, problem.metric, tuple(judged), tuple(parts),
+    )  # fmt: skip
+
+
+def _start(graph: str, fit: Fit) -> float:
+    """Where to begin: as told, or at the graph's own value, or in the middle of the bounds."""
+    prepare = find_graph(graph).prepare
+    if fit.start is not None:
+        return float(fit.start)
+    known = None if prepare is None else inspect.signature(prepare).parameters.get(fit.name)
+    own = None if known is None else known.default
+    if isinstance(own, float | int) and not isinstance(own, bool) and fit.low <= own <= fit.high:
+        return float(own)
+    return math.sqrt(fit.low * fit.high)
+
+
+def _search(
+    problem: Trials,
+    fits: Sequence[Fit],
+    begin: Mapping[str, float],
+    places: Sequence[int],
+    method: str,
+    most: int,
+    watch: Callable[[int, Mapping[str, float], float], None] | None,
+) -> Found:
+    """Make the mean measure over some recordings small, in the logarithms of the parameters."""
     low, high = (np.log([getattr(f, n) for f in fits]) for n in ("low", "high"))
-    start = np.log([f.start or math.sqrt(f.low * f.high) for f in fits])
+    start = np.clip(np.log([begin[f.name] for f in fits]), low, high)
     count, best = 0, (math.inf, start)
 
     def named(x: np.ndarray) -> dict[str, float]:
@@ -156,7 +193,7 @@ def tune(
 
     def values(points: np.ndarray) -> np.ndarray:
         nonlocal count, best
-        found = problem.measured([named(x) for x in points], len(recordings)).mean(axis=1)
+        found = problem.measured([named(x) for x in points], places).mean(axis=1)
         count += len(points)
         if found.min() < best[0]:
             best = float(found.min()), points[int(found.argmin())]
@@ -174,6 +211,7 @@ def tune(
     from scipy import optimize
 
     minimize: Callable[..., Any] = optimize.minimize
+    limits: dict[str, Any]
     how: dict[str, Any] = {"method": method, "bounds": list(zip(low, high, strict=True))}
     if method == "L-BFGS-B":
         limits = {"maxfun": max(1, most // (2 * len(fits) + 1)), "ftol": 1e-8}
@@ -181,144 +219,23 @@ def tune(
     else:
         names = {"Nelder-Mead": ("xatol", "fatol"), "Powell": ("xtol", "ftol")}[method]
         limits = {"maxfev": most, names[0]: 1e-3, names[1]: 1e-6}
+        if method == "Nelder-Mead":  # scipy's own first steps are a part of x, which is next to none at x = 0
+            limits["initial_simplex"] = np.vstack([start, start + np.diag(_first_steps(start, low, high))])
         ended = minimize(lambda x: float(values(x[None])[0]), start, options=limits, **how)
-    found = named(best[1])
-    at_bound = tuple(
-        f.name for f, x, a, b in zip(fits, best[1], low, high, strict=True) if min(x - a, b - x) < 2e-3
-    )
-    return Tuned(
-        graph, found, named(start), measure, problem.metric, problem.judged(found, len(recordings)), count,
-        bool(ended.success), str(ended.message), at_bound,
-    )  # fmt: skip
+    ends = zip(fits, best[1], low, high, strict=True)
+    at_bound = {f.name: "low" if x - a < b - x else "high" for f, x, a, b in ends if min(x - a, b - x) < 2e-3}
+    return Found(named(best[1]), count, bool(ended.success), str(ended.message), at_bound)
 
 
-class _Problem:
-    """A graph on recordings, each loaded once."""
-
-    def __init__(
-        self, graph: str, recordings: Sequence[Recording], settings: Mapping[str, Value],
-        measure: str, metric: str | None, engine: str,
-    ) -> None:  # fmt: skip
-        self.graph, self.recordings, self.settings = graph, recordings, settings
-        self.measure, self.metric, self.engine = measure, metric, engine
-        self._flights: list[Flight] = []
-        self._steps: OrderedDict[Any, Any] = OrderedDict()
-        for one in recordings:
-            _, flight = prepared(graph, one.data, one.seed, settings)
-            self._flights.append(flight)
-
-    def _case(self, place: int, point: Mapping[str, float]) -> Case:
-        one = self.recordings[place]
-        flight = self._flights[place]
-        with remembering(self._steps):  # only the blocks whose settings move are recorded anew
-            return prepared(self.graph, one.data, one.seed, {**self.settings, **point}, flight)[0]
-
-    def _results(self, cases: Sequence[Case], places: Sequence[int]) -> list[Result | Exception]:
-        """A result a case; of one that raises, what it raises."""
-        found: list[Result | Exception] = []
-        if self.engine not in MANY:
-            for case, place in zip(cases, places, strict=True):
-                seed = self.recordings[place].seed
-                try:
-                    found.append(simulate(case.graph, case.inputs, engine=self.engine, seed=seed))
-                except Exception as error:
-                    found.append(error)
-            return found
-        made: dict[int, Result | Exception] = {}
-        for program, members in grouped(cases):
-            seeds = [self.recordings[places[k]].seed for k in members]
-            several = [cases[k] for k in members]
-            chunk = min(64, 2 ** math.ceil(math.log2(len(members))))
-            try:
-                results: Sequence[Any] = simulate_together(
-                    several, seeds, program=program, engine=self.engine, dtype="float64", chunk=chunk
-                )
-            except Exception as error:
-                results = [error] * len(members)
-            made.update(zip(members, results, strict=True))
-        return [made[k] for k in range(len(cases))]
-
-    def measured(self, points: Sequence[Mapping[str, float]], count: int) -> np.ndarray:
-        """The measure (points, recordings) on the first `count` recordings."""
-        pairs = [(p, k) for p in points for k in range(count)]
-        cases = [self._case(k, p) for p, k in pairs]
-        results = self._results(cases, [k for _, k in pairs])
-        found = [self._value(c, r) for c, r in zip(cases, results, strict=True)]
-        return np.array(found).reshape(len(points), count)
-
-    def _value(self, case: Case, result: Result | Exception) -> float:
-        if isinstance(result, DataError):
-            raise result  # the recording is wrong, whatever the parameters
-        if isinstance(result, Exception):
-            return _ASTRAY
-        if self.measure == "likelihood":
-            value = surprise(result)
-        else:
-            error = self._score(case, result)
-            value = math.log(error) if error > 0 else _ASTRAY
-        return min(value, _ASTRAY) if math.isfinite(value) else _ASTRAY
-
-    def _score(self, case: Case, result: Result) -> float:
-        score = case.score(result)
-        self.metric = self.metric or next(iter(score), None)
-        if self.metric not in score:
-            raise DataError(
-                "there is no such error to make small",
-                path=f"tune, {self.graph}",
-                expected=", ".join(score) or "a flight with a truth",
-                got=str(self.metric),
-                fix="choose another metric, or measure=likelihood, which needs no truth",
-            )
-        return float(score[self.metric])
-
-    def judged(self, point: Mapping[str, float], fitted: int) -> tuple[Judged, ...]:
-        """Each recording with the graph's own values and with those found."""
-        found = []
-        for k, one in enumerate(self.recordings):
-            cases = [self._case(k, {}), self._case(k, point)]
-            results = self._results(cases, [k, k])
-            before, after = (self._value(c, r) for c, r in zip(cases, results, strict=True))
-            scores = [
-                c.score(r) if isinstance(r, Result) else {} for c, r in zip(cases, results, strict=True)
-            ]
-            both = {n: (scores[0][n], scores[1][n]) for n in scores[0] if n in scores[1]}
-            found.append(Judged(one, k >= fitted, before, after, both))
-        return tuple(found)
-
-
-def surprise(result: Result) -> float:
-    """The negative log-likelihood of all innovations of a run, a measured value.
-
-    Raises:
-        DataError: where the graph collects none: streams with a `residual` and its `covariance`.
-    """
-    total, count = 0.0, 0.0
-    for series in result.series.values():
-        names = series.leaves
-        if not {"residual", "covariance"} <= set(names) or not len(series):
-            continue
-        r, S = names["residual"], names["covariance"]
-        sign, size = np.linalg.slogdet(S)
-        if not (sign > 0).all() or not np.isfinite(r).all():
-            return math.inf
-        parts = names["parts"] if "parts" in names else np.full(len(r), float(r.shape[-1]))
-        nis = (r * np.linalg.solve(S, r[..., None])[..., 0]).sum(-1)
-        total += 0.5 * float((nis + size + parts * math.log(2.0 * math.pi)).sum())
-        count += float(parts.sum())
-    if not count:
-        raise DataError(
-            "this graph collects no innovations",
-            path=f"tune, {result.graph}",
-            expected="an output with the fields residual and covariance, with events",
-            got=", ".join(result.series) or "no outputs",
-            fix="tune by error, or collect the innovation in the graph",
-        )
-    return total / count
+def _first_steps(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """A quarter of the way between the bounds, at most a factor e, towards the farther one."""
+    sign = np.where(high - start >= start - low, 1.0, -1.0)
+    return np.asarray(sign * np.minimum(1.0, 0.25 * (high - low)))
 
 
 def _check(
     graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
-    settings: Mapping[str, Value], most: int,
+    settings: Mapping[str, Value], most: int, folds: int | None,
 ) -> None:  # fmt: skip
     def wrong(place: str, expected: str, got: object) -> DeclarationError:
         return DeclarationError(
@@ -338,6 +255,13 @@ def _check(
         raise wrong("held-out", "recordings that are not fitted to", both[0])
     if type(most) is not int or most < 1:
         raise wrong("most", "a whole number from 1", most)
+    if folds is not None and (type(folds) is not int or not 2 <= folds <= len(recordings)):
+        raise wrong("folds", f"a whole number from 2 to that of the recordings, {len(recordings)}", folds)
+    if folds is not None and held_out:
+        raise wrong("folds", "either folds or recordings that are held out", f"{len(held_out)} held out")
+    twice = [r for k, r in enumerate(recordings) if r in recordings[:k]]
+    if twice:
+        raise wrong("data", "each recording once", twice[0])
     prepare = find_graph(graph).prepare
     for fit in fits:
         numbers = [x for x in (fit.low, fit.start or fit.low, fit.high)]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import socket
+import threading
 
 import pytest
 
@@ -88,10 +91,39 @@ def test_a_number_of_workers_that_cannot_be_is_refused(kind, workers):
 
 
 def test_a_scheduler_that_does_not_answer_is_an_error():
-    distributed = pytest.importorskip("distributed")
-    import dask
+    pytest.importorskip("distributed")
+    with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
+        OnDask("tcp://127.0.0.1:9", patience=0.5)
+    assert "no answer within 0.5 s" in caught.value.got
 
-    with dask.config.set({"distributed.comm.timeouts.connect": "500ms"}):
-        assert distributed
+
+@pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:9", "127.0.0.1", "tcp://"])
+def test_an_address_that_is_none_is_an_error_at_once(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
+        OnDask(address)
+    assert address in caught.value.got
+
+
+@pytest.mark.parametrize("said", [b"HTTP/1.0 400 Bad Request\r\n\r\nnothing here", b"", None])
+def test_what_is_no_scheduler_is_told_from_one(said):
+    """A web server, one that hangs up, and one that listens and says nothing."""
+    pytest.importorskip("distributed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    caller = server.accept()[0]
+                    if said is None:
+                        kept.append(caller)
+                        continue
+                    with caller, contextlib.suppress(OSError):
+                        caller.sendall(said)
+
+        kept: list[socket.socket] = []
+        threading.Thread(target=serve, daemon=True).start()
         with pytest.raises(DeclarationError, match="no scheduler answers"):
-            OnDask("tcp://127.0.0.1:9")
+            OnDask(f"tcp://127.0.0.1:{server.getsockname()[1]}", patience=0.5)
+        for caller in kept:
+            caller.close()

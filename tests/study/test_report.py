@@ -92,7 +92,7 @@ def test_pairs_are_by_seed_and_flight():
     (line,) = compared(a, b, ["e"])
     assert line["pairs"] == 60
     assert 0.87 < line["low"] < line["ratio"] < line["high"] < 0.93
-    assert line["better"] > 0.9
+    assert line["less"] > 0.9
 
 
 def test_the_interval_covers_the_truth_as_often_as_it_says():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import math
@@ -255,6 +256,57 @@ def test_a_worker_killed_in_the_middle_changes_nothing(kind, undisturbed, tmp_pa
     assert watcher.killed
     assert done.done == 20
     assert told(read_table(tmp_path)) == rows
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """The address of a Dask scheduler with two workers, each a process of its own without a nurse."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    near = ["--scheduler-file", str(file), "--no-dashboard"]
+    commands = [["dask_scheduler", "--host", "127.0.0.1", "--port", "0", *near]]
+    commands += [["dask_worker", *near, "--nthreads", "1", "--no-nanny", "--name", f"{k}"] for k in range(2)]
+    with contextlib.ExitStack() as all_of:
+        for name, *options in commands:
+            process = subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.{name}", *options],
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path,
+            )  # fmt: skip
+            all_of.callback(process.wait)
+            all_of.callback(process.kill)
+        deadline = time.monotonic() + 90
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"]
+
+
+@pytest.mark.slow
+def test_a_scheduler_elsewhere_loses_a_worker_and_nothing_else(cluster, undisturbed, tmp_path):
+    """Scheduler and workers are processes that were there before; one is killed while it works."""
+    study, rows = undisturbed
+    with OnDask(cluster, patience=30.0) as executor:
+        deadline = time.monotonic() + 90
+        while len(executor.pids()) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        watcher = Murderer(executor)
+        done = run_study(study, tmp_path / "out", executor=executor, watcher=watcher)
+        alive = executor.pids()
+    assert watcher.killed
+    assert len(alive) == 1
+    assert watcher.killed not in alive
+    assert done.done == 20
+    assert told(read_table(tmp_path / "out")) == rows
+
+
+@pytest.mark.slow
+def test_the_command_uses_a_scheduler_elsewhere(cluster, undisturbed, tmp_path):
+    study, rows = undisturbed
+    (tmp_path / "study.json").write_text(json.dumps(study.resolved()))
+    command = [sys.executable, "-c", "from flowgraph.cli import main; main()", "batch", "study.json"]
+    command += ["--out", "out", "--scheduler", cluster, "--quiet"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert told(read_table(tmp_path / "out")) == rows
 
 
 def test_a_study_killed_and_run_again_changes_nothing(undisturbed, tmp_path):

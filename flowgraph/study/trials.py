@@ -1,0 +1,193 @@
+"""What a search for parameters makes small: a measure of a graph on recordings, at given settings.
+
+Two measures can be made small. With `likelihood`, the negative logarithm of how likely the innovations r of
+covariance S are, a value read,
+
+    1/2 (r^T S^-1 r + log det S + m log 2 pi)        summed over all, over the number of values
+
+which needs no truth, and has its least where the filter is as sure as it is right (R. Mehra, "On the
+identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control 15(2), 1970; F. C.
+Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11(1),
+1965). With `error`, the logarithm of a metric against the truth, of which the mean over recordings is taken,
+so that a recording counts by how much better it gets and not by how hard it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from flowgraph.errors import DataError
+from flowgraph.recording import remembering
+from flowgraph.registry import Case
+from flowgraph.result import Result
+from flowgraph.series import Flight
+from flowgraph.simulate import simulate
+from flowgraph.study.spec import Value
+from flowgraph.study.tasks import MANY, grouped, prepared, simulate_together
+
+ASTRAY = 1e6
+"""What a recording counts on which the filter fails: more than any that works."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight to fit to or to judge by, and the seed of it and of the run."""
+
+    data: str
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One recording by the measure that was made small, and by the metrics: a value each of three.
+
+    Args:
+        recording: which.
+        held_out: whether the search that gave `after` did without it.
+        before: at the start of the search. after: with what was found. own: with the graph's own settings.
+        metrics: before, after and own, by name; those that all three have.
+        fold: the number of the search that it was held out of, from 0, where there were several.
+    """
+
+    recording: Recording
+    held_out: bool
+    before: float
+    after: float
+    own: float
+    metrics: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    fold: int | None = None
+
+
+class Trials:
+    """A graph on recordings, each loaded once."""
+
+    def __init__(
+        self, graph: str, recordings: Sequence[Recording], settings: Mapping[str, Value],
+        measure: str, metric: str | None, engine: str,
+    ) -> None:  # fmt: skip
+        self.graph, self.recordings, self.settings = graph, recordings, settings
+        self.measure, self.metric, self.engine = measure, metric, engine
+        self._flights: list[Flight] = []
+        self._steps: OrderedDict[Any, Any] = OrderedDict()
+        for one in recordings:
+            _, flight = prepared(graph, one.data, one.seed, settings)
+            self._flights.append(flight)
+
+    def _case(self, place: int, point: Mapping[str, float]) -> Case:
+        one = self.recordings[place]
+        flight = self._flights[place]
+        with remembering(self._steps):  # only the blocks whose settings move are recorded anew
+            return prepared(self.graph, one.data, one.seed, {**self.settings, **point}, flight)[0]
+
+    def _results(self, cases: Sequence[Case], places: Sequence[int]) -> list[Result | Exception]:
+        """A result a case; of one that raises, what it raises."""
+        found: list[Result | Exception] = []
+        if self.engine not in MANY:
+            for case, place in zip(cases, places, strict=True):
+                seed = self.recordings[place].seed
+                try:
+                    found.append(simulate(case.graph, case.inputs, engine=self.engine, seed=seed))
+                except Exception as error:
+                    found.append(error)
+            return found
+        made: dict[int, Result | Exception] = {}
+        for program, members in grouped(cases):
+            seeds = [self.recordings[places[k]].seed for k in members]
+            several = [cases[k] for k in members]
+            chunk = min(64, 2 ** math.ceil(math.log2(len(members))))
+            try:
+                results: Sequence[Any] = simulate_together(
+                    several, seeds, program=program, engine=self.engine, dtype="float64", chunk=chunk
+                )
+            except Exception as error:
+                results = [error] * len(members)
+            made.update(zip(members, results, strict=True))
+        return [made[k] for k in range(len(cases))]
+
+    def measured(self, points: Sequence[Mapping[str, float]], places: Sequence[int]) -> np.ndarray:
+        """The measure (points, recordings) on the recordings at some places."""
+        pairs = [(p, k) for p in points for k in places]
+        cases = [self._case(k, p) for p, k in pairs]
+        results = self._results(cases, [k for _, k in pairs])
+        found = [self._value(c, r) for c, r in zip(cases, results, strict=True)]
+        return np.array(found).reshape(len(points), len(places))
+
+    def _value(self, case: Case, result: Result | Exception) -> float:
+        if isinstance(result, DataError):
+            raise result  # the recording is wrong, whatever the parameters
+        if isinstance(result, Exception):
+            return ASTRAY
+        if self.measure == "likelihood":
+            value = surprise(result)
+        else:
+            error = self._score(case, result)
+            value = math.log(error) if error > 0 else ASTRAY
+        return min(value, ASTRAY) if math.isfinite(value) else ASTRAY
+
+    def _score(self, case: Case, result: Result) -> float:
+        score = case.score(result)
+        self.metric = self.metric or next(iter(score), None)
+        if self.metric not in score:
+            raise DataError(
+                "there is no such error to make small",
+                path=f"tune, {self.graph}",
+                expected=", ".join(score) or "a flight with a truth",
+                got=str(self.metric),
+                fix="choose another metric, or measure=likelihood, which needs no truth",
+            )
+        return float(score[self.metric])
+
+    def judged(
+        self, places: Sequence[int], start: Mapping[str, float], point: Mapping[str, float], *,
+        held_out: bool, fold: int | None = None,
+    ) -> list[Judged]:  # fmt: skip
+        """Recordings at the start, with what was found, and with the graph's own settings."""
+        found = []
+        for k in places:
+            cases = [self._case(k, p) for p in (start, point, {})]
+            results = self._results(cases, [k] * 3)
+            before, after, own = (self._value(c, r) for c, r in zip(cases, results, strict=True))
+            scores = [
+                c.score(r) if isinstance(r, Result) else {} for c, r in zip(cases, results, strict=True)
+            ]
+            first, *others = scores
+            all_of = {n: tuple(s[n] for s in scores) for n in first if all(n in s for s in others)}
+            metrics = {n: (float(a), float(b), float(c)) for n, (a, b, c) in all_of.items()}
+            found.append(Judged(self.recordings[k], held_out, before, after, own, metrics, fold))
+        return found
+
+
+def surprise(result: Result) -> float:
+    """The negative log-likelihood of all innovations of a run, a measured value.
+
+    Raises:
+        DataError: where the graph collects none: streams with a `residual` and its `covariance`.
+    """
+    total, count = 0.0, 0.0
+    for series in result.series.values():
+        names = series.leaves
+        if not {"residual", "covariance"} <= set(names) or not len(series):
+            continue
+        r, S = names["residual"], names["covariance"]
+        sign, size = np.linalg.slogdet(S)
+        if not (sign > 0).all() or not np.isfinite(r).all():
+            return math.inf
+        parts = names["parts"] if "parts" in names else np.full(len(r), float(r.shape[-1]))
+        nis = (r * np.linalg.solve(S, r[..., None])[..., 0]).sum(-1)
+        total += 0.5 * float((nis + size + parts * math.log(2.0 * math.pi)).sum())
+        count += float(parts.sum())
+    if not count:
+        raise DataError(
+            "this graph collects no innovations",
+            path=f"tune, {result.graph}",
+            expected="an output with the fields residual and covariance, with events",
+            got=", ".join(result.series) or "no outputs",
+            fix="tune by error, or collect the innovation in the graph",
+        )
+    return total / count
