@@ -160,7 +160,20 @@ def python_digest(graph: Graph, *, every: bool = False) -> str:
     They are those of the host, or, with `every`, all. Empty where there are none.
     """
     calls = [n for n in graph.nodes if isinstance(n, CallNode) and (every or n.block.host)]
-    return digest([(n.path, code_digest(n.block.step), dict(n.settings)) for n in calls]) if calls else ""
+    return (
+        digest([(n.path, code_digest(n.block.step), _settings(n.settings)) for n in calls]) if calls else ""
+    )
+
+
+def _settings(settings: Mapping[str, Any]) -> Any:
+    """The digest of each; of one that holds itself, as a figure does, only its kind."""
+    found = {}
+    for name, value in settings.items():
+        try:
+            found[name] = digest(value)
+        except RecursionError:
+            found[name] = type(value).__qualname__
+    return found
 
 
 def failure_digest(error: BaseException) -> str:

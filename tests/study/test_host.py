@@ -177,6 +177,26 @@ def test_a_changed_host_block_is_another_key(installed, monkeypatch):
     assert not first & {r.key for r in execution.plan(study("reference")).runs}
 
 
+def test_a_setting_that_holds_itself_counts_by_its_kind():
+    """Such as the figure that a display draws on."""
+
+    class Figure:
+        def __init__(self):
+            self.axes = [self]
+
+    @block(host=True)
+    def show(x: Scalar, *, on: Any) -> Scalar:
+        return x
+
+    @graph
+    def shown(x: Stream[Scalar], *, on: Any):
+        return {"x": show(x, on=on)}
+
+    described = keys.python_digest(shown.build(on=Figure()))
+    assert described == keys.python_digest(shown.build(on=Figure()))
+    assert described != keys.python_digest(shown.build(on=object))
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_graph_of_host_blocks_alone_is_refused_run_by_run(engine, tmp_path):
     """PnP alone has nothing to accelerate: each row names the block and the engine that runs it."""

@@ -127,3 +127,12 @@ def test_graphs_of_many_seeds_are_lowered_once(name, monkeypatch):
         found.append(lowered.lower(case.graph))
     assert found[1] is found[0]
     assert found[2] is found[0]
+
+
+def test_results_do_not_depend_on_the_number_of_workers_or_the_chunk(tmp_path):
+    """To the last bit: each run starts from its own state, wherever its outputs are put."""
+    one = run_study(study("c", seeds=5, chunk=5), tmp_path / "one")
+    two = run_study(study("c", seeds=5, chunk=2), tmp_path / "two", workers=2)
+    assert not [*one.failed, *two.failed]
+    assert [numbers(row) for row in one.rows] == [numbers(row) for row in two.rows]
+    assert len({row["position_rmse_m"] for row in one.rows}) == 5
