@@ -18,11 +18,10 @@ from flowgraph.c.compile import FLAGS
 from flowgraph.c.source import Source, generate
 from flowgraph.c.syntax import comment, string
 from flowgraph.errors import OutputError, writes
-from flowgraph.graph import NEVER
-from flowgraph.inputs import Inputs, Tape, prepare, tape
+from flowgraph.inputs import Inputs
 from flowgraph.optimise import for_engine, optimise
 from flowgraph.pipeline import Leaf, Pipeline, Port
-from flowgraph.playback import check_together, sources_of
+from flowgraph.pipeline_inputs import events_of
 from flowgraph.program import specialise
 
 
@@ -251,9 +250,7 @@ def write_events(pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: s
         DataError, UnknownNameError: as for a run.
         OutputError: where the file cannot be written.
     """
-    sources, given = sources_of(pipeline, inputs)
-    events: Tape = tape(prepare(sources, given, dict.fromkeys(sources.sources, NEVER)), sources)
-    check_together(pipeline, events)
+    events = events_of(pipeline, inputs)
     columns = [_texts(port, s) for port, s in zip(pipeline.inputs, events.series, strict=True)]
     rows = [iter(c) for c in columns]
     with writes(file), open(file, "w") as out:
