@@ -22,10 +22,11 @@ from flowgraph.errors import (
 from flowgraph.export import write_tum
 from flowgraph.graph import Graph
 from flowgraph.inputs import arrays, clocks_of, ticks, timing_of
-from flowgraph.joins import collect, every, latest, match, merge, sink, zip, zip_latest, zip_latest_right
+from flowgraph.joins import collect, every, latest, merge, sink
 from flowgraph.lowering import lower
 from flowgraph.many import Batch, simulate_many
 from flowgraph.operations import drop, group_by, scan, take_while, tap, until, unzip
+from flowgraph.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.pipeline import Pipeline
 from flowgraph.registry import Case, Report, find_graph, load_flight
 from flowgraph.result import Result

@@ -34,7 +34,7 @@ from flowgraph import (
     zip_latest_right,
 )
 from flowgraph.clock import Counted, Source, counted, disjoint
-from flowgraph.joins import _zip_plan
+from flowgraph.pairs import _zip_plan
 from tests.support import all_engines, pairs, scalars
 
 
