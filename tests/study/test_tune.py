@@ -211,7 +211,7 @@ def test_the_command_says_at_which_bound_a_search_ended():
 
 @pytest.mark.slow
 def test_tuning_from_the_data_sheet_lowers_the_error_on_recordings_that_were_held_out():
-    """As in docs/studies.md, with fewer folds and points. What was tuned by hand stands beside it as `own`."""
+    """As in docs/studies.md, with fewer folds and points. What was tuned by hand is beside it, as `own`."""
     folder = recordings("ese650")
     words = ["tune", "quaternion_ukf", *(w for k in range(1, 7) for w in ("--data", f"ese650:{folder}:{k}"))]
     words += ["--folds", "2", "--by", "error", "--metric", "inclination_rmse_deg", "--engine", "c"]
