@@ -12,8 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowgraph import Case, Flight, Stream, collect, delay, graph, latest
-from flowgraph.blocks.euler import need_order
+from flowgraph import Stream, collect, delay, graph, latest
 from flowgraph.blocks.euler_ins import (
     euler_angles,
     navigation_belief,
@@ -25,10 +24,7 @@ from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.kalman import Gaussian
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.pnp import PoseMeasurement
-from flowgraph.checks import need_numbers
-from flowgraph.graphs.euler_flight import noise_of, pose_covariance, scored, start_at
-from flowgraph.graphs.tag_pose import poses_of
-from flowgraph.inputs import clocks_of
+from flowgraph.graphs.euler_flight import on_pose_flight
 
 
 @graph
@@ -63,54 +59,4 @@ def ins_ekf_pose(
     }
 
 
-@ins_ekf_pose.on_flight
-def for_flight(
-    flight: Flight,
-    *,
-    order: str = "zxy",
-    tags: str = "all",
-    gyro_factor: float = 1.0,
-    accelerometer_factor: float = 1.0,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    gate: float | None = None,
-    settle: float = 1.0,
-) -> Case:
-    """Start the filter at the first measured pose of a flight, at rest and without biases.
-
-    Args:
-        flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and `vicon`.
-        order: zxy (the course's) or zyx (the report's).
-        tags: all, even or odd: the ids that PnP uses.
-        gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
-        position_noise, attitude_noise: standard deviations, m and rad, beyond the pose's own covariance; the
-            flight's, or 0.002 and 0.002, if left out.
-        gate: a measurement with a larger normalised innovation squared changes nothing.
-        settle: seconds at the start that the errors leave out.
-
-    Raises:
-        DataError: where the flight lacks a stream.
-        DeclarationError, UnknownNameError: for a setting that is out of range.
-    """
-    need_order(order, "ins_ekf_pose.order")
-    need_numbers(
-        "ins_ekf_pose",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
-    inputs = flight.need("ins_ekf_pose", "imu") | {"pose": poses_of("ins_ekf_pose", flight, tags=tags)}
-    built = ins_ekf_pose.build(
-        **clocks_of(inputs),
-        start=start_at(inputs["pose"], order),
-        noise=noise_of(flight, gyro_factor, accelerometer_factor),
-        R=pose_covariance(flight.info, position_noise, attitude_noise),
-        order=order,
-        gate=gate,
-    )
-    return Case(built, inputs, scored(flight, order, settle))
+for_flight = on_pose_flight(ins_ekf_pose)

@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, DeclarationError, Flight, Stream, delay, graph, latest, merge
-from flowgraph.blocks.euler import need_order
 from flowgraph.blocks.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.inertial import ImuNoise
@@ -30,9 +29,7 @@ from flowgraph.blocks.state_particles import (
 )
 from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.checks import need_numbers
-from flowgraph.graphs.euler_flight import noise_of, pose_covariance, scored, start_at
-from flowgraph.graphs.tag_pose import poses_of
-from flowgraph.inputs import clocks_of
+from flowgraph.graphs.euler_flight import need_settings, pose_case
 
 MOST_PARTICLES = 2**18
 
@@ -121,18 +118,15 @@ def for_flight(
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    need_order(order, "ins_particle.order")
-    need_numbers(
-        "ins_particle",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-            "inflate": inflate,
-        },
-        not_negative={"settle": settle, "resample_below": resample_below, "spread": spread},
-    )
+    shared: dict[str, Any] = {
+        "gyro_factor": gyro_factor,
+        "accelerometer_factor": accelerometer_factor,
+        "position_noise": position_noise,
+        "attitude_noise": attitude_noise,
+        "inflate": inflate,
+    }
+    need_settings("ins_particle", order, settle, **shared)
+    need_numbers("ins_particle", not_negative={"resample_below": resample_below, "spread": spread})
     if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
         raise DeclarationError(
             "setting 'particles' is out of range",
@@ -141,16 +135,16 @@ def for_flight(
             got=repr(particles),
             fix="write particles=5000",
         )
-    inputs = flight.need("ins_particle", "imu") | {"pose": poses_of("ins_particle", flight, tags=tags)}
-    built = ins_particle.build(
-        **clocks_of(inputs),
-        start=start_states(particles, start_at(inputs["pose"], order), seed=seed),
-        noise=noise_of(flight, gyro_factor, accelerometer_factor),
-        R=pose_covariance(flight.info, position_noise, attitude_noise) * inflate**2,
-        factor=inflate**2,
+    return pose_case(
+        ins_particle,
+        flight,
         order=order,
+        tags=tags,
+        settle=settle,
+        start=lambda first: start_states(particles, first, seed=seed),
+        factor=inflate**2,
         resample_below=resample_below,
         spread=spread,
         scheme=scheme,
+        **shared,
     )
-    return Case(built, inputs, scored(flight, order, settle))

@@ -15,7 +15,6 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
-from flowgraph.blocks.euler import need_order
 from flowgraph.blocks.euler_ins import (
     STATE,
     euler_angles,
@@ -32,9 +31,8 @@ from flowgraph.blocks.unscented import predict_unscented
 from flowgraph.blocks.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import CameraMotion
-from flowgraph.checks import need_numbers
 from flowgraph.errors import UnknownNameError
-from flowgraph.graphs.euler_flight import noise_of, scored
+from flowgraph.graphs.euler_flight import need_settings, noise_of, scored
 from flowgraph.inputs import clocks_of
 
 
@@ -105,20 +103,12 @@ def for_flight(
         DataError: where the flight lacks a stream or the truth.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    need_order(order, "ins_ukf_velocity.order")
+    need_settings(
+        "ins_ukf_velocity", order, settle, gyro_factor=gyro_factor, accelerometer_factor=accelerometer_factor,
+        velocity_noise=velocity_noise, rate_noise=rate_noise, gate=gate,
+    )  # fmt: skip
     if rate not in RATES:
         raise UnknownNameError("source of the rate", rate, RATES, path="ins_ukf_velocity.rate")
-    need_numbers(
-        "ins_ukf_velocity",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "velocity_noise": velocity_noise,
-            "rate_noise": rate_noise,
-            "gate": gate,
-        },
-        not_negative={"settle": settle},
-    )
     inputs = flight.need("ins_ukf_velocity", "imu", "motion")
     if flight.truth is None:
         raise DataError(

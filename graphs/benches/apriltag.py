@@ -18,7 +18,7 @@ import numpy as np
 
 from flowgraph import Flight, Report, Series, simulate
 from flowgraph.blocks.datasets import course, rob6213, studentdata, umd
-from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.metrics import interpolate_pose, pose_errors, within_truth
 from flowgraph.blocks.vision.mapping import frames_of
 from flowgraph.blocks.vision.motion import velocity_error
 from flowgraph.blocks.vision.pnp import rotation_of, solve
@@ -30,12 +30,13 @@ from flowgraph.graphs.ins_ukf_pose import ins_ukf_pose
 from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
 from flowgraph.graphs.tag_pose import map_of, poses_of
 
-__all__ = ["apriltag", "held_out", "odd_reprojection", "withheld"]
+__all__ = ["apriltag", "drift", "held_out", "lasting", "odd_reprojection", "withheld"]
 
 PUBLISHED = {  # position, 3-D metres, on files 1-7: extended filter, particle filter
     1: (0.156, 0.142), 2: (0.119, 0.144), 3: (0.186, 0.133), 4: (0.192, 0.136), 5: (0.151, 0.158),
     6: (0.090, 0.141), 7: (0.117, 0.145),
 }  # fmt: skip
+SPANS = (0.5, 1.0, 2.0, 3.0, 5.0)  # s, over which a drift is told
 BLIND = 1e4  # m^2 and rad^2: the covariance of a pose that says nothing
 
 
@@ -162,6 +163,10 @@ def _flown(
         result = simulate(case.graph, case.inputs)
         if "ukf_pose" in name:
             _draw(figures, flight, result)
+        if "velocity" in name:
+            grown = {span: drift(result["belief"], flight.truth, span) for span in SPANS}
+            said = "; ".join(f"{h:.4f} in {span:g} s ({a:.4f})" for span, (a, h) in grown.items())
+            notes.append(f"{flight.name}: {name}: drift in the plane (3-D), m: {said}")
         yield _row(flight.name, name, case.score(result), raw if "pose" in name else None)
     fit = velocity_error(flight.streams["motion"], flight.truth, flight.info["mount"])
     yield _row(flight.name, f"camera velocity, {flight.info['delay']:.3f} s late", {}, None, **{"m/s": fit})
@@ -176,6 +181,11 @@ def _hand_held(flight: Flight, notes: list[str], gap: float) -> Iterator[dict[st
     notes.append(f"{flight.name}: split-half distance of camera positions {1e3 * apart:.2f} mm (median)")
     yield _row(flight.name, "PnP from even ids: odd ids", {}, None, px=pixels)
     even = poses_of("apriltag", flight, tags="even")
+    best = poses_of("apriltag", flight)
+    seen = odd_reprojection(flight, tag_map, dict(zip(best.time.tolist(), _poses(best), strict=True)))
+    yield _row(flight.name, "PnP from all ids, those that judge it too", {}, None, px=_median(seen))
+    kept = lasting(flight, tag_map, dict(zip(even.time.tolist(), _poses(even), strict=True)))
+    notes.append(f"{flight.name}: correlation of an odd corner's residual with the image before: {kept:.2f}")
     blind, gapped = withheld(even, gap)
     held = dict(zip(even.time.tolist(), _poses(blind), strict=True))
     for name, used, hidden in (
@@ -216,20 +226,80 @@ def _poses(series: Series) -> list[tuple[np.ndarray, np.ndarray]]:
     return list(zip(series["position"], rotation_of(series["attitude"]), strict=True))
 
 
-def odd_reprojection(
-    flight: Flight, tag_map: TagMap, poses: Mapping[int, tuple[np.ndarray, np.ndarray]]
-) -> dict[int, np.ndarray]:
-    """By time (ns), the distances (px) of the odd ids' corners from where a pose of the body puts them."""
+def drift(belief: Series, truth: Series, span: float) -> tuple[float, float]:
+    """By how much the position's error grows within `span` seconds: root mean square over all starts, m, in
+    three dimensions and in the horizontal plane.
+
+    Raises:
+        DataError: when the run is shorter than the span.
+    """
+    seen = within_truth(belief, truth, 0.0)
+    apart = seen["position"] - interpolate_pose(truth, seen.time)[0]
+    later = np.searchsorted(seen.time, seen.time + round(span * 1e9))
+    inside = later < len(seen)
+    if not inside.any():
+        raise DataError(
+            "the run is shorter than the span of the drift",
+            path=belief.name,
+            expected=f"more than {span:g} s within the truth",
+            got=f"{len(seen)} beliefs",
+            fix="choose a shorter span",
+        )
+    squared = (apart[later[inside]] - apart[inside]) ** 2
+    return float(np.sqrt(squared.sum(axis=1).mean())), float(np.sqrt(squared[:, :2].sum(axis=1).mean()))
+
+
+Poses = Mapping[int, tuple[np.ndarray, np.ndarray]]
+"""Position and attitude matrix of the body by time, ns."""
+
+
+def _odd_residuals(
+    flight: Flight, tag_map: TagMap, poses: Poses
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Time, odd ids (k,) and where a pose puts their corners minus where they are (k, 4, 2), px."""
     camera, mount, tags = flight.info["camera"], flight.info["mount"], flight.streams["tags"]
-    found = {}
     for time, (ids, corners) in zip(tags.time.tolist(), frames_of(tags), strict=True):
         places, known = tag_map.find(ids)
         odd = known & (ids % 2 == 1)
         if time in poses and odd.any():
             R, t = mount.view(*poses[time])
-            seen = places[odd] @ R.T + t
-            found[time] = np.linalg.norm(camera.project(seen) - corners[odd], axis=-1).ravel()
-    return found
+            yield time, ids[odd], camera.project(places[odd] @ R.T + t) - corners[odd]
+
+
+def odd_reprojection(flight: Flight, tag_map: TagMap, poses: Poses) -> dict[int, np.ndarray]:
+    """By time (ns), the distances (px) of the odd ids' corners from where a pose of the body puts them."""
+    found = _odd_residuals(flight, tag_map, poses)
+    return {time: np.linalg.norm(residual, axis=-1).ravel() for time, _, residual in found}
+
+
+def lasting(flight: Flight, tag_map: TagMap, poses: Poses, *, most: float = 3.0) -> float:
+    """How much of the odd ids' residuals is still there in the next image: the correlation of each corner's
+    with its own before. Averaging over images takes away only what is not. Those beyond `most` px are left
+    out.
+
+    Raises:
+        DataError: when no odd id is seen in two images.
+    """
+    before: dict[int, np.ndarray] = {}
+    pairs: list[np.ndarray] = []
+    for _, ids, residual in _odd_residuals(flight, tag_map, poses):
+        for tag, now in zip(ids.tolist(), residual, strict=True):
+            if np.abs(now).max() > most:
+                before.pop(tag, None)
+                continue
+            if tag in before:
+                pairs.append(np.stack([before[tag].ravel(), now.ravel()]))
+            before[tag] = now
+    if not pairs:
+        raise DataError(
+            "no odd tag is seen twice",
+            path=flight.name,
+            expected="an odd id in two images",
+            got=f"{len(flight.streams['tags'])} images",
+            fix="choose another recording",
+        )
+    first, second = np.concatenate(pairs, axis=1)
+    return float(first @ second / np.sqrt((first @ first) * (second @ second)))
 
 
 def held_out(flight: Flight, tag_map: TagMap) -> tuple[float, float]:

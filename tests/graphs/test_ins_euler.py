@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,9 +26,18 @@ from flowgraph import (
     simulate,
 )
 from flowgraph.blocks.metrics import interpolate_pose, pose_errors, within_truth
-from flowgraph.blocks.vision.pnp import as_measurements
+from flowgraph.blocks.vision.motion import camera_motion_of
+from flowgraph.blocks.vision.pnp import as_measurements, rotation_of
 from flowgraph.graphs import ins_ekf_pose, ins_particle, ins_ukf_pose, ins_ukf_velocity, tag_pose
-from flowgraph.graphs.benches.apriltag import apriltag, held_out, odd_reprojection, withheld
+from flowgraph.graphs.benches.apriltag import (
+    SPANS,
+    apriltag,
+    drift,
+    held_out,
+    lasting,
+    odd_reprojection,
+    withheld,
+)
 from flowgraph.graphs.euler_flight import SingularityWarning
 from flowgraph.graphs.tag_pose import map_of, poses_of
 from flowgraph.plot_trajectory import plot_ins, plot_space
@@ -257,11 +268,13 @@ def test_the_shift_between_the_worlds_may_come_from_the_other_flight(number, oth
 @VICON
 @pytest.mark.parametrize("number", [1, 4])
 def test_recorded_velocities_do_not_diverge(number):
-    """The place in the horizontal plane drifts less with the gyroscope's rate than with the camera's.
+    """Over any span, the horizontal place drifts less with the gyroscope's rate than with the camera's.
 
     Not so the height: the optical flow's own error, 0.03 m/s for all of flight 4, outweighs the rate there.
     """
-    made, drift = recorded(number), {}
+    made = recorded(number)
+    far: dict[str, float] = {}
+    grown: dict[str, np.ndarray] = {}
     assert made.truth is not None
     for rate in ("gyro", "camera"):
         case = case_of(ins_ukf_velocity, made, rate=rate)
@@ -271,8 +284,63 @@ def test_recorded_velocities_do_not_diverge(number):
         assert score["tilt_rmse_deg"] < 0.5
         belief = within_truth(result["belief"], made.truth, 1.0)
         apart = belief["position"] - interpolate_pose(made.truth, belief.time)[0]
-        drift[rate] = np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1)))
-    assert drift["gyro"] < drift["camera"] < 0.07
+        far[rate] = np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1)))
+        grown[rate] = np.array([drift(result["belief"], made.truth, span) for span in SPANS])
+    assert far["gyro"] < far["camera"] < 0.07
+    better = grown["gyro"] < grown["camera"]
+    assert better[:, 1].all()
+    assert better[:, 0].all() or number == 4
+    assert grown["camera"][:, 1].max() < 0.06
+
+
+@VICON
+@pytest.mark.parametrize(("number", "falling"), [(1, -0.03), (4, -0.07)])
+def test_the_optical_flow_reads_a_descent_too_slow(number, falling):
+    """Why the height of flight 4 drifts: no mount, lever or scale is wrong by itself in one direction."""
+    made = recorded(number)
+    assert made.truth is not None
+    motion = made.streams["motion"]
+    motion = motion[(motion.time >= made.truth.time[0]) & (motion.time <= made.truth.time[-1])]
+    expected, _ = camera_motion_of(made.truth, motion.time, made.info["mount"])
+    down = expected[:, 2]
+    error = motion["velocity"][:, 2] - down
+    assert falling < error[down > 0.2].mean() < -0.008
+    assert abs(error[down < -0.2].mean()) < 0.005
+
+
+def test_drift_is_what_the_error_grows_by():
+    made = flight(1.0)
+    truth = made.truth
+    assert truth is not None
+    seconds = truth.seconds[:, None] - truth.seconds[0]
+    walked = truth["position"] + seconds * np.array([0.3, 0.4, 1.2])
+    belief = Series(truth.time, truth.values.replace(position=walked), name="belief")
+    np.testing.assert_allclose(drift(belief, truth, 0.25), (0.25 * 1.3, 0.25 * 0.5), rtol=1e-9)
+    shifted = Series(truth.time, truth.values.replace(position=truth["position"] + 1.0), name="belief")
+    np.testing.assert_allclose(drift(shifted, truth, 0.25), 0.0, atol=1e-12)
+    with pytest.raises(DataError, match=r"shorter than the span[\s\S]*more than 5 s"):
+        drift(belief, truth, 5.0)
+
+
+def test_what_lasts_of_a_reprojection():
+    """Corners with noise of their own in each image keep nothing; a wrong map keeps nearly all."""
+    made = flight(1.0)
+    truth, tags = made.truth, made.streams["tags"]
+    assert truth is not None
+    position, attitude = interpolate_pose(truth, tags.time)
+    poses = dict(zip(tags.time.tolist(), zip(position, rotation_of(attitude), strict=True), strict=True))
+    tag_map = map_of(made)
+    assert abs(lasting(made, tag_map, poses)) < 0.1
+    shaken = np.random.default_rng(1).normal(scale=4e-3, size=tag_map.corners.shape)
+    assert lasting(made, replace(tag_map, corners=tag_map.corners + shaken), poses) > 0.5
+    with pytest.raises(DataError, match=r"no odd tag is seen twice"):
+        lasting(made, tag_map, {})
+
+
+def test_the_kalman_filters_of_poses_share_their_settings():
+    kinds = [inspect.signature(cast(Any, g.prepare)) for g in (ins_ekf_pose, ins_ukf_pose)]
+    assert kinds[0] == kinds[1]
+    assert {"order", "tags", "gate", "position_noise"} <= set(kinds[0].parameters)
 
 
 @MAT
@@ -293,6 +361,9 @@ def test_tags_that_took_no_part_are_where_the_filter_puts_them(name):
     of = lambda s: odd_reprojection(
         made, tag_map, dict(zip(s.time.tolist(), zip(s["position"], _matrices(s), strict=True), strict=True))
     )
+    # what PnP errs by lasts: little is left that a filter could average
+    raw = dict(zip(even.time.tolist(), zip(even["position"], _matrices(even), strict=True), strict=True))
+    assert lasting(made, tag_map, raw) > 0.85
     ours, held = of(belief), of(blind)
     middle = lambda found, times: np.median(np.concatenate([found[t] for t in times if t in found]))
     assert middle(ours, list(held)) < middle(held, list(held))
