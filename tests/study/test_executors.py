@@ -94,7 +94,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error():
     pytest.importorskip("distributed")
     with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
         OnDask("tcp://127.0.0.1:9", patience=0.5)
-    assert "no answer within 0.5 s" in caught.value.got
+    assert "no answer within 0.5 s" in str(caught.value.got)
 
 
 @pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:9", "127.0.0.1", "tcp://"])
@@ -102,7 +102,7 @@ def test_an_address_that_is_none_is_an_error_at_once(address):
     pytest.importorskip("distributed")
     with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
         OnDask(address)
-    assert address in caught.value.got
+    assert address in str(caught.value.got)
 
 
 @pytest.mark.parametrize("said", [b"HTTP/1.0 400 Bad Request\r\n\r\nnothing here", b"", None])
