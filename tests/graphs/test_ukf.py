@@ -12,10 +12,8 @@ import pytest
 from flowgraph import Case, DataError, DeclarationError, Flight, LoweringError, load_flight, lower, simulate
 from flowgraph import simulate_many as many
 from flowgraph.blocks.consistency import chi_square_band, inside, state_nees
-from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply, to_matrix
+from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply
 from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.metrics import interpolate_pose
 from flowgraph.blocks.pose_model import start_state
 from flowgraph.graphs import ekf, ukf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
@@ -95,53 +93,6 @@ def test_single_precision_follows_double():
 def test_the_spread_of_the_points_changes_little():
     found = [case.score(simulate(case.graph, case.inputs)) for case in (a_case(), a_case(alpha=0.001))]
     assert abs(found[0]["position_rmse_m"] - found[1]["position_rmse_m"]) < 5e-3
-
-
-# The thesis's experiment
-
-
-THESIS = {
-    "HHH": (0.0345, 0.00517),
-    "HHL": (0.0920, 0.00917),
-    "HLL": (0.0329, 0.0102),
-    "LHH": (0.290, 0.326),
-    "LHL": (0.930, 0.295),
-    "LLL": (0.327, 0.324),
-}
-"""What the thesis prints for its UKF: mean squares, of metres and of squared Frobenius distances."""
-
-
-@cache
-def experiment(setting: str, seed: int) -> Flight:
-    vicon, force, rate = (1.0 if letter == "L" else 0.1 for letter in setting)
-    return load_world(
-        "thesis",
-        seed=seed,
-        settings={
-            "sensors": "gyro,coordinate_acceleration,vicon",
-            "gyro.noise": math.sqrt(rate / 200.0),
-            "coordinate_acceleration.noise": math.sqrt(force / 200.0),
-            "vicon.noise": math.sqrt(0.1 * vicon),
-            "vicon.attitude_noise": math.sqrt(0.1 * vicon),
-        },
-    )
-
-
-@pytest.mark.parametrize(
-    "setting", [s if s in ("HLL", "LLL") else pytest.param(s, marks=pytest.mark.slow) for s in THESIS]
-)
-def test_it_is_better_than_the_thesiss_in_its_own_metric(setting):
-    squares = []
-    for seed in range(2):
-        flight = experiment(setting, seed)
-        case = ukf.case(flight)
-        belief = simulate(case.graph, case.inputs)["belief"]
-        assert flight.truth is not None
-        p, q = interpolate_pose(flight.truth, belief.time)
-        R = to_matrix(belief.attitude, xp=np) - to_matrix(q, xp=np)
-        distance = np.einsum("nij,nij->n", R, R)
-        squares.append([np.mean(np.sum((belief.position - p) ** 2, axis=-1)), np.mean(distance**2)])
-    assert (np.mean(squares, axis=0) < THESIS[setting]).all()
 
 
 # Consistency
