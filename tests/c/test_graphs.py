@@ -36,14 +36,17 @@ SINGLE = {
 
 
 @pytest.mark.parametrize("name", LIBRARY)
-def test_all_engines_agree(name):
+def test_c_agrees_with_python_and_with_the_interpreter(name):
+    """XLA is compared in `tests/graphs/test_optimised.py`, and in each graph's own tests."""
     given = library_case(name)
     wanted = simulate(given.graph, given.inputs)
-    for engine in ("reference", "xla", "c"):
+    for engine in ("reference", "c"):
         same(wanted, simulate(given.graph, given.inputs, engine=engine), exact=False)
 
 
-@pytest.mark.parametrize("name", LIBRARY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "rbpf_outdoor" else n for n in LIBRARY]
+)
 def test_single_precision_stays_near(name):
     given = library_case(name)
     double = simulate(given.graph, given.inputs, engine="c")[given.estimate]
