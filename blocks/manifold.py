@@ -128,13 +128,10 @@ class StateSpace:
         self._flat = all(isinstance(p, _Euclidean) for p in parts)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, StateSpace) and self._kinds() == other._kinds()
+        return isinstance(other, StateSpace) and self.parts == other.parts
 
     def __hash__(self) -> int:
-        return hash(self._kinds())
-
-    def _kinds(self) -> tuple[tuple[type[Part], int], ...]:
-        return tuple((type(p), p.size) for p in self.parts)
+        return hash(self.parts)
 
     def __repr__(self) -> str:
         inside = ", ".join(f"{type(p).__name__[1:].lower()}({p.size})" for p in self.parts)

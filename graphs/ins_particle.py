@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowgraph import Case, DeclarationError, Flight, Stream, delay, graph, latest, merge
+from flowgraph import Case, Flight, Stream, delay, graph, latest, merge
 from flowgraph.blocks.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.extended import between_imu
 from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.resampling import MOST_PARTICLES
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.state_particles import (
     StateCloud,
@@ -28,10 +29,8 @@ from flowgraph.blocks.state_particles import (
     weigh_states,
 )
 from flowgraph.blocks.vision.pnp import PoseMeasurement
-from flowgraph.checks import need_numbers
+from flowgraph.checks import need_count, need_numbers
 from flowgraph.graphs.euler_flight import need_settings, pose_case
-
-MOST_PARTICLES = 2**18
 
 
 @graph
@@ -127,14 +126,7 @@ def for_flight(
     }
     need_settings("ins_particle", order, settle, **shared)
     need_numbers("ins_particle", not_negative={"resample_below": resample_below, "spread": spread})
-    if not isinstance(particles, int) or isinstance(particles, bool) or not 1 <= particles <= MOST_PARTICLES:
-        raise DeclarationError(
-            "setting 'particles' is out of range",
-            path="ins_particle.particles",
-            expected=f"a whole number from 1 to {MOST_PARTICLES}",
-            got=repr(particles),
-            fix="write particles=5000",
-        )
+    need_count("ins_particle", "particles", particles, least=1, most=MOST_PARTICLES)
     return pose_case(
         ins_particle,
         flight,

@@ -28,7 +28,7 @@ class _Format:
         bits, mantissa, bias: its width, the bits after the point, and the exponent's offset.
         half_pi, ln2: significant bits of the parts in which the constant is subtracted.
         exp, sine, artanh, arctan: terms of each series; `sine` is that of the cosine, too.
-        low, high: arguments between which exp is a normal number.
+        low, high: arguments between which exp is written out: below it is 0, above infinite.
         most: largest argument of sine and cosine.
     """
 
@@ -48,7 +48,7 @@ class _Format:
 
 _FORMATS = {
     "double": _Format(64, 52, 1023, (33, 33, 53), (32, 53), 14, 9, 11, 21, -708.0, 709.79, 1.6e6),
-    "float": _Format(32, 23, 127, (8, 8, 8, 24), (15, 24), 8, 6, 5, 10, -87.3, 88.73, 1e5),
+    "float": _Format(32, 23, 127, (8, 8, 8, 24), (15, 24), 8, 6, 5, 10, -86.98, 88.73, 1e5),
 }
 
 

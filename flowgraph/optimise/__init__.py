@@ -54,7 +54,7 @@ PASSES = {
     "symmetry": "compute one half of A P A^T",
     "structure": "split products along zero and identity blocks",
     "mirror": "write A P A^T, with zeros in A, as A (A P)^T",
-    "sparse": "tell which elements of larger factors are zero",
+    "sparse": "tell which elements of larger factors are zero, numbers or scalars that are there",
     "unroll": "take small arrays apart into scalars",
     "reuse": "let arrays share memory whose times do not overlap",
     "layout": "lay the axis of particles out innermost",

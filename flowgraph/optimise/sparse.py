@@ -33,8 +33,9 @@ def tell_zeros(program: Program) -> Program:
     facts, draft = facts_of(program), Draft(program)
     found: dict[int, Table] = {}
     for i in program.instructions:
-        if _is_large(program, i):
-            found |= {n: table for n in i.args if (table := _told(facts, draft, n)) is not None}
+        if _is_large(program, i):  # a factor's first product says: later there are scalars it cannot name
+            new = [n for n in i.args if n not in found]
+            found |= {n: table for n in new if (table := _told(facts, draft, n)) is not None}
         draft.keep(i)
     return draft.done(found)
 

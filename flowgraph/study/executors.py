@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -334,7 +335,8 @@ def _ask(distributed: Any, address: str, patience: float) -> None:
             comm.abort()
 
     try:
-        answer = asyncio.run(asyncio.wait_for(ask(), patience + 1.0))
+        with ThreadPoolExecutor(1) as apart:  # a notebook has an event loop of its own in this thread
+            answer = apart.submit(asyncio.run, asyncio.wait_for(ask(), patience + 1.0)).result()
         if isinstance(answer, Mapping) and answer.get("type") == "Scheduler":
             return
         said = f"what answers is {answer.get('type') if isinstance(answer, Mapping) else answer!r}"

@@ -14,9 +14,10 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from flowgraph.graph import CallNode, Graph
 from flowgraph.pipeline import Pipeline, Port, Register
 from flowgraph.series import Flight, Series
 
-FORMAT = 1
+FORMAT = 2
 """Goes into each key; a change of the rules in this module needs another number."""
 
 
@@ -60,6 +61,10 @@ def _feed(into: Any, value: Any) -> None:
         for key in sorted(value, key=repr):
             _feed(into, key)
             _feed(into, value[key])
+    elif isinstance(value, set | frozenset):
+        _feed(into, ("set", sorted(digest(part) for part in value)))
+    elif isinstance(value, partial):
+        _feed(into, ("partial", value.func, value.args, value.keywords))
     elif isinstance(value, list | tuple):
         into.update(f"list:{len(value)}:".encode())
         for part in value:
@@ -70,8 +75,14 @@ def _feed(into: Any, value: Any) -> None:
         _feed(into, ("flight", dict(value.streams), value.truth, dict(value.info)))
     elif is_dataclass(value) and not isinstance(value, type):
         _feed(into, (type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}))
-    elif callable(value):
-        _feed(into, ("callable", getattr(value, "__module__", ""), getattr(value, "__qualname__", "")))
+    elif isinstance(value, FunctionType):
+        closed = [cell.cell_contents for cell in value.__closure__ or ()]
+        given = (value.__defaults__, value.__kwdefaults__)
+        _feed(into, ("function", value.__module__, value.__qualname__, closed, given))
+    elif isinstance(value, MethodType):
+        _feed(into, ("method", value.__func__, value.__self__))
+    elif inspect.isclass(value) or inspect.isbuiltin(value):
+        _feed(into, ("callable", value.__module__ or "", value.__qualname__))
     else:
         held = getattr(value, "__dict__", None)
         _feed(into, (type(value).__qualname__, dict(held) if held else str(value)))

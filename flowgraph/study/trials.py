@@ -28,6 +28,7 @@ from flowgraph.registry import Case
 from flowgraph.result import Result
 from flowgraph.series import Flight
 from flowgraph.simulate import simulate
+from flowgraph.study.keys import digest
 from flowgraph.study.spec import Value
 from flowgraph.study.tasks import MANY, grouped, prepared, simulate_together
 
@@ -74,10 +75,21 @@ class Trials:
         self.graph, self.recordings, self.settings = graph, recordings, settings
         self.measure, self.metric, self.engine = measure, metric, engine
         self._flights: list[Flight] = []
+        self._worked = False
         self._steps: OrderedDict[Any, Any] = OrderedDict()
         for one in recordings:
             _, flight = prepared(graph, one.data, one.seed, settings)
             self._flights.append(flight)
+
+    def twice(self) -> tuple[Recording, Recording] | None:
+        """Two recordings that hold the same, as a file does whatever the seed or the spelling of its path."""
+        seen: dict[str, Recording] = {}
+        for one, flight in zip(self.recordings, self._flights, strict=True):
+            what = digest((dict(flight.streams), flight.truth))
+            if what in seen:
+                return seen[what], one
+            seen[what] = one
+        return None
 
     def _case(self, place: int, point: Mapping[str, float]) -> Case:
         one = self.recordings[place]
@@ -101,22 +113,37 @@ class Trials:
             seeds = [self.recordings[places[k]].seed for k in members]
             several = [cases[k] for k in members]
             chunk = min(64, 2 ** math.ceil(math.log2(len(members))))
-            try:
-                results: Sequence[Any] = simulate_together(
-                    several, seeds, program=program, engine=self.engine, dtype="float64", chunk=chunk
-                )
-            except Exception as error:
-                results = [error] * len(members)
-            made.update(zip(members, results, strict=True))
+            made.update(zip(members, self._together(several, seeds, program, chunk), strict=True))
         return [made[k] for k in range(len(cases))]
+
+    def _together(
+        self, cases: Sequence[Case], seeds: Sequence[int], program: Any, chunk: int
+    ) -> Sequence[Result | Exception]:
+        """Cases of one program; where one raises, each alone, so that it fails for itself."""
+        try:
+            return simulate_together(
+                cases, seeds, program=program, engine=self.engine, dtype="float64", chunk=chunk
+            )
+        except Exception as error:
+            if len(cases) == 1:
+                return [error]
+        return [self._together([c], [s], program, 1)[0] for c, s in zip(cases, seeds, strict=True)]
 
     def measured(self, points: Sequence[Mapping[str, float]], places: Sequence[int]) -> np.ndarray:
         """The measure (points, recordings) on the recordings at some places."""
         pairs = [(p, k) for p in points for k in places]
         cases = [self._case(k, p) for p, k in pairs]
         results = self._results(cases, [k for _, k in pairs])
+        self._need_one(results)
         found = [self._value(c, r) for c, r in zip(cases, results, strict=True)]
         return np.array(found).reshape(len(points), len(places))
+
+    def _need_one(self, results: Sequence[Result | Exception]) -> None:
+        """Until something has worked, what every run raises is no matter of the parameters: raise it."""
+        failed = [r for r in results if isinstance(r, Exception)]
+        if not self._worked and len(failed) == len(results):
+            raise failed[0]
+        self._worked = True
 
     def _value(self, case: Case, result: Result | Exception) -> float:
         if isinstance(result, DataError):

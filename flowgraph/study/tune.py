@@ -138,6 +138,8 @@ def tune(
     settings = dict(settings or {})
     _check(graph, fits, recordings, held_out, settings, most, folds)
     problem = Trials(graph, [*recordings, *held_out], settings, measure, metric, engine)
+    if same := problem.twice():
+        raise _wrong("data", "recordings that differ, each once, fitted to or held out", same)
     start = {f.name: _start(graph, f) for f in fits}
     whole = range(len(recordings))
 
@@ -233,45 +235,40 @@ def _first_steps(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.nda
     return np.asarray(sign * np.minimum(1.0, 0.25 * (high - low)))
 
 
+def _wrong(place: str, expected: str, got: object) -> DeclarationError:
+    return DeclarationError(
+        "this cannot be tuned",
+        path=f"tune, {place}",
+        expected=expected,
+        got=repr(got),
+        fix=f"mend {place}",
+    )
+
+
 def _check(
     graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
     settings: Mapping[str, Value], most: int, folds: int | None,
 ) -> None:  # fmt: skip
-    def wrong(place: str, expected: str, got: object) -> DeclarationError:
-        return DeclarationError(
-            "this cannot be tuned",
-            path=f"tune, {place}",
-            expected=expected,
-            got=repr(got),
-            fix=f"mend {place}",
-        )
-
     if not fits:
-        raise wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
+        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
     if not recordings:
-        raise wrong("data", "one recording or more", "none")
-    both = [r for r in recordings if r in held_out]
-    if both:
-        raise wrong("held-out", "recordings that are not fitted to", both[0])
+        raise _wrong("data", "one recording or more", "none")
     if type(most) is not int or most < 1:
-        raise wrong("most", "a whole number from 1", most)
+        raise _wrong("most", "a whole number from 1", most)
     if folds is not None and (type(folds) is not int or not 2 <= folds <= len(recordings)):
-        raise wrong("folds", f"a whole number from 2 to that of the recordings, {len(recordings)}", folds)
+        raise _wrong("folds", f"a whole number from 2 to that of the recordings, {len(recordings)}", folds)
     if folds is not None and held_out:
-        raise wrong("folds", "either folds or recordings that are held out", f"{len(held_out)} held out")
-    twice = [r for k, r in enumerate(recordings) if r in recordings[:k]]
-    if twice:
-        raise wrong("data", "each recording once", twice[0])
+        raise _wrong("folds", "either folds or recordings that are held out", f"{len(held_out)} held out")
     prepare = find_graph(graph).prepare
     for fit in fits:
-        numbers = [x for x in (fit.low, fit.start or fit.low, fit.high)]
+        numbers = [fit.low, fit.low if fit.start is None else fit.start, fit.high]
         if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers) or not (
             0 < fit.low < fit.high and fit.low <= numbers[1] <= fit.high
         ):
-            raise wrong(f"fit {fit.name}", "0 < low <= start <= high, low < high", fit)
+            raise _wrong(f"fit {fit.name}", "0 < low <= start <= high, low < high", fit)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
-            raise wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
-        if any(flight_part(r.data, {fit.name: fit.low}) for r in recordings):
-            raise wrong(f"fit {fit.name}", "a setting of the graph, not one of the flight", fit.name)
+            raise _wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
+        if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
+            raise _wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
         if prepare is not None:
             parsed_settings(prepare, {fit.name: text(float(fit.low))}, also=(), path=graph)

@@ -7,7 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Array, Series, Signal, Stream, block, graph, integer, latest, lower, real, simulate
+from flowgraph import (
+    Array,
+    Scalar,
+    Series,
+    Signal,
+    Stream,
+    block,
+    graph,
+    integer,
+    latest,
+    lower,
+    real,
+    simulate,
+)
 from flowgraph.c import generate
 from flowgraph.c.expand import _RULES
 from flowgraph.ops import ELEMENTWISE, OPS
@@ -211,6 +224,46 @@ def test_functions_for_lanes_in_single_precision():
         with np.errstate(over="ignore"):
             right = wanted[leaf].astype(np.float32)
         np.testing.assert_allclose(got, right, rtol=3e-7, atol=1.5e-7, err_msg=leaf)
+
+
+def test_exp_in_single_precision_is_right_down_to_where_it_is_zero():
+    """Relative to itself: what it gives is as small as 1e-38."""
+    values = np.linspace(-86.97, -80.0, 64).astype(np.float32).astype(float)
+
+    @block
+    def small(x: real(64), *, xp):  # type: ignore[valid-type]
+        return xp.exp(x), xp.exp(x - 1.0)
+
+    @graph
+    def g(x: Stream[real(64)]):  # type: ignore[valid-type]
+        return small(x)
+
+    built, data = g.build(), {"x": Series(np.arange(1), values[None])}
+    near, below = simulate(built, data, engine="c", dtype="float32").output.leaves.values()
+    np.testing.assert_allclose(near[0], np.exp(values), rtol=3e-7)
+    assert below[0, 0] == 0.0
+
+
+def test_two_products_of_one_factor_compile_with_scalars_made_between_them():
+    """The second could name a scalar of its factor that was not there at the first."""
+
+    @block
+    def work(x: Scalar, *, xp):
+        v = x * xp.arange(12, dtype=x.dtype) * 0.1 + 0.3
+        F = xp.asarray(np.eye(12)) * xp.cos(v)
+        first = F @ xp.sin(xp.reshape(xp.arange(144, dtype=x.dtype), (12, 12)) + x)
+        c = xp.cos(v[3])
+        return xp.sum(F @ (first * c)) + c
+
+    @graph
+    def g(x: Stream[Scalar]):
+        return work(x)
+
+    built, data = g.build(), {"x": Series(np.arange(3), np.linspace(0.1, 1.0, 3))}
+    wanted = simulate(built, data, engine="reference").output.value
+    for passes in (("sparse",), None):
+        found = simulate(built, data, engine="c", passes=passes).output.value
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 def test_a_sine_that_cannot_be_told_exactly_is_not_a_number():

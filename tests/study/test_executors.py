@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import signal
@@ -95,6 +96,18 @@ def test_a_scheduler_that_does_not_answer_is_an_error():
     with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
         OnDask("tcp://127.0.0.1:9", patience=0.5)
     assert "no answer within 0.5 s" in str(caught.value.got)
+
+
+def test_a_scheduler_is_asked_from_within_an_event_loop_too():
+    """As in a notebook."""
+    pytest.importorskip("distributed")
+
+    async def cell() -> None:
+        OnDask("tcp://127.0.0.1:9", patience=0.5)
+
+    with pytest.raises(DeclarationError, match="no scheduler answers") as caught:
+        asyncio.run(cell())
+    assert "event loop" not in str(caught.value)
 
 
 @pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:9", "127.0.0.1", "tcp://"])
