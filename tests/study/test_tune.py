@@ -20,6 +20,7 @@ from flowgraph import (
     simulate,
 )
 from flowgraph.cli import app
+from flowgraph.study import trials
 from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
 from tests.blocks.test_datasets import course
 from tests.data import recordings
@@ -233,11 +234,19 @@ def test_tuning_from_the_data_sheet_lowers_the_error_on_a_recording_that_was_hel
     assert means["after"] < means["before"] - 0.3  # of a logarithm: by a quarter
 
 
-def test_what_fails_at_every_point_is_said_and_not_searched(monkeypatch):
+@pytest.mark.parametrize("engine", ["reference", "c"])
+def test_what_fails_at_every_point_is_said_and_not_searched(monkeypatch, engine):
     """A missing compiler, say, is no matter of the parameters."""
-    monkeypatch.setenv("CC", "/nonexistent")
+
+    def missing(*_: Any, **__: Any) -> Any:
+        raise MissingDependencyError(
+            "needs a C compiler", path="c", expected="cc", got="none", fix="install one"
+        )
+
+    for name in ("simulate", "simulate_together"):
+        monkeypatch.setattr(trials, name, missing)
     with pytest.raises(MissingDependencyError, match="C compiler"):
-        tune("ekf", NOISES[:1], [Recording("sim")], settings={"imu.rate": 50}, engine="c", most=2)
+        tune("ekf", NOISES[:1], [Recording("sim")], settings={"imu.rate": 50}, engine=engine, most=2)
 
 
 def test_a_file_is_one_recording_whatever_its_seed(tmp_path):
