@@ -25,7 +25,7 @@ import library
 
 from flowgraph import FlowgraphError
 from flowgraph.cli.options import graph_of
-from flowgraph.registry import graph_names
+from flowgraph.data.registry import graph_names
 
 matplotlib.use("Agg")
 

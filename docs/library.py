@@ -15,8 +15,8 @@ from typing import Any
 
 import flowgraph.blocks
 from flowgraph import Block, Signal, find_graph
-from flowgraph.block import REQUIRED
-from flowgraph.registry import graph_names
+from flowgraph.data.registry import graph_names
+from flowgraph.language.block import REQUIRED
 from flowgraph.types import StructType, Type, leaves_of, struct_type
 
 

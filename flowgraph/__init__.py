@@ -2,9 +2,15 @@
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
-from flowgraph.block import Block, block, when
-from flowgraph.clock import aperiodic, periodic
-from flowgraph.declare import delay, graph
+from flowgraph.data.export import write_tum
+from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
+from flowgraph.data.registry import Case, Report, find_graph, load_flight
+from flowgraph.data.result import Result
+from flowgraph.data.series import Flight, Series
+from flowgraph.engines.many import Batch, simulate_many
+from flowgraph.engines.python.run import Run
+from flowgraph.engines.simulate import simulate
+from flowgraph.engines.state import load_state, save_state
 from flowgraph.errors import (
     ClockError,
     CycleError,
@@ -19,33 +25,27 @@ from flowgraph.errors import (
     TypeMismatchError,
     UnknownNameError,
 )
-from flowgraph.export import write_tum
-from flowgraph.graph import Graph
-from flowgraph.inputs import arrays, clocks_of, ticks, timing_of
-from flowgraph.joins import collect, every, latest, merge, sink
-from flowgraph.lowering import lower
-from flowgraph.many import Batch, simulate_many
-from flowgraph.operations import drop, group_by, scan, take_while, tap, until, unzip
-from flowgraph.pairs import match, zip, zip_latest, zip_latest_right
-from flowgraph.pipeline import Pipeline
-from flowgraph.registry import Case, Report, find_graph, load_flight
-from flowgraph.result import Result
-from flowgraph.run import Run
-from flowgraph.series import Flight, Series
-from flowgraph.simulate import simulate
-from flowgraph.state import load_state, save_state
-from flowgraph.stream import Held, Stream, apply
-from flowgraph.timed import delta_time, high_pass, integrate, low_pass
+from flowgraph.language.block import Block, block, when
+from flowgraph.language.clock import aperiodic, periodic
+from flowgraph.language.declare import delay, graph
+from flowgraph.language.graph import Graph
+from flowgraph.language.joins import collect, every, latest, merge, sink
+from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
+from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
+from flowgraph.language.stream import Held, Stream, apply
+from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
+from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
+from flowgraph.pipeline.lowering import lower
+from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
-from flowgraph.windows import batch, flat_map, padded, reduce, stacked, window
 
 if _TYPE_CHECKING:
-    from flowgraph.progress import ProgressBar
+    from flowgraph.data.progress import ProgressBar
 
 
 def __getattr__(name: str) -> object:
     if name == "ProgressBar":  # with it comes rich, which a program without a bar need not import
-        from flowgraph.progress import ProgressBar
+        from flowgraph.data.progress import ProgressBar
 
         return ProgressBar
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,7 +8,7 @@ capture corrects what has drifted, when it comes:
                  v = v- + (1 - alpha_v) ((z - z_last) - (p- - p_last)) / dt_pose
 
 The shares are of a pose, not of a tick: rates may be any, and vary. They stand for a covariance, and are set
-by hand; how large the errors are that they leave can be asked for (`blocks/fixed_gain.py`).
+by hand; how large the errors are that they leave can be asked for (`blocks/orientation/fixed_gain.py`).
 
 Source: R. Fiszel, thesis (2017), section on the asynchronous augmented complementary filter (in scala-flow:
 AugmentedComplementaryFilter). Three things are mended. The thesis adds the accelerometer to the velocity in
@@ -22,14 +22,14 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest, merge
-from flowgraph.blocks.complementary import check_alpha, correct_by_pose, dead_reckon
-from flowgraph.blocks.fixed_gain import PoseNoise, pose_spread
-from flowgraph.blocks.inertial import GRAVITY
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.orientation.complementary import check_alpha, correct_by_pose, dead_reckon
+from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import imu_noise_of, noise_of
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
-from flowgraph.blocks.tuning import imu_noise_of, noise_of
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 
 @graph

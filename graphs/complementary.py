@@ -32,7 +32,8 @@ from flowgraph import (
     latest,
     low_pass,
 )  # fmt: skip
-from flowgraph.blocks.complementary import (
+from flowgraph.blocks.metrics.errors import attitude_errors
+from flowgraph.blocks.orientation.complementary import (
     WorldForce,
     carry_to_world,
     check_alpha,
@@ -43,11 +44,10 @@ from flowgraph.blocks.complementary import (
     turn_by_gyro,
     with_parts,
 )  # fmt: skip
-from flowgraph.blocks.fixed_gain import AttitudeNoise, attitude_spread
-from flowgraph.blocks.metrics import attitude_errors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
+from flowgraph.blocks.scoring.scorer import scorer
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 
 @graph

@@ -11,13 +11,17 @@ The noise of the quaternion, 4 x 4, is an unscented transform of the rate noise;
 unit norm after each step, and the covariance with it.
 
 Source: R. Fiszel, thesis (2017), section on the extended Kalman filter. Mended: the covariance is corrected
-with a minus sign, and a correction starts from the prediction. The equations stand in `blocks/extended.py`.
+with a minus sign, and a correction starts from the prediction. The equations stand in
+`blocks/models/pose.py`.
 """
 
 from __future__ import annotations
 
 from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
-from flowgraph.blocks.extended import (
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.smoothing import pose_steps
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.pose import (
     QuaternionBelief,
     between_imu,
     pose_belief,
@@ -25,12 +29,8 @@ from flowgraph.blocks.extended import (
     start_pose,
     update_pose,
 )  # fmt: skip
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.scores import scorer
-from flowgraph.blocks.signals import Imu, Pose
-from flowgraph.blocks.smoothing import pose_steps
-from flowgraph.blocks.tuning import (
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import (
     check_settings,
     gravity_of,
     noise_of,
@@ -38,6 +38,7 @@ from flowgraph.blocks.tuning import (
     unbiased_noise_of,
     with_imu,
 )
+from flowgraph.blocks.signals import Imu, Pose
 
 
 @graph

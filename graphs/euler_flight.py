@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Flight, Result, Series
-from flowgraph.blocks.euler import need_order
-from flowgraph.blocks.euler_ins import singularity_warning, start_gaussian
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.scores import scorer
-from flowgraph.checks import need_numbers
-from flowgraph.declare import GraphFunction
+from flowgraph.blocks.geometry.euler import need_order
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.data.inputs import clocks_of
 from flowgraph.graphs.tag_pose import poses_of
-from flowgraph.inputs import clocks_of
+from flowgraph.language.checks import need_numbers
+from flowgraph.language.declare import GraphFunction
 
 __all__ = [
     "POSE_NOISE",

@@ -11,11 +11,11 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 from __future__ import annotations
 
 from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph
-from flowgraph.blocks.alignment import orientation_start
-from flowgraph.blocks.complementary import turn_by_gyro
-from flowgraph.blocks.metrics import orientation_errors
+from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.metrics.errors import orientation_errors
+from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.signals import Attitude, Gyro, Imu
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 
 @graph

@@ -6,7 +6,7 @@
 
 The rate is the body's, log(R_0^T R_1), which is what a gyroscope reads; log(R_1 R_0^T) would be the world's.
 A window of several samples, because the stamps of both sides jitter. The equations stand in
-`blocks/imu_calibration.py`.
+`blocks/inertial/imu_calibration.py`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Result, Series, Stream, clocks_of, delay, graph, latest
-from flowgraph.blocks.imu_calibration import (
+from flowgraph.blocks.inertial.imu_calibration import (
     LEAST,
     SAMPLES,
     CountsCalibration,
@@ -27,7 +27,7 @@ from flowgraph.blocks.imu_calibration import (
     windows_of,
 )
 from flowgraph.blocks.signals import Attitude
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 _NOTHING = NormalEquations(
     gyro_square=np.zeros((4, 4)),

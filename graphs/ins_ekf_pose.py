@@ -5,7 +5,7 @@
 Every tick predicts to now, with the Jacobians of the step to state and noises; a tick with a pose also
 corrects. The pose, found by PnP on the host (`tag_pose`), is a source.
 
-Source: the course's nonlinear Kalman filter. Equations: `blocks/euler_ins.py`.
+Source: the course's nonlinear Kalman filter. Equations: `blocks/models/euler_ins.py`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Stream, collect, delay, graph, latest
-from flowgraph.blocks.euler_ins import (
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.models.euler_ins import (
     euler_angles,
     navigation_belief,
     predict_extended,
     update_pose_angles,
 )
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.graphs.euler_flight import on_pose_flight

@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Flight, Series, Stream, clocks_of, collect, delay, graph, latest
-from flowgraph.blocks.aiding import aid_attitude, aid_position
-from flowgraph.blocks.alignment import StartSpread, start_belief
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
-from flowgraph.blocks.metrics import interpolate_pose, pose_errors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
+from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
+from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import check_settings, given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
-from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of
 
 
 @graph

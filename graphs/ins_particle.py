@@ -6,8 +6,8 @@ The same process and observation model as `ins_ukf_pose`, without a Gaussian: ev
 with the IMU and noises drawn for each; a tick with a pose weighs them, and resamples when few carry the
 weight.
 
-Source: the course's particle filter on AprilTags; equations: `blocks/euler_ins.py`,
-`blocks/state_particles.py`.
+Source: the course's particle filter on AprilTags; equations: `blocks/models/euler_ins.py`,
+`blocks/particles/states.py`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, Flight, Stream, delay, graph, latest, merge
-from flowgraph.blocks.euler_ins import euler_angles, navigation_belief
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.resampling import MOST_PARTICLES
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.state_particles import (
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.particles.states import (
     StateCloud,
     average_state,
     propagate_states,
@@ -28,9 +27,10 @@ from flowgraph.blocks.state_particles import (
     start_states,
     weigh_states,
 )
+from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.pnp import PoseMeasurement
-from flowgraph.checks import need_count, need_numbers
 from flowgraph.graphs.euler_flight import need_settings, pose_case
+from flowgraph.language.checks import need_count, need_numbers
 
 
 @graph

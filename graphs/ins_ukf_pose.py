@@ -5,8 +5,8 @@
 Every tick predicts to now, through sigma points that are augmented with the IMU's noises; a tick with a pose
 also corrects. The pose, found by PnP on the host (`tag_pose`), is a source.
 
-Sources: the report's first filter, and the course's nonlinear Kalman filter. Equations: `blocks/euler_ins.py`
-and `blocks/unscented.py`.
+Sources: the report's first filter, and the course's nonlinear Kalman filter. Equations:
+`blocks/models/euler_ins.py` and `blocks/unscented/filters.py`.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Stream, collect, delay, graph, latest
-from flowgraph.blocks.euler_ins import (
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
     increment_variances,
     navigation_belief,
     update_pose_angles,
 )
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented import predict_unscented
-from flowgraph.blocks.unscented_ins import carried, far_points
+from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.graphs.euler_flight import on_pose_flight
 

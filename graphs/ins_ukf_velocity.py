@@ -7,7 +7,8 @@ own (rate="camera", the report's eq. 9), or the gyroscope's minus its bias (rate
 filter estimates. The noises of rate and velocity augment the sigma points. Nothing measures position and
 heading: both drift.
 
-Source: the report's second filter. Equations: `blocks/euler_ins.py` and `blocks/unscented_ins.py`.
+Source: the report's second filter. Equations: `blocks/models/euler_ins.py` and
+`blocks/models/unscented_ins.py`.
 """
 
 from __future__ import annotations
@@ -15,25 +16,25 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
-from flowgraph.blocks.euler_ins import (
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
     increment_variances,
     navigation_belief,
     start_gaussian,
 )
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented import predict_unscented
-from flowgraph.blocks.unscented_ins import RATES, carried, far_points, update_camera_velocity
+from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import CameraMotion
+from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.euler_flight import need_settings, noise_of, scored
-from flowgraph.inputs import clocks_of
 
 
 @graph

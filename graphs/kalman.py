@@ -31,9 +31,10 @@ from flowgraph import (
     delay,
     graph,
 )  # fmt: skip
-from flowgraph.blocks.consistency import point_errors
-from flowgraph.blocks.kalman import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.point import (
+from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
+from flowgraph.blocks.kalman.smoothing import point_steps
+from flowgraph.blocks.metrics.consistency import point_errors
+from flowgraph.blocks.models.point import (
     PointReading,
     WorldAcceleration,
     between,
@@ -42,9 +43,8 @@ from flowgraph.blocks.point import (
     start_point,
     told_acceleration,
 )  # fmt: skip
-from flowgraph.blocks.scores import scorer
-from flowgraph.blocks.smoothing import point_steps
-from flowgraph.blocks.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
 
 
 @graph

@@ -8,7 +8,7 @@ Two error-state filters, of the tilt and of the heading, so that a magnet cannot
               correct   north - atan2(m_y, m_x),  m = R field                 every reading of the field
 
 An acceleration is told from a tilt by the velocity, which must stay small; a disturbed field by its strength
-and its dip. The equations stand in `blocks/marg.py` and `blocks/heading.py`.
+and its dip. The equations stand in `blocks/orientation/marg.py` and `blocks/orientation/heading.py`.
 
 Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, secs.
 5-7; D. Laidig and T. Seel, "VQF", Information Fusion 91, 2023.
@@ -21,9 +21,9 @@ import math
 import numpy as np
 
 from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph, latest
-from flowgraph.blocks.alignment import static_alignment
-from flowgraph.blocks.datasets.scores import scored_errors
-from flowgraph.blocks.heading import (
+from flowgraph.blocks.inertial.alignment import static_alignment
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.orientation.heading import (
     FieldTrust,
     HeadingBelief,
     join_orientation,
@@ -31,8 +31,7 @@ from flowgraph.blocks.heading import (
     start_heading,
     update_heading,
 )
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.marg import (
+from flowgraph.blocks.orientation.marg import (
     UNIT,
     LevelBelief,
     RestRule,
@@ -41,8 +40,9 @@ from flowgraph.blocks.marg import (
     predict_level,
     start_level,
 )
+from flowgraph.blocks.scoring.orientation import scored_errors
 from flowgraph.blocks.signals import Imu, MagneticField
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 _REST, _TRUST = RestRule(), FieldTrust()
 

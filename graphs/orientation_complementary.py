@@ -37,8 +37,10 @@ from flowgraph import (
     graph,
     latest,
 )  # fmt: skip
-from flowgraph.blocks.alignment import level_attitude
-from flowgraph.blocks.complementary import (
+from flowgraph.blocks.inertial.alignment import level_attitude
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.metrics.errors import attitude_errors
+from flowgraph.blocks.orientation.complementary import (
     blend,
     carry_to_world,
     check_alpha,
@@ -50,13 +52,11 @@ from flowgraph.blocks.complementary import (
     turn_by_gyro,
     with_parts,
 )
-from flowgraph.blocks.fixed_gain import AttitudeNoise, attitude_spread
-from flowgraph.blocks.inertial import GRAVITY
-from flowgraph.blocks.metrics import attitude_errors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import check_choice, noise_of
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
-from flowgraph.blocks.tuning import check_choice, noise_of
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 _STILL = Gyro(rate=np.zeros(3))
 _HOVER = Thrust(thrust=np.float64(-GRAVITY[2]))

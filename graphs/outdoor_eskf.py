@@ -6,7 +6,7 @@ after the other. Optical flow measures from a clone of the pose at the last pict
 
 Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017; S. I.
 Roumeliotis and J. W. Burdick, "Stochastic cloning", ICRA 2002. The equations stand in
-`blocks/outdoor_belief.py`.
+`blocks/outdoor/belief.py`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.kalman import Gaussian, update_extended
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.outdoor_belief import (
+from flowgraph.blocks.kalman.filters import Gaussian, update_extended
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.outdoor.belief import (
     FLOW,
     OUTDOOR,
     FieldObserver,
@@ -33,9 +32,10 @@ from flowgraph.blocks.outdoor_belief import (
     predict_clone,
     start_outdoor,
 )
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.scoring.scorer import scorer
 from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 
 @graph

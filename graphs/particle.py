@@ -9,7 +9,8 @@ the filter be compared with the exact answer.
     resample    where 1 / sum(w_i^2) is below a fraction of the number of points
 
 Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the particle filter; N.
-Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stand in `blocks/plane.py`.
+Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stand in
+`blocks/particles/plane.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
-from flowgraph.blocks.plane import (
+from flowgraph.blocks.particles.plane import (
     PlaneCloud,
     PlanePosition,
     PlaneVelocity,
@@ -29,10 +30,10 @@ from flowgraph.blocks.plane import (
     start_plane,
     weigh_plane,
 )
-from flowgraph.blocks.resampling import MOST_PARTICLES
-from flowgraph.blocks.scores import scorer
-from flowgraph.blocks.tuning import noise_of
-from flowgraph.checks import need_count, need_numbers
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import noise_of
+from flowgraph.language.checks import need_count, need_numbers
 
 
 @graph

@@ -11,7 +11,8 @@ they are at sqrt(n) here, and the centre has no weight. With weighted=True it is
 der Merwe instead. Noise, process and correction all multiply from the right, in the body.
 
 Source: E. Kraft, "A quaternion-based unscented Kalman filter for orientation tracking", Fusion 2003, sec. 3.
-The equations stand in `blocks/orientation.py`, `blocks/unscented.py` and `blocks/sigma_points.py`.
+The equations stand in `blocks/orientation/accelerometer.py`, `blocks/unscented/filters.py` and
+`blocks/unscented/sigma_points.py`.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Flight, Result, Stream, clocks_of, collect, delay, graph
-from flowgraph.blocks.alignment import orientation_start
-from flowgraph.blocks.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.metrics import orientation_errors
-from flowgraph.blocks.orientation import (
+from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.metrics.errors import orientation_errors
+from flowgraph.blocks.orientation.accelerometer import (
     STATE,
     named_orientation,
     see_rate_and_gravity,
@@ -31,10 +32,10 @@ from flowgraph.blocks.orientation import (
     start_orientation,
     turn_by_rate,
 )
-from flowgraph.blocks.sigma_points import SigmaPoints
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented import predict_unscented, update_unscented
-from flowgraph.checks import need_numbers
+from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints
+from flowgraph.language.checks import need_numbers
 
 KRAFT = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0, mean="kraft")
 """2 n points at sqrt(n) deviations, of weight 1/(2 n)."""

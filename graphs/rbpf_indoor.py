@@ -26,12 +26,12 @@ from flowgraph import (
     latest,
     merge,
 )
-from flowgraph.blocks.alignment import StartSpread
-from flowgraph.blocks.calibration import subtract_rest_bias
-from flowgraph.blocks.geometry import level, to_matrix
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.particles import (
+from flowgraph.blocks.geometry.rotations import level, to_matrix
+from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.calibration import subtract_rest_bias
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.particles.cloud import (
     attitude_likelihood,
     average_attitude,
     average_pose,
@@ -42,12 +42,12 @@ from flowgraph.blocks.particles import (
     start_cloud,
     weights,
 )
-from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
-from flowgraph.blocks.resampling import MOST_PARTICLES, draw_ancestors, take_ancestors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES, draw_ancestors, take_ancestors
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import Cloud, Imu, Pose
-from flowgraph.blocks.tuning import given, imu_noise_of, noise_of
-from flowgraph.checks import need_count, need_numbers
+from flowgraph.language.checks import need_count, need_numbers
 
 
 @graph

@@ -9,16 +9,15 @@ Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section o
 Rao-Blackwellized particle filter. Mended: the attitude is drawn after the readings, not before them (drawn at
 every step, a thousand particles are too few for a sharp magnetometer); the altimeter reads p_z / cos(tilt)
 (the thesis prints a sine), and optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0
-q_1, in the world). The equations stand in `blocks/outdoor_cloud.py`.
+q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
 """
 
 from __future__ import annotations
 
 from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
-from flowgraph.blocks.extended import between_imu
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.outdoor import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.outdoor_cloud import (
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.outdoor.cloud import (
     OutdoorCloud,
     as_cloud,
     correct_distance,
@@ -30,11 +29,12 @@ from flowgraph.blocks.outdoor_cloud import (
     take_outdoor_ancestors,
     take_picture,
 )
-from flowgraph.blocks.particles import average_attitude, average_pose, effective_sample_size, weights
-from flowgraph.blocks.resampling import MOST_PARTICLES, draw_ancestors
-from flowgraph.blocks.scores import scorer
+from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES, draw_ancestors
+from flowgraph.blocks.scoring.scorer import scorer
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.checks import need_count, need_numbers
+from flowgraph.language.checks import need_count, need_numbers
 
 
 @graph

@@ -11,10 +11,10 @@ the signs of this library: specific force, z up.
 from __future__ import annotations
 
 from flowgraph import Case, Flight, Result, Stream, clocks_of, graph
-from flowgraph.blocks.metrics import orientation_errors
-from flowgraph.blocks.orientation import roll_pitch_attitude
+from flowgraph.blocks.metrics.errors import orientation_errors
+from flowgraph.blocks.orientation.accelerometer import roll_pitch_attitude
 from flowgraph.blocks.signals import Imu
-from flowgraph.checks import need_numbers
+from flowgraph.language.checks import need_numbers
 
 
 @graph

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, simulate
-from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.signals import Pose
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.mapping import build_map, frames_of
 from flowgraph.blocks.vision.pnp import PoseMeasurement, as_measurements, find_pose, no_pose
 from flowgraph.blocks.vision.tags import TagMap, Tags
-from flowgraph.checks import need_numbers
+from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import UnknownNameError
-from flowgraph.inputs import clocks_of
+from flowgraph.language.checks import need_numbers
 
 WHICH = ("all", "even", "odd")
 

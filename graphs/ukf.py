@@ -13,8 +13,8 @@ The mean of the quaternions is Markley's eigenvector, or Kraft's gradient descen
 
 Source: R. Fiszel, thesis (2017), section on the unscented Kalman filter, whose state this is; E. Wan and R.
 van der Merwe, "The unscented Kalman filter for nonlinear estimation", 2000; E. Kraft, "A quaternion-based
-unscented Kalman filter for orientation tracking", 2003. The equations stand in `blocks/sigma_points.py`,
-`blocks/unscented.py` and `blocks/pose_model.py`.
+unscented Kalman filter for orientation tracking", 2003. The equations stand in
+`blocks/unscented/sigma_points.py`, `blocks/unscented/filters.py` and `blocks/models/unscented_pose.py`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,20 @@ from flowgraph import (
     graph,
     latest,
 )  # fmt: skip
-from flowgraph.blocks.extended import POSE, between_imu
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.metrics import pose_errors
-from flowgraph.blocks.pose_model import STATE, carry_pose, imu_density, named_pose, see_pose, start_state
-from flowgraph.blocks.scores import scorer
-from flowgraph.blocks.sigma_points import GAUSSIAN, SigmaPoints
-from flowgraph.blocks.signals import Imu, Pose
-from flowgraph.blocks.tuning import (
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.pose import POSE, between_imu
+from flowgraph.blocks.models.unscented_pose import (
+    STATE,
+    carry_pose,
+    imu_density,
+    named_pose,
+    see_pose,
+    start_state,
+)
+from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.tuning import (
     check_settings,
     gravity_of,
     noise_of,
@@ -50,7 +55,9 @@ from flowgraph.blocks.tuning import (
     unbiased_noise_of,
     with_imu,
 )
-from flowgraph.blocks.unscented import predict_unscented, update_unscented
+from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 
 _NONE = (0.0, 0.0, 0.0)
 

@@ -20,7 +20,7 @@ import numpy as np
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
 from flowgraph.blocks.datasets.shape import Recording, known, number, the_file, unit_quaternions
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, MagneticField, Pose
 from flowgraph.errors import DataError
 

@@ -21,8 +21,8 @@ from flowgraph.blocks.datasets.parameters import Parameters
 from flowgraph.blocks.datasets.shape import known, number
 from flowgraph.blocks.datasets.studentdata import SETTINGS as READING
 from flowgraph.blocks.datasets.studentdata import flight_of
-from flowgraph.blocks.euler import angles_from_matrix
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.geometry.euler import angles_from_matrix
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.motion import CameraMotion, camera_motion_of
 from flowgraph.errors import DeclarationError

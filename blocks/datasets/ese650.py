@@ -26,14 +26,14 @@ from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
 from flowgraph.blocks.datasets.shape import Recording, known, offset, policy
 from flowgraph.blocks.datasets.tables import POLICIES
-from flowgraph.blocks.imu_calibration import (
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu_calibration import (
     CountsCalibration,
     ImuCounts,
     calibrated,
     fit_counts,
     windows_of,
 )  # fmt: skip
-from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.signals import Attitude, Imu
 from flowgraph.errors import DataError, DeclarationError
 

@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.shape import MOST_OFFSET, known, offset, policy, present
 from flowgraph.blocks.datasets.tables import POLICIES, read_table
-from flowgraph.blocks.geometry import conjugate, multiply
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.geometry.rotations import conjugate, multiply
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
 from flowgraph.errors import DataError
 

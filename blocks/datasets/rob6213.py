@@ -32,9 +32,9 @@ from flowgraph import Array, Flight, Series, Signal, real
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
 from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
 from flowgraph.blocks.datasets.tables import strictly_later
-from flowgraph.blocks.euler import quaternion_from_angles
-from flowgraph.blocks.geometry import multiply
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.geometry.euler import quaternion_from_angles
+from flowgraph.blocks.geometry.rotations import multiply
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import COURSE_MOUNT
 from flowgraph.blocks.vision.motion import CameraMotion, find_delay, velocity_error

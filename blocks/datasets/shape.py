@@ -14,7 +14,7 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.tables import POLICIES, in_order, nanoseconds
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
 __all__ = [

@@ -25,8 +25,8 @@ from flowgraph.blocks.datasets.matfile import read_structs
 from flowgraph.blocks.datasets.parameters import Parameters, parse_parameters
 from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
 from flowgraph.blocks.datasets.tables import strictly_later
-from flowgraph.blocks.euler import quaternion_from_angles
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.geometry.euler import quaternion_from_angles
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import measure

@@ -25,7 +25,7 @@ from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
 from flowgraph.blocks.datasets.shape import known, number, split_argument
 from flowgraph.blocks.datasets.tables import strictly_later
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.pnp import rotation_of

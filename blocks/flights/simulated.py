@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.flights import plane, worlds
-from flowgraph.blocks.geometry import from_rotation_vector, multiply
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
 from flowgraph.blocks.world import generator
 from flowgraph.errors import DeclarationError, UnknownNameError

@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks import sensors as s
-from flowgraph.blocks.geometry import geodesic_angle
+from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.signals import NavigationState
 from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
 from flowgraph.errors import DeclarationError, UnknownNameError

@@ -6,10 +6,10 @@ depend on the seed and the sensor's name only.
 
 from __future__ import annotations
 
+from flowgraph.blocks.geometry.geodetic import as_geodetic, as_position, from_enu, to_enu
 from flowgraph.blocks.sensors.altimeter import Altimeter
 from flowgraph.blocks.sensors.control import BodyRateInput, ThrustInput
 from flowgraph.blocks.sensors.flow import OpticalFlowSensor
-from flowgraph.blocks.sensors.geodetic import as_geodetic, as_position, from_enu, to_enu
 from flowgraph.blocks.sensors.gps import Gps
 from flowgraph.blocks.sensors.inertial import (
     MOST_LOOKS,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.blocks.geometry import conjugate, multiply
+from flowgraph.blocks.geometry.rotations import conjugate, multiply
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.pose import turned
 from flowgraph.blocks.sensors.sensor import Sensor

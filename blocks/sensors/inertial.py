@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.sensor import Sensor
 from flowgraph.blocks.signals import CoordinateAcceleration, Gyro, Imu, SpecificForce

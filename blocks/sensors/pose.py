@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.blocks.geometry import from_rotation_vector, multiply
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.sensor import Sensor
 from flowgraph.blocks.signals import Attitude, Pose, Position

@@ -21,8 +21,8 @@ import numpy as np
 from flowgraph import Series, Signal
 from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.motion import Motion, World
-from flowgraph.clock import nanoseconds
 from flowgraph.errors import DeclarationError
+from flowgraph.language.clock import nanoseconds
 
 __all__ = ["Recording", "Sensor"]
 

@@ -10,8 +10,13 @@ import numpy as np
 
 from flowgraph.blocks.datasets.parameters import Parameters
 from flowgraph.blocks.datasets.studentdata import load, packet_tags
-from flowgraph.blocks.euler import angles_from_matrix, angles_from_quaternion, matrix_from_angles, wrapped
-from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.geometry.euler import (
+    angles_from_matrix,
+    angles_from_quaternion,
+    matrix_from_angles,
+    wrapped,
+)
+from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import measure, rotation_of
 from flowgraph.errors import DataError

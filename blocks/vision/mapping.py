@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Series
-from flowgraph.blocks.geometry import skew
+from flowgraph.blocks.geometry.rotations import skew
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import solve
 from flowgraph.blocks.vision.tags import TagMap

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Series, Signal, real
-from flowgraph.blocks.geometry import skew, slerp, to_matrix
+from flowgraph.blocks.geometry.rotations import skew, slerp, to_matrix
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.errors import DataError
 

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, Signal, block, integer, real, when
-from flowgraph.blocks.geometry import skew
+from flowgraph.blocks.geometry.rotations import skew
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.tags import TagMap, Tags
 
@@ -174,7 +174,7 @@ def quaternion_of(R: npt.ArrayLike) -> np.ndarray:
 
 def rotation_of(q: npt.ArrayLike) -> np.ndarray:
     """The rotation (..., 3, 3) of a unit quaternion (..., 4)."""
-    from flowgraph.blocks.geometry import to_matrix
+    from flowgraph.blocks.geometry.rotations import to_matrix
 
     return np.asarray(to_matrix(np.asarray(q, dtype=float), xp=np))
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.blocks.inertial import GRAVITY
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.world.minimum_jerk import Primitives
 
 __all__ = ["LIMITS", "Limits", "feasible"]

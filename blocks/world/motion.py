@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph.blocks.geometry import to_matrix
-from flowgraph.blocks.inertial import GRAVITY
+from flowgraph.blocks.geometry.rotations import to_matrix
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.errors import DataError
 
 __all__ = ["Motion", "World"]

@@ -19,7 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from flowgraph.blocks.inertial import GRAVITY
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join
 from flowgraph.blocks.world.motion import Motion, World

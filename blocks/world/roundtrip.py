@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.blocks.geometry import from_rotation_vector
+from flowgraph.blocks.geometry.rotations import from_rotation_vector
 from flowgraph.blocks.world.motion import Motion, World
 
 __all__ = ["RoundTrip"]

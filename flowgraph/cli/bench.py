@@ -20,8 +20,8 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
+from flowgraph.data.registry import bench_names, find_bench, parsed_settings, setting_names
 from flowgraph.errors import UnknownNameError
-from flowgraph.registry import bench_names, find_bench, parsed_settings, setting_names
 
 
 @app.command()

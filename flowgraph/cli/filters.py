@@ -26,13 +26,13 @@ from flowgraph.cli.terminal import (
     without_font_warnings,
     writing,
 )
+from flowgraph.data.export import write_tum
+from flowgraph.data.progress import ProgressBar
+from flowgraph.data.registry import Case, find_graph, flight_names, graph_names
+from flowgraph.data.result import Result
+from flowgraph.data.series import Flight, Series
+from flowgraph.engines.simulate import ENGINES, simulate
 from flowgraph.errors import DataError, FlowgraphError, writes
-from flowgraph.export import write_tum
-from flowgraph.progress import ProgressBar
-from flowgraph.registry import Case, find_graph, flight_names, graph_names
-from flowgraph.result import Result
-from flowgraph.series import Flight, Series
-from flowgraph.simulate import ENGINES, simulate
 
 
 @app.command("list")
@@ -155,9 +155,9 @@ def _recorded(case: Case) -> list[Series]:
 
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
-    from flowgraph.plot import plot_navigation, plot_result
-    from flowgraph.plot_attitude import plot_orientation
-    from flowgraph.plot_trajectory import plot_space
+    from flowgraph.drawing.attitude import plot_orientation
+    from flowgraph.drawing.plot import plot_navigation, plot_result
+    from flowgraph.drawing.trajectory import plot_space
 
     with writes(out):
         out.mkdir(parents=True, exist_ok=True)

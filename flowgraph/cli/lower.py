@@ -11,9 +11,9 @@ from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, graph_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.errors import UnknownNameError
-from flowgraph.lowering import lower as lower_graph
-from flowgraph.optimise import COMPILED, DEFAULT, PASSES
-from flowgraph.optimise import without as passes_without
+from flowgraph.pipeline.lowering import lower as lower_graph
+from flowgraph.pipeline.optimise import COMPILED, DEFAULT, PASSES
+from flowgraph.pipeline.optimise import without as passes_without
 
 TARGETS = ("description", "c")
 """What can be written."""
@@ -54,7 +54,7 @@ def lower(
     pipeline = lower_graph(built, dtype=dtype)
     pipeline.save(output)
     if target == "c":
-        from flowgraph.c import write_c, write_events
+        from flowgraph.engines.c import write_c, write_events
 
         for file in write_c(pipeline, output, dtype, passes=passes).values():
             err_console.print(f"wrote {file}", markup=False)
@@ -63,7 +63,7 @@ def lower(
             err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:
-        from flowgraph.costs import cost_report
+        from flowgraph.pipeline.costs import cost_report
 
         costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
         for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.series import Flight
 from flowgraph.errors import DataError, DeclarationError
-from flowgraph.graph import Graph
-from flowgraph.inputs import Inputs
-from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
-from flowgraph.series import Flight
+from flowgraph.language.graph import Graph
 
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
 Data = Annotated[

@@ -13,10 +13,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from flowgraph.data.registry import find_graph, load_flight
+from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError
-from flowgraph.lowering import lower
-from flowgraph.registry import find_graph, load_flight
-from flowgraph.series import Flight
+from flowgraph.pipeline.lowering import lower
 from flowgraph.study import keys
 from flowgraph.study.executors import Executor, Finished, InProcess, ProcessPool
 from flowgraph.study.spec import Study, Value, text

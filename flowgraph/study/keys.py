@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.series import Flight, Series
 from flowgraph.errors import FlowgraphError
-from flowgraph.graph import CallNode, Graph
-from flowgraph.pipeline import Pipeline, Port, Register
-from flowgraph.series import Flight, Series
+from flowgraph.language.graph import CallNode, Graph
+from flowgraph.pipeline.pipeline import Pipeline, Port, Register
 
 FORMAT = 2
 """Goes into each key; a change of the rules in this module needs another number."""

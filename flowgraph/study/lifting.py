@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.graph import CallNode, Graph, RegisterNode
-from flowgraph.lowering import lower
-from flowgraph.pipeline import Cell, Pipeline, Register
-from flowgraph.state import join_states
+from flowgraph.engines.state import join_states
+from flowgraph.language.graph import CallNode, Graph, RegisterNode
+from flowgraph.pipeline.lowering import lower
+from flowgraph.pipeline.pipeline import Cell, Pipeline, Register
 from flowgraph.types import ArrayType, flatten
 
 _PREFIX = "constants/"

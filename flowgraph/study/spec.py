@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
-from flowgraph.registry import find_graph, flight_names, flight_settings, parsed_settings
 
 Value = bool | int | float | str
 Point = Mapping[str, Value]
@@ -200,7 +200,7 @@ def text(value: Value) -> str:
 
 
 def _engines() -> tuple[str, ...]:
-    from flowgraph.simulate import ENGINES
+    from flowgraph.engines.simulate import ENGINES
 
     return ENGINES
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.series import Series
 from flowgraph.errors import DataError, MissingDependencyError, writes
-from flowgraph.series import Series
 from flowgraph.study.keys import content_digest
 from flowgraph.study.spec import Study
 

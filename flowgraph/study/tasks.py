@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.result import Result
+from flowgraph.data.series import Flight, Series
+from flowgraph.engines.many import Batch, simulate_many
+from flowgraph.engines.simulate import simulate
 from flowgraph.errors import DataError, FlowgraphError
-from flowgraph.graph import Graph
-from flowgraph.many import Batch, simulate_many
-from flowgraph.recording import remembering
-from flowgraph.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
-from flowgraph.result import Result
-from flowgraph.series import Flight, Series
-from flowgraph.simulate import simulate
+from flowgraph.language.graph import Graph
+from flowgraph.language.recording import remembering
 from flowgraph.study.keys import structure
 from flowgraph.study.lifting import Lowered, lifted, start_of
 from flowgraph.study.spec import Value, text

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.registry import Case
+from flowgraph.data.result import Result
+from flowgraph.data.series import Flight
+from flowgraph.engines.simulate import simulate
 from flowgraph.errors import DataError
-from flowgraph.recording import remembering
-from flowgraph.registry import Case
-from flowgraph.result import Result
-from flowgraph.series import Flight
-from flowgraph.simulate import simulate
+from flowgraph.language.recording import remembering
 from flowgraph.study.keys import digest
 from flowgraph.study.spec import Value
 from flowgraph.study.tasks import MANY, grouped, prepared, simulate_together

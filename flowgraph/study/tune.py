@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.registry import find_graph, parsed_settings
+from flowgraph.engines.simulate import ENGINES
 from flowgraph.errors import DeclarationError, UnknownNameError
-from flowgraph.registry import find_graph, parsed_settings
-from flowgraph.simulate import ENGINES
 from flowgraph.study.spec import Value, text
 from flowgraph.study.tasks import flight_part
 from flowgraph.study.trials import Judged, Recording, Trials, surprise

@@ -18,7 +18,7 @@ import numpy as np
 
 from flowgraph import Flight, Report, Series, simulate
 from flowgraph.blocks.datasets import course, rob6213, studentdata, umd
-from flowgraph.blocks.metrics import interpolate_pose, pose_errors, within_truth
+from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors, within_truth
 from flowgraph.blocks.vision.mapping import frames_of
 from flowgraph.blocks.vision.motion import velocity_error
 from flowgraph.blocks.vision.pnp import rotation_of, solve
@@ -122,7 +122,7 @@ def _posed(
 
 
 def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: Any) -> None:
-    from flowgraph.plot_trajectory import plot_ins, plot_space
+    from flowgraph.drawing.trajectory import plot_ins, plot_space
 
     belief, observed = result["belief"], flight.streams["pose"]
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Report, Series, load_flight, simulate
-from flowgraph.blocks.datasets.scores import scored_errors
-from flowgraph.blocks.geometry import multiply
+from flowgraph.blocks.geometry.rotations import multiply
+from flowgraph.blocks.scoring.orientation import scored_errors
 from flowgraph.blocks.signals import Attitude
 from flowgraph.graphs.benches import engine_of, recordings
 from flowgraph.graphs.marg import marg

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph import DeclarationError, find_graph, load_flight, lower, simulate
-from flowgraph.costs import Costs, Machine
-from flowgraph.registry import Report
+from flowgraph.data.registry import Report
+from flowgraph.pipeline.costs import Costs, Machine
 
 
 def cost(

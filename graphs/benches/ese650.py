@@ -13,8 +13,8 @@ from typing import Any
 
 from flowgraph import Report, UnknownNameError, find_graph, load_flight, simulate
 from flowgraph.blocks.datasets.ese650 import sets_in
+from flowgraph.data.registry import graph_names
 from flowgraph.graphs.benches import engine_of, recordings
-from flowgraph.registry import graph_names
 
 FILTERS = ("quaternion_ukf", "roll_pitch", "gyro_integration")
 PUBLISHED: Mapping[int, tuple[float, float, float]] = {

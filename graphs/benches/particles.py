@@ -13,14 +13,14 @@ import numpy as np
 
 from flowgraph import Case, DeclarationError, Flight, Report, UnknownNameError, simulate
 from flowgraph.blocks.flights import simulated
-from flowgraph.blocks.plane import exact, plane_errors
-from flowgraph.checks import need_count
+from flowgraph.blocks.particles.plane import exact, plane_errors
 from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.particle import particle
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
+from flowgraph.language.checks import need_count
 
 __all__ = ["FILTERS", "particles"]
 

@@ -22,17 +22,16 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Graph, Report, Series, clocks_of, simulate_many
-from flowgraph.blocks.alignment import StartSpread, start_belief
-from flowgraph.blocks.extended import start_pose
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.geometry import geodesic_angle, to_matrix
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.particles import start_cloud
-from flowgraph.blocks.point import start_point
-from flowgraph.blocks.pose_model import start_state
+from flowgraph.blocks.geometry.rotations import geodesic_angle, to_matrix
+from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.models.point import start_point
+from flowgraph.blocks.models.pose import start_pose
+from flowgraph.blocks.models.unscented_pose import start_state
+from flowgraph.blocks.particles.cloud import start_cloud
+from flowgraph.blocks.scoring.tuning import WEIGHTLESS, with_imu
 from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate, Position
-from flowgraph.blocks.tuning import WEIGHTLESS, with_imu
-from flowgraph.checks import need_count
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
@@ -41,6 +40,7 @@ from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.kalman import kalman, readings
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.graphs.ukf import ukf
+from flowgraph.language.checks import need_count
 
 __all__ = ["FILTERS", "PUBLISHED", "SETTINGS", "thesis"]
 

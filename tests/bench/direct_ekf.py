@@ -1,6 +1,7 @@
 """The benchmark's peer: the ten-state filter of `graphs/ekf.py` with filterpy's ExtendedKalmanFilter.
 
-The same equations as `blocks/extended.py`, as somebody would write them who needs this one filter: filterpy
+The same equations as `blocks/models/pose.py`, as somebody would write them who needs this one filter:
+filterpy
 does the covariance and the correction, and what it asks its user for, motion, Jacobians and noise, is plain
 NumPy with small products spelt out.
 """

@@ -1,7 +1,7 @@
 """The benchmark's peer: the 15-state inertial filter as one hand-written NumPy loop, without flowgraph.
 
-The same equations as `blocks/inertial.py` and `blocks/aiding.py`, as somebody would write them who needs
-this one filter only: matrices allocated once, blocks written in place, small products spelt out.
+The same equations as `blocks/inertial/imu.py` and `blocks/inertial/aiding.py`, as somebody would write them
+who needs this one filter only: matrices allocated once, blocks written in place, small products spelt out.
 """
 
 from __future__ import annotations

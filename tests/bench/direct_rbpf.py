@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.namespaces import NUMPY
-from flowgraph.random import Site, seed_words
+from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.random import Site, seed_words
 
 PRODUCT = np.zeros((4, 16))
 """A quaternion product as a matrix times the 16 products of the parts."""

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
-from flowgraph.c.engine import Compiled, State
-from flowgraph.inputs import Inputs, prepare, tape
-from flowgraph.optimise import DEFAULT, for_engine
-from flowgraph.playback import real_leaves
-from flowgraph.random import ROUNDS, Site, seed_words, segments
-from flowgraph.series import Series
+from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.series import Series
+from flowgraph.engines.c.engine import Compiled, State
+from flowgraph.engines.playback import real_leaves
+from flowgraph.pipeline.optimise import DEFAULT, for_engine
+from flowgraph.recorder.random import ROUNDS, Site, seed_words, segments
 from tests.bench import direct_eskf, direct_rbpf, inertial, particles
 from tests.bench.rows import Row, interleaved, missing, seconds
 

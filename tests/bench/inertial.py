@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Graph, Result, Series, simulate, timing_of
-from flowgraph.blocks.alignment import StartSpread, start_belief
 from flowgraph.blocks.flights import simulated
+from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.signals import Belief, Position
 from flowgraph.graphs.ins_eskf import ins_eskf
 from tests.bench import direct_eskf

@@ -24,11 +24,11 @@ import numpy as np
 
 from flowgraph import Case, Result, simulate
 from flowgraph.blocks.flights import simulated
-from flowgraph.blocks.particles import start_cloud
-from flowgraph.blocks.resampling import SCHEMES, quantised
+from flowgraph.blocks.particles.cloud import start_cloud
+from flowgraph.blocks.particles.resampling import SCHEMES, quantised
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
-from flowgraph.namespaces import NUMPY
-from flowgraph.random import NumpyDraw, seed_words
+from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.random import NumpyDraw, seed_words
 from tests.bench import direct_eskf, direct_rbpf
 from tests.bench.rows import Row, interleaved, missing, seconds
 

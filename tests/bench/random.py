@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.namespaces import NUMPY
-from flowgraph.random import Site, seed_words
+from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.random import Site, seed_words
 from tests.bench.rows import Row, interleaved, seconds
 
 PERIOD_NS = 5_000_000
@@ -31,7 +31,7 @@ def in_xla(*, ticks: int = 2000, particles: int = 1000, repeats: int = 15) -> li
     import jax
     import jax.numpy as jnp
 
-    from flowgraph.xla import _JaxNamespace
+    from flowgraph.engines.xla.scan import _JaxNamespace
 
     shape = (3, particles)
     site = Site("bench", "normal", shape)

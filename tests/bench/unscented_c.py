@@ -2,7 +2,7 @@
 
 The state is position, velocity, Euler angles (Z-Y-X) and the biases of gyroscope and accelerometer; the model
 is strapdown navigation with an IMU as control, the measurement position and angles. Both filters are made of
-what `blocks/unscented.py` offers; the peer, `floor/ukf.cpp`, has the same equations in the same form.
+what `blocks/unscented/filters.py` offers; the peer, `floor/ukf.cpp`, has the same equations in the same form.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, real, simulate
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.unscented import predict_unscented, update_unscented
-from flowgraph.series import Series
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.data.series import Series
 from tests.bench.generated_c import floor, loop
 from tests.bench.rows import Row, interleaved, missing, seconds
 

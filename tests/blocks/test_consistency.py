@@ -7,10 +7,10 @@ import pytest
 
 from flowgraph import DataError, Series
 from flowgraph.blocks import consistency as c
-from flowgraph.blocks.chi_square import gate_table
-from flowgraph.blocks.geometry import from_rotation_vector, multiply
-from flowgraph.blocks.kalman import Gaussian, KalmanInnovation, update_linear
-from flowgraph.blocks.point import PointBelief
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
+from flowgraph.blocks.kalman.filters import Gaussian, KalmanInnovation, update_linear
+from flowgraph.blocks.metrics.chi_square import gate_table
+from flowgraph.blocks.models.point import PointBelief
 from flowgraph.blocks.signals import Innovation, NavigationState
 
 RNG = np.random.default_rng(8)

@@ -389,7 +389,7 @@ def test_a_mapping_must_be_whole(tmp_path):
 
 def test_a_library_of_a_format_is_imported_when_it_is_needed():
     program = (
-        "import sys; import flowgraph.blocks.datasets; from flowgraph.registry import flight_names;"
+        "import sys; import flowgraph.blocks.datasets; from flowgraph.data.registry import flight_names;"
         "flight_names(); assert not {'rosbags', 'scipy.io'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from flowgraph.blocks import geometry as g
+from flowgraph.blocks.geometry import rotations as g
 
 numbers = st.floats(-1.0, 1.0, allow_subnormal=False)
 vectors = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0, allow_subnormal=False))

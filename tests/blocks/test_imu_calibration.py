@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, Series, find_graph, load_flight, simulate
-from flowgraph.blocks.imu_calibration import (
+from flowgraph.blocks.inertial.imu_calibration import (
     CountsCalibration,
     ImuCounts,
     Window,

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowgraph.blocks import geometry as g
-from flowgraph.blocks.aiding import aid_attitude, aid_position
-from flowgraph.blocks.alignment import StartSpread, level_attitude, start_belief
 from flowgraph.blocks.datasets import euroc
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise, predict
-from flowgraph.blocks.metrics import interpolate_pose
+from flowgraph.blocks.geometry import rotations as g
+from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
+from flowgraph.blocks.inertial.alignment import StartSpread, level_attitude, start_belief
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
+from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position, SpecificForce
 from tests.bench import direct_eskf
 

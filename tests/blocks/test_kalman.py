@@ -20,17 +20,16 @@ from flowgraph import (
     real,
     simulate,
 )
-from flowgraph.block import When
-from flowgraph.blocks.geometry import from_rotation_vector, multiply
-from flowgraph.blocks.kalman import (
+from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean, quaternion
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
+from flowgraph.blocks.kalman.filters import (
     Gaussian,
     predict_linear,
     update_extended,
     update_linear,
 )
-from flowgraph.blocks.linear import LinearModel
-from flowgraph.blocks.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.roots import (
+from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.roots import (
     GaussianRoot,
     lower_root,
     predict_root,
@@ -38,6 +37,7 @@ from flowgraph.blocks.roots import (
     update_extended_root,
     update_root,
 )
+from flowgraph.language.block import When
 from tests.support import all_engines
 
 RNG = np.random.default_rng(5)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph.blocks import geometry as g
-from flowgraph.blocks import lanes
+from flowgraph.blocks.geometry import lanes
+from flowgraph.blocks.geometry import rotations as g
 
 N = 7
 

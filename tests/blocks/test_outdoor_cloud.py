@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from flowgraph.blocks import geometry as g
-from flowgraph.blocks.inertial import GRAVITY, ImuNoise
-from flowgraph.blocks.outdoor_cloud import (
+from flowgraph.blocks.geometry import rotations as g
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.outdoor.cloud import (
     OutdoorCloud,
     correct_distance,
     correct_field,
@@ -21,7 +21,7 @@ from flowgraph.blocks.outdoor_cloud import (
     take_picture,
 )
 from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.random import NumpyDraw, seed_words
+from flowgraph.recorder.random import NumpyDraw, seed_words
 
 N = 4
 EARTH = np.array([0.0, 25e-6, -43e-6])

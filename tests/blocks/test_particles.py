@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, multivariate_normal
 
-from flowgraph.blocks import geometry as g
-from flowgraph.blocks.alignment import StartSpread
-from flowgraph.blocks.calibration import subtract_rest_bias
-from flowgraph.blocks.inertial import GRAVITY
-from flowgraph.blocks.particles import (
+from flowgraph.blocks.geometry import rotations as g
+from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.calibration import subtract_rest_bias
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.particles.cloud import (
     attitude_likelihood,
     average_attitude,
     average_pose,
@@ -21,9 +21,9 @@ from flowgraph.blocks.particles import (
     start_cloud,
     weights,
 )
-from flowgraph.blocks.rao_blackwell import correct_motion, predict_motion
+from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.signals import Attitude, Cloud, Imu, LogLikelihood, Pose, Weights
-from flowgraph.random import NumpyDraw, seed_words
+from flowgraph.recorder.random import NumpyDraw, seed_words
 
 N = 5
 READING = Imu(gyro=np.array([0.3, -0.2, 1.0]), specific_force=np.array([1.0, 0.5, 9.0]))

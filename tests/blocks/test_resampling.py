@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from flowgraph import Scalar, Series, Signal, Stream, block, graph, real, simulate
-from flowgraph.blocks.particles import start_cloud
-from flowgraph.blocks.resampling import SCHEMES, ancestor_index, draw_ancestors, take_ancestors
+from flowgraph.blocks.particles.cloud import start_cloud
+from flowgraph.blocks.particles.resampling import SCHEMES, ancestor_index, draw_ancestors, take_ancestors
 from flowgraph.blocks.signals import Ancestors
 from flowgraph.errors import UnknownNameError
-from flowgraph.random import NumpyDraw, seed_words
+from flowgraph.recorder.random import NumpyDraw, seed_words
 from flowgraph.types import Array
 
 N = 20

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowgraph import timing_of
-from flowgraph.blocks import geometry as g
 from flowgraph.blocks import sensors as s
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.sensors.geodetic import FLATTENING, SEMI_MAJOR_AXIS
+from flowgraph.blocks.geometry import rotations as g
+from flowgraph.blocks.geometry.geodetic import FLATTENING, SEMI_MAJOR_AXIS
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.world import Hover, RoundTrip, thesis_flight
 from flowgraph.errors import DeclarationError
 

@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 
 from flowgraph import DeclarationError, UnknownNameError
-from flowgraph.block import When
-from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply, to_rotation_vector
-from flowgraph.blocks.kalman import Gaussian, predict_linear, update_extended, update_linear
-from flowgraph.blocks.linear import LinearModel
-from flowgraph.blocks.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.sigma_points import SigmaPoints, mean_turn
-from flowgraph.blocks.unscented import predict_unscented, update_unscented
+from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean, quaternion
+from flowgraph.blocks.geometry.rotations import (
+    from_rotation_vector,
+    geodesic_angle,
+    multiply,
+    to_rotation_vector,
+)
+from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_extended, update_linear
+from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints, mean_turn
+from flowgraph.language.block import When
 
 DT = 0.1
 POSE = StateSpace(euclidean(3), quaternion())

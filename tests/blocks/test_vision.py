@@ -12,10 +12,10 @@ from flowgraph import DataError, DeclarationError, Series, UnknownNameError
 from flowgraph.blocks.datasets.course import Motion, see
 from flowgraph.blocks.datasets.parameters import Parameters
 from flowgraph.blocks.datasets.rob6213 import MotionTruth
-from flowgraph.blocks.geometry import to_matrix
-from flowgraph.blocks.kalman import Gaussian
+from flowgraph.blocks.geometry.rotations import to_matrix
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.models.unscented_ins import update_camera_velocity
 from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.unscented_ins import update_camera_velocity
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount
 from flowgraph.blocks.vision.mapping import _first_guess, _Problem, build_map
 from flowgraph.blocks.vision.motion import (
@@ -270,7 +270,7 @@ def test_a_camera_velocity_corrects_the_velocity(rate):
     rng = np.random.default_rng(0)
     truth = np.concatenate([np.zeros(3), [0.1, -0.2, 0.3], [1.0, -0.5, 0.2], [0.02, 0.0, -0.01], np.zeros(3)])
     w = np.array([0.5, -1.0, 0.8])
-    from flowgraph.blocks.euler import matrix_from_angles
+    from flowgraph.blocks.geometry.euler import matrix_from_angles
 
     R = np.asarray(matrix_from_angles(truth[3:6], order="zyx", xp=np))
     v = camera_velocity(truth[6:9], R, w, mount=COURSE_MOUNT, xp=np)

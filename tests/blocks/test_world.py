@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from flowgraph.blocks import geometry as g
-from flowgraph.blocks.inertial import GRAVITY
+from flowgraph.blocks.geometry import rotations as g
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.world import (
     Hover,
     KeyPoint,

@@ -14,8 +14,8 @@ import flowgraph
 from flowgraph import Block, FlowgraphError, Signal, errors, find_graph
 from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rosbag, tum
 from flowgraph.blocks.flights import simulated
-from flowgraph.ops import OPS
-from flowgraph.registry import graph_names
+from flowgraph.data.registry import graph_names
+from flowgraph.recorder.ops import OPS
 
 ROOT = Path(__file__).resolve().parents[2]
 

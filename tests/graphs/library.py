@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flowgraph import Case
 from flowgraph.cli.options import case_of
-from flowgraph.registry import graph_names
+from flowgraph.data.registry import graph_names
 from tests.blocks.test_datasets import course
 
 ON_HOST = {"tag_pose"}

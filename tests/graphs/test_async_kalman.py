@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, Flight, Series, aperiodic, periodic, simulate, simulate_many
-from flowgraph.blocks.consistency import chi_square_band, inside
-from flowgraph.blocks.kalman import Gaussian
-from flowgraph.blocks.point import (
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.metrics.consistency import chi_square_band, inside
+from flowgraph.blocks.models.point import (
     WorldAcceleration,
     point_model,
     start_point,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, load_flight, simulate
-from flowgraph.blocks.complementary import correct_by_pose
-from flowgraph.blocks.metrics import pose_errors
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.orientation.complementary import correct_by_pose
 from flowgraph.blocks.signals import Pose, PoseEstimate
 from flowgraph.graphs import augmented_complementary
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn

@@ -23,7 +23,7 @@ from flowgraph import (
     periodic,
     simulate,
 )
-from flowgraph.blocks.geometry import geodesic_angle, rotate
+from flowgraph.blocks.geometry.rotations import geodesic_angle, rotate
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
 from flowgraph.graphs import complementary
 from tests.graphs.estimation import THESIS, engines_agree, is_lowered_and_drawn

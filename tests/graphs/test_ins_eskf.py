@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, Flight, Result, Series, find_graph, load_flight, lower, simulate
-from flowgraph.blocks.geometry import geodesic_angle
+from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.signals import Belief
 from tests.support import ENGINES, flat_state, same
 

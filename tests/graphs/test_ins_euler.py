@@ -25,9 +25,10 @@ from flowgraph import (
     lower,
     simulate,
 )
-from flowgraph.blocks.metrics import interpolate_pose, pose_errors, within_truth
+from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors, within_truth
 from flowgraph.blocks.vision.motion import camera_motion_of
 from flowgraph.blocks.vision.pnp import as_measurements, rotation_of
+from flowgraph.drawing.trajectory import plot_ins, plot_space
 from flowgraph.graphs import ins_ekf_pose, ins_particle, ins_ukf_pose, ins_ukf_velocity, tag_pose
 from flowgraph.graphs.benches.apriltag import (
     SPANS,
@@ -40,7 +41,6 @@ from flowgraph.graphs.benches.apriltag import (
 )
 from flowgraph.graphs.euler_flight import SingularityWarning
 from flowgraph.graphs.tag_pose import map_of, poses_of
-from flowgraph.plot_trajectory import plot_ins, plot_space
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, Series, load_flight, simulate
-from flowgraph.blocks.alignment import static_alignment
-from flowgraph.blocks.geometry import conjugate, from_rotation_vector, multiply, rotate, tilt_and_heading
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.marg import RestRule, detect_rest
+from flowgraph.blocks.geometry.rotations import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    rotate,
+    tilt_and_heading,
+)
+from flowgraph.blocks.inertial.alignment import static_alignment
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.orientation.marg import RestRule, detect_rest
 from flowgraph.blocks.signals import Attitude, Imu, MagneticField
 from flowgraph.graphs import marg
 from tests.data import recordings

@@ -16,9 +16,9 @@ from flowgraph import (
     simulate,
     simulate_many,
 )
-from flowgraph.optimise import DEFAULT, PASSES, optimise, without
-from flowgraph.pipeline import Pipeline
-from flowgraph.program import specialise
+from flowgraph.pipeline.optimise import DEFAULT, PASSES, optimise, without
+from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.program import specialise
 from tests.graphs.estimation import compare
 from tests.graphs.library import LIBRARY, library_case
 

@@ -19,12 +19,17 @@ from flowgraph import (
     load_flight,
     simulate,
 )
-from flowgraph.blocks.alignment import rest_seconds
-from flowgraph.blocks.calibration import silence_frozen_gyro
-from flowgraph.blocks.euler import angles_from_quaternion
-from flowgraph.blocks.geometry import from_rotation_vector, geodesic_angle, multiply, to_rotation_vector
-from flowgraph.blocks.metrics import orientation_errors
-from flowgraph.blocks.orientation import STATE, roll_pitch_attitude, see_rate_and_gravity
+from flowgraph.blocks.geometry.euler import angles_from_quaternion
+from flowgraph.blocks.geometry.rotations import (
+    from_rotation_vector,
+    geodesic_angle,
+    multiply,
+    to_rotation_vector,
+)
+from flowgraph.blocks.inertial.alignment import rest_seconds
+from flowgraph.blocks.inertial.calibration import silence_frozen_gyro
+from flowgraph.blocks.metrics.errors import orientation_errors
+from flowgraph.blocks.orientation.accelerometer import STATE, roll_pitch_attitude, see_rate_and_gravity
 from flowgraph.blocks.signals import Attitude, Imu
 from flowgraph.graphs import gyro_integration, quaternion_ukf, roll_pitch
 from flowgraph.graphs.benches.ese650 import PUBLISHED
@@ -111,8 +116,8 @@ def test_the_options_change_little(settings):
 
 def test_krafts_set_has_no_centre_and_keeps_the_covariance():
     """Points at sqrt(n), weights 1/(2 n): an identity leaves P; at sqrt(2 n) it would come out doubled."""
-    from flowgraph.blocks.kalman import Gaussian
-    from flowgraph.blocks.unscented import predict_unscented
+    from flowgraph.blocks.kalman.filters import Gaussian
+    from flowgraph.blocks.unscented.filters import predict_unscented
     from flowgraph.graphs.quaternion_ukf import KRAFT
 
     assert KRAFT.scale(6) == pytest.approx(np.sqrt(6.0))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, load_flight, simulate
-from flowgraph.blocks.complementary import blend, remove_thrust
-from flowgraph.blocks.geometry import geodesic_angle, rotate, slerp
+from flowgraph.blocks.geometry.rotations import geodesic_angle, rotate, slerp
+from flowgraph.blocks.orientation.complementary import blend, remove_thrust
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Thrust
 from flowgraph.graphs import orientation_complementary
 from tests.graphs.estimation import THESIS, engines_agree, is_lowered_and_drawn

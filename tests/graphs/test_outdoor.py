@@ -12,9 +12,8 @@ import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, Series, simulate
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.geometry import geodesic_angle
-from flowgraph.blocks.outdoor import OutdoorSensors, attitude_of_two, outdoor_flight
-from flowgraph.blocks.outdoor_belief import (
+from flowgraph.blocks.geometry.rotations import geodesic_angle
+from flowgraph.blocks.outdoor.belief import (
     FLOW,
     OUTDOOR,
     FieldObserver,
@@ -22,6 +21,7 @@ from flowgraph.blocks.outdoor_belief import (
     observe_distance,
     observe_flow,
 )
+from flowgraph.blocks.outdoor.flight import OutdoorSensors, attitude_of_two, outdoor_flight
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.study import Study, read_table, run_study

@@ -22,11 +22,11 @@ from flowgraph import (
     simulate,
 )
 from flowgraph.blocks.flights import simulated
-from flowgraph.blocks.geometry import geodesic_angle
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.metrics import interpolate_pose, pose_errors
-from flowgraph.blocks.particles import start_cloud
-from flowgraph.blocks.resampling import SCHEMES
+from flowgraph.blocks.geometry.rotations import geodesic_angle
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors
+from flowgraph.blocks.particles.cloud import start_cloud
+from flowgraph.blocks.particles.resampling import SCHEMES
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from tests.bench import direct_eskf, direct_rbpf

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from flowgraph import Flight, Series, periodic
-from flowgraph.blocks.alignment import StartSpread, start_belief
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.particles import start_cloud
+from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.particles.cloud import start_cloud
 from flowgraph.blocks.signals import Attitude, Imu, Position
+from flowgraph.engines.many import Runs, simulate_many
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
-from flowgraph.many import Runs, simulate_many
 
 SETTINGS = ("HHH", "HHL", "HLL", "LHH", "LHL", "LLL")
 VICON, READING = {"H": 0.01, "L": 0.1}, {"H": 0.1, "L": 1.0}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowgraph import find_graph, load_flight
-from flowgraph.blocks.scores import Scorer
+from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.study import Store, Study, read_trajectory, run_study, tasks
 
 pytest.importorskip("pyarrow")
@@ -51,7 +51,7 @@ def test_runs_on_threads_are_those_of_one_at_a_time(tmp_path):
 
 
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
-    from flowgraph.c import engine
+    from flowgraph.engines.c import engine
 
     tasks._programs.clear()
     compiled: list[Any] = []
@@ -114,7 +114,7 @@ def test_graphs_of_many_seeds_are_lowered_once(name, monkeypatch):
     """The second particle filter has merges, whose rule for ties is a function."""
     from collections import OrderedDict
 
-    from flowgraph.recording import remembering
+    from flowgraph.language.recording import remembering
     from flowgraph.study.lifting import Lowered
 
     lowered, steps, settings = Lowered(), OrderedDict[Any, Any](), dict(FLIGHT)

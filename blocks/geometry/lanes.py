@@ -1,0 +1,127 @@
+"""Small vectors, quaternions and 3 x 3 matrices side by side: n of each, the number of which is the last
+axis.
+
+With struct-of-arrays fields such as (3, n) and (3, 3, n) a closed form is a few array operations over all n,
+several times faster than n factorizations (`linalg.solve` on (n, 3, 3)), and each lane is independent: a
+compiler may put them on as many processors as it has.
+
+Conventions and equation numbers are those of `flowgraph.blocks.geometry.rotations`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array
+from flowgraph.blocks.geometry import rotations as geometry
+
+__all__ = [
+    "cross",
+    "exponential",
+    "inverse_and_determinant",
+    "matrix_product",
+    "multiply",
+    "normalize",
+    "products",
+    "rotate",
+    "rotation_matrices",
+    "rotation_vectors_to",
+    "transpose",
+]
+
+
+def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The quaternion product (4, 16), rotation matrix (9, 16) and rotated vector (3, 48) of 16 products."""
+    units = np.eye(4)
+    pairs = [(a, b) for a in units for b in units]
+    product = np.stack([geometry.multiply(a, b, xp=np) for a, b in pairs], axis=1)
+    # what is bilinear in (q, q) follows from its values on sums of units: B(a, b) = (Q(a + b) - Q(a - b)) / 4
+    square = lambda q: geometry.to_matrix(q, xp=np).reshape(9)
+    matrix = np.stack([(square(a + b) - square(a - b)) / 4.0 for a, b in pairs], axis=1)
+    rotated = matrix.reshape(3, 3, 16).transpose(1, 0, 2).reshape(3, 48)
+    return product, matrix, rotated
+
+
+_PRODUCT, _MATRIX, _ROTATED = _tables()
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def products(a: Array, b: Array, *, xp: Any) -> Array:
+    """The 16 products (16, n) of the parts of quaternions a and b (4, n)."""
+    return xp.reshape(a[:, None, :] * b[None, :, :], (16, a.shape[-1]))
+
+
+def multiply(a: Array, b: Array, *, xp: Any) -> Array:
+    """The quaternion products a * b (4, n) (Solà eq. 12)."""
+    return xp.asarray(_PRODUCT, dtype=a.dtype) @ products(a, b, xp=xp)
+
+
+def normalize(q: Array, *, xp: Any) -> Array:
+    """The quaternions (4, n) scaled to unit norm."""
+    return q / xp.sqrt(xp.sum(q * q, axis=0))
+
+
+def exponential(v: Array, *, xp: Any) -> Array:
+    """Exp: the quaternions (4, n) of rotation vectors (3, n) in rad (Solà eq. 101)."""
+    u = 0.5 * v
+    half = xp.sqrt(xp.maximum(xp.sum(u * u, axis=0, keepdims=True), 1e-30))  # as in geometry: never 0/0
+    return xp.concat([xp.cos(half), xp.sin(half) / half * u], axis=0)
+
+
+def rotation_matrices(q: Array, *, xp: Any) -> Array:
+    """The rotation matrices (3, 3, n), body to world (Solà eq. 115)."""
+    return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ products(q, q, xp=xp), (3, 3, q.shape[-1]))
+
+
+def rotate(q: Array, v: Array, *, xp: Any) -> Array:
+    """One body vector v (3) in world coordinates, for each attitude (4, n): (3, n).
+
+    R(q) v is linear in the products of q's parts, with a (3, 16) matrix that v alone makes: no rotation
+    matrices.
+    """
+    by_products = xp.reshape(v @ xp.asarray(_ROTATED, dtype=q.dtype), (3, 16))
+    return by_products @ products(q, q, xp=xp)
+
+
+def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:
+    """Log(q^-1 * z): the rotation vectors (3, n) in rad, at most pi long, from attitudes (4, n) to z (4)."""
+    to_z = geometry.right_product(z, xp=xp) * xp.asarray(_CONJUGATE, dtype=q.dtype)
+    relative = to_z @ q
+    w, v = relative[:1, :], relative[1:, :]
+    squared = xp.sum(v * v, axis=0, keepdims=True)
+    small = squared < 1e-10
+    sine = xp.sqrt(xp.where(small, 1.0, squared))
+    # near zero: 2 asin(s)/s, with s^2 << 1; a series, so that the ratio is never 0/0
+    scale = xp.where(small, 2.0 + squared / 3.0, 2.0 * xp.atan2(sine, xp.abs(w)) / sine)
+    return xp.where(w < 0.0, -scale, scale) * v
+
+
+def cross(a: Array, B: Array, *, xp: Any) -> Array:
+    """The cross products (3, m, n) of vectors a (3, n), or one for all (3, 1), with m columns B (3, m, n)."""
+    after, before = (lambda v, k=k: xp.concat([v[k:, ...], v[:k, ...]], axis=0) for k in (1, 2))
+    return after(a)[:, None, :] * before(B) - before(a)[:, None, :] * after(B)
+
+
+def transpose(a: Array, *, xp: Any) -> Array:
+    """The transposed matrices (m, k, n) of a (k, m, n)."""
+    return xp.permute_dims(a, (1, 0, 2))
+
+
+def matrix_product(a: Array, b: Array) -> Array:
+    """The products (3, 3, n) of matrices a and b."""
+    return a[:, 0:1, :] * b[0:1, :, :] + a[:, 1:2, :] * b[1:2, :, :] + a[:, 2:3, :] * b[2:3, :, :]
+
+
+def inverse_and_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
+    """The inverses (3, 3, n) and determinants (n) of symmetric matrices (3, 3, n), by cofactors.
+
+    The cofactor of (i, j) is a 2 x 2 determinant of the rows and columns that follow i and j cyclically, so
+    all nine come from shifted views of the matrix written out to 5 x 5.
+    """
+    wide = xp.concat([S, S[:2, :, :]], axis=0)
+    wide = xp.concat([wide, wide[:, :2, :]], axis=1)
+    cofactors = wide[1:4, 1:4, :] * wide[2:5, 2:5, :] - wide[1:4, 2:5, :] * wide[2:5, 1:4, :]
+    determinant = xp.sum(S[0, :, :] * cofactors[0, :, :], axis=0)
+    return cofactors / determinant, determinant

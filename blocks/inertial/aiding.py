@@ -1,0 +1,163 @@
+"""Aiding: correct an inertial belief with positions and attitudes, where there are any.
+
+Each block takes a prior and an optional measurement. Without one the prior passes through and there is no
+innovation. With one, the error state is estimated by a Kalman update in Joseph form, folded into the nominal
+state, and reset.
+
+Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, sec. 7:
+update eqs. 275-276, injection eq. 283, reset eqs. 286-287 for the right (local) attitude error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array, block
+from flowgraph.blocks.geometry.rotations import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    skew,
+    to_matrix,
+    to_rotation_vector,
+)
+from flowgraph.blocks.metrics.chi_square import gate_table
+from flowgraph.blocks.signals import Attitude, Belief, Innovation, Position
+
+__all__ = ["aid_attitude", "aid_position"]
+
+Spread = float | tuple[float, float, float]
+"""A standard deviation: one number for three axes, or one each."""
+
+ORIGIN = (0.0, 0.0, 0.0)
+ALIGNED = (1.0, 0.0, 0.0, 0.0)
+
+
+def _reset_table() -> np.ndarray:
+    """(3, 225): maps an attitude correction d to -skew(d)/2 in the attitude block of a 15 x 15 matrix."""
+    table = np.zeros((3, 15, 15))
+    table[0, 7, 8], table[0, 8, 7] = 0.5, -0.5
+    table[1, 8, 6], table[1, 6, 8] = 0.5, -0.5
+    table[2, 6, 7], table[2, 7, 6] = 0.5, -0.5
+    flat = table.reshape(3, 225)
+    flat.flags.writeable = False
+    return flat
+
+
+_RESET = _reset_table()
+
+
+@block
+def aid_position(
+    prior: Belief,
+    position: Position | None,
+    *,
+    noise: Spread,
+    lever: tuple[float, float, float] = ORIGIN,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[Belief, Innovation | None]:
+    """Correct a belief with the measured position of a point fixed to the body.
+
+    z = p + R(q) lever + noise, so H = [I, 0, -R skew(lever), 0, 0] and residual = z - p - R lever.
+
+    Args:
+        prior: the belief at the time of the measurement.
+        position: z, m in the world; or absent.
+        noise: standard deviation, m.
+        lever: the point in body coordinates, m.
+        gate: when given, a measurement with a nis above it changes nothing (for three axes 16.3 is 99.9 %);
+            below 1 it is that probability, such as 0.999.
+
+    Returns:
+        The posterior, and the innovation (m, world) where there was a measurement.
+    """
+    if position is None:
+        return prior, None
+    kind = prior.position.dtype
+    R = to_matrix(prior.attitude, xp=xp)
+    arm = xp.asarray(lever, dtype=kind)
+    residual = position.position - prior.position - (R @ arm[..., None])[..., 0]
+    zero = 0.0 * R
+    H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
+    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
+    return posterior, Innovation(residual=residual, covariance=S, nis=nis)
+
+
+@block
+def aid_attitude(
+    prior: Belief,
+    attitude: Attitude | None,
+    *,
+    noise: Spread,
+    mount: tuple[float, float, float, float] = ALIGNED,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[Belief, Innovation | None]:
+    """Correct a belief with a measured attitude.
+
+    z = q * Exp(noise) * mount; residual = Log(q^-1 * z * mount^-1) and H = [0, 0, I, 0, 0], to first order.
+
+    Args:
+        prior: the belief at the time of the measurement.
+        attitude: z, a unit quaternion, sensor to world; or absent.
+        noise: standard deviation about the body axes, rad.
+        mount: the sensor's attitude in the body, a unit quaternion.
+        gate: as in `aid_position`.
+
+    Returns:
+        The posterior, and the innovation (rad, body) where there was a measurement.
+    """
+    if attitude is None:
+        return prior, None
+    kind = prior.position.dtype
+    residual = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
+    zero = 0.0 * (residual[..., :, None] * residual[..., None, :])
+    H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
+    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
+    return posterior, Innovation(residual=residual, covariance=S, nis=nis)
+
+
+def _variance(noise: Spread, kind: Any, xp: Any) -> Array:
+    spread = noise if isinstance(noise, tuple) else (noise,) * 3
+    return xp.eye(3, dtype=kind) * xp.asarray([s * s for s in spread], dtype=kind)
+
+
+def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) -> Array:
+    measured = z
+    if mount != ALIGNED:
+        measured = multiply(z, conjugate(xp.asarray(mount, dtype=q.dtype), xp=xp), xp=xp)
+    return to_rotation_vector(multiply(conjugate(q, xp=xp), measured, xp=xp), xp=xp)
+
+
+def _correct(
+    prior: Belief, residual: Array, H: Array, R: Array, gate: float | None, xp: Any
+) -> tuple[Belief, Array, Array]:
+    """The update every measurement shares: (posterior, innovation covariance, nis)."""
+    P = prior.covariance
+    HP = H @ P
+    S = HP @ H.mT + R
+    column = residual[..., None]
+    solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
+    nis = (column.mT @ solved[..., 15:])[..., 0, 0]
+    K = solved[..., :15].mT
+    if gate is not None:
+        K = K * xp.astype(nis <= float(gate_table(gate, 3)[3]), K.dtype)[..., None, None]
+    d = (K @ column)[..., 0]
+    one = xp.eye(15, dtype=P.dtype)
+    turn = d[..., 6:9]
+    reset = xp.reshape(turn @ xp.asarray(_RESET, dtype=P.dtype), (*d.shape[:-1], 15, 15)) + one
+    gain = reset @ K
+    A = reset - gain @ H
+    P = A @ P @ A.mT + gain @ R @ gain.mT
+    posterior = Belief(
+        position=prior.position + d[..., 0:3],
+        velocity=prior.velocity + d[..., 3:6],
+        attitude=multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
+        gyro_bias=prior.gyro_bias + d[..., 9:12],
+        accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],
+        covariance=0.5 * (P + P.mT),
+    )
+    return posterior, S, nis

@@ -1,0 +1,263 @@
+"""The Kalman filter: predict and correct a Gaussian, with what its users ask for first.
+
+- The covariance is corrected in Joseph form, so it stays symmetric, and positive up to rounding; the
+  blocks of `roots` carry a triangular root of it instead, whose square cannot become negative.
+- A measurement of which some entries are NaN corrects with the others (`arrays(..., not_finite="keep")` lets
+  NaN pass as data). Nothing of the missing entries reaches the result.
+- The innovation is an output with its normalised square (NIS), and an optional gate on it, which is as strict
+  with a part of a measurement as with all of it.
+- A state or measurement of angles and quaternions is declared once, as a `StateSpace`.
+
+Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+2001: secs. 5.2 (filter, Joseph form) and 5.4 (NIS).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Array, Signal, block, boolean, real, when
+from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.metrics.chi_square import gate_table
+
+__all__ = [
+    "Correction",
+    "Gaussian",
+    "KalmanInnovation",
+    "Vector",
+    "correct",
+    "predict_linear",
+    "update_extended",
+    "update_linear",
+]
+
+Vector = Annotated[Any, real("m")]
+"""A control or a measurement: m real numbers."""
+
+
+class Gaussian(Signal):
+    """A Gaussian belief: its mean (n) and its covariance (t, t) in the tangent space; t = n for vectors."""
+
+    mean: Array = real("n")
+    covariance: Array = real("t", "t")
+
+
+class KalmanInnovation(Signal):
+    """What a measurement said beyond its prediction.
+
+    residual: measured minus predicted, 0 where an entry is missing. covariance: of the residual, as the
+    filter expects it; 1 on the diagonal where an entry is missing. nis: residual^T covariance^-1 residual.
+    parts: how many entries there were, which is the mean of `nis` in a consistent filter. accepted: whether
+    it passed the gate.
+    """
+
+    residual: Array = real("m")
+    covariance: Array = real("m", "m")
+    nis: Array = real()
+    parts: Array = real()
+    accepted: Array = boolean()
+
+
+class Correction(NamedTuple):
+    """What a measurement does: the gain times the residual, the new covariance, and the innovation."""
+
+    shift: Array
+    covariance: Array
+    innovation: KalmanInnovation
+
+
+@block
+def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt: float, xp: Any) -> Gaussian:
+    """Predict over `dt` seconds with a linear model and a control that is held over the step.
+
+        x' = F x + G u        P' = F P F^T + Q
+
+    F, G and Q are those of `model` for dt. With dt = 0, as at the first firing, this is the identity.
+
+    Args:
+        belief: mean (n) and covariance (n, n).
+        control: u (m).
+        model: `LinearModel`.
+
+    Source: Bar-Shalom et al. eqs. 5.2.3-2, 5.2.3-5. (R. Fiszel's thesis, 2017, prints S- for S there.)
+    """
+    F, G, Q = model.discrete(dt, xp, belief.mean.dtype)
+    return Gaussian(
+        mean=(F @ belief.mean[..., None] + G @ control[..., None])[..., 0],
+        covariance=_symmetric(F @ belief.covariance @ F.mT + Q),
+    )
+
+
+@block
+def update_linear(
+    prior: Gaussian,
+    measured: Vector | None,
+    *,
+    H: npt.ArrayLike,
+    R: npt.ArrayLike,
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[Gaussian, KalmanInnovation | None]:
+    """Correct with z = H x + noise, where there is a measurement; without one the prior passes through.
+
+        r = z - H x        S = H P H^T + R        K = P H^T S^-1
+        x' = x + K r       P' = (I - K H) P (I - K H)^T + K R K^T
+
+    An entry of z that is NaN counts as not measured. If all are, the prior passes through and there is no
+    innovation.
+
+    Args:
+        prior: mean (n) and covariance (t, t).
+        measured: z (m); or absent.
+        H: (m, n).
+        R: (m, m) covariance of the noise.
+        space: of the state, where some of it are angles: x' = x plus K r. (For quaternions:
+            `update_extended`.)
+        measured_space: of z, where some of it are angles: r = z minus H x.
+        gate: when given, a measurement that is too far off changes nothing. Below 1 it is the probability
+            with which an honest one passes, such as 0.999; from 1 on the largest nis of a whole measurement,
+            as `chi_square_gate` gives it, and where entries are missing one of the same probability
+            (`gate_table`).
+
+    Returns:
+        The posterior, and the innovation where there was one.
+
+    Source: Bar-Shalom et al. eqs. 5.2.3-9 to 5.2.3-17. (The thesis prints P' = P + K S K^T: the sign is
+    minus.)
+    """
+    if measured is None:
+        return prior, None
+    H = xp.asarray(H, dtype=prior.mean.dtype)
+    predicted = (H @ prior.mean[..., None])[..., 0]
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+
+
+@block
+def update_extended(
+    prior: Gaussian,
+    measured: Vector | None,
+    *,
+    observe: Callable[..., tuple[Array, Array]],
+    R: npt.ArrayLike,
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[Gaussian, KalmanInnovation | None]:
+    """`update_linear` with a measurement that is any function of the state: z = h(x) + noise.
+
+    Args:
+        observe: `observe(x, xp) -> (h(x), H)`, where H (m, t) is the Jacobian of h with respect to the
+            tangent vectors of `space` and `measured_space`, at x.
+        R: (m, m) covariance of the noise, in the tangent space of z.
+        space, measured_space: of the state and of z, of any parts.
+        prior, measured, gate: as in `update_linear`.
+
+    Source: Bar-Shalom et al. sec. 10.3.3; on manifolds Hertzberg et al. 2013, sec. 4.
+    """
+    if measured is None:
+        return prior, None
+    predicted, H = observe(prior.mean, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+
+
+def correct(
+    P: Array,
+    residual: Array,
+    H: Array,
+    R: Array,
+    *,
+    present: Array | None = None,
+    gate: float | None = None,
+    space: StateSpace | None = None,
+    xp: Any,
+) -> Correction:
+    """The correction that every Kalman filter shares, linear or extended, in Joseph form.
+
+    Args:
+        P: prior covariance (..., t, t).
+        residual: (..., m); 0 where an entry is missing.
+        H: Jacobian (..., m, t).
+        R: covariance of the noise (..., m, m).
+        present: (..., m) which entries there are; None: all.
+        gate, space: as in `update_linear`.
+    """
+    if present is None:
+        present = residual == residual
+    H, R = masked(H, R, present, xp)
+    HP = H @ P
+    S = HP @ H.mT + R
+    column = residual[..., None]
+    solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
+    nis = (column.mT @ solved[..., -1:])[..., 0, 0]
+    accepted = accepts(nis, gate, present, xp)
+    K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
+    shift = (K @ column)[..., 0]
+    turn = None if space is None else space.reset(shift, xp)
+    rest = xp.eye(P.shape[-1], dtype=P.dtype) - K @ H
+    if turn is not None:
+        rest, K = turn @ rest, turn @ K
+    innovation = KalmanInnovation(
+        residual=residual,
+        covariance=S,
+        nis=nis,
+        parts=xp.sum(xp.astype(present, P.dtype), axis=-1),
+        accepted=accepted,
+    )
+    return Correction(shift, _symmetric(rest @ P @ rest.mT + K @ R @ K.mT), innovation)
+
+
+def _update(
+    prior: Gaussian, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
+    space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
+) -> tuple[Gaussian, Any]:  # fmt: skip
+    residual, present = innovate(measured, predicted, measured_space, xp)
+    noise = xp.asarray(R, dtype=prior.mean.dtype)
+    found = correct(prior.covariance, residual, H, noise, present=present, gate=gate, space=space, xp=xp)
+    mean = moved(prior.mean, found.shift, space, xp)
+    return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+
+
+def innovate(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:
+    """Measured minus predicted, 0 where an entry is NaN, and which entries there are."""
+    apart = measured - predicted if space is None else space.minus(measured, predicted, xp)
+    present = ~xp.isnan(apart)
+    return xp.where(present, apart, 0.0), present
+
+
+def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
+    """H and R with zero rows and unit variance for entries that are missing: they then say nothing."""
+    here = xp.astype(present, H.dtype)
+    both = here[..., :, None] * here[..., None, :]
+    return H * here[..., :, None], R * both + xp.eye(H.shape[-2], dtype=H.dtype) * (1.0 - here)[..., None]
+
+
+def accepts(nis: Array, gate: float | None, present: Array, xp: Any) -> Array:
+    """Whether an innovation (...) of the entries `present` (..., m) passes the gate; all do without one."""
+    if gate is None:
+        return nis == nis
+    limits = gate_table(gate, present.shape[-1])
+    parts = xp.sum(xp.astype(present, nis.dtype), axis=-1)[..., None]
+    places = xp.asarray(np.arange(len(limits)), dtype=nis.dtype)
+    return nis <= xp.sum(xp.where(parts == places, xp.asarray(limits, dtype=nis.dtype), 0.0), axis=-1)
+
+
+def moved(mean: Array, shift: Array, space: StateSpace | None, xp: Any) -> Array:
+    """The mean, moved by a tangent vector."""
+    return mean + shift if space is None else space.plus(mean, shift, xp)
+
+
+def where_any(present: Array, innovation: KalmanInnovation, xp: Any) -> Any:
+    """The innovation, present where any entry was measured."""
+    return when(xp.any(present), innovation)
+
+
+def _symmetric(P: Array) -> Array:
+    return 0.5 * (P + P.mT)

@@ -1,0 +1,292 @@
+"""How good an estimate is: errors against the truth, and whether the filter knew how large they would be.
+
+Position errors are in metres, velocity errors in m/s; attitude errors geodesic, in degrees, with tilt and
+heading apart. Where there is a covariance, the NEES, the squared error in deviations of the filter's own,
+tells whether it is honest; see `consistency`. For a pose it is taken in the tangent space: position, velocity
+(world) and a rotation vector (body), nine numbers.
+
+Source of the NEES: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, sec. 5.4.2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Series
+from flowgraph.blocks.geometry.euler import angles_from_quaternion, wrapped
+from flowgraph.blocks.geometry.rotations import (
+    conjugate,
+    geodesic_angle,
+    multiply,
+    slerp,
+    tilt_and_heading,
+    to_matrix,
+    to_rotation_vector,
+    world_error,
+)
+from flowgraph.blocks.metrics.chi_square import chi_square_band, inside
+from flowgraph.errors import DataError
+
+__all__ = [
+    "attitude_errors",
+    "error_summary",
+    "interpolate",
+    "interpolate_pose",
+    "nees",
+    "nees_summary",
+    "orientation_errors",
+    "pose_errors",
+    "state_error",
+    "within_truth",
+]
+
+
+def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The truth's position (n, 3) and attitude (n, 4) at `time` (n,) int64 ns: `interpolate` of both."""
+    return interpolate(truth, "position", time), interpolate(truth, "attitude", time)
+
+
+def interpolate(truth: Series, name: str, time: np.ndarray) -> np.ndarray:
+    """A field of the truth at `time` (n,) int64 ns: linear, and slerp for the attitude.
+
+    A time outside the truth gets its first or last value.
+    """
+    right = np.clip(np.searchsorted(truth.time, time), 1, max(len(truth) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(truth) - 1)
+    span = np.maximum(truth.time[right] - truth.time[left], 1)
+    part = np.clip((time - truth.time[left]) / span, 0.0, 1.0)  # integer differences: exact before dividing
+    x = truth[name]
+    if name == "attitude":
+        return slerp(x[left], x[right], part)
+    return np.asarray(x[left] + (x[right] - x[left]) * part[:, None])
+
+
+def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
+    """The ticks of an estimate that can be compared: `settle` seconds or more after the first, and covered by
+    a truth that is not NaN there.
+
+    Raises:
+        DataError: when there is none.
+    """
+    time = estimate.time
+    held = time - time[:1] >= round(settle * 1e9)
+    if len(truth):
+        held &= (time >= truth.time[0]) & (time <= truth.time[-1])
+        for name in {"position", "attitude"} & set(truth.leaves):
+            if not np.isfinite(truth[name]).all():  # unknown at some time, and so between its neighbours
+                held[held] = np.isfinite(interpolate(truth, name, time[held])).all(axis=-1)
+    chosen = estimate[_rows(held)]
+    if not len(truth) or not len(chosen):
+        raise DataError(
+            "no tick of the estimate lies within the truth",
+            path=estimate.name,
+            expected=f"ticks {settle} s or more after the first, where the truth is known",
+            got=f"{estimate!r}, {truth!r}",
+            fix="check the time offsets, or make settle smaller",
+        )
+    return chosen
+
+
+def _rows(held: np.ndarray) -> slice | np.ndarray:
+    """The rows of a mask, as a slice where nothing lies between them: that copies nothing."""
+    rows = np.flatnonzero(held)
+    whole = len(rows) and rows[-1] - rows[0] + 1 == len(rows)
+    return slice(int(rows[0]), int(rows[-1]) + 1) if whole else held
+
+
+def error_summary(error: npt.ArrayLike) -> dict[str, float]:
+    """`rmse`, `mean` and `max` of the length of error vectors (..., k), or of angles (n,)."""
+    size = np.abs(np.asarray(error, dtype=float))
+    size = np.linalg.norm(size, axis=-1) if size.ndim > 1 else size
+    return {
+        "rmse": float(np.sqrt(np.mean(np.square(size)))),
+        "mean": float(np.mean(size)),
+        "max": float(np.max(size)),
+    }
+
+
+def state_error(
+    time: np.ndarray, truth: Series, position: np.ndarray, velocity: np.ndarray, attitude: np.ndarray | None =
+    None
+) -> np.ndarray:  # fmt: skip
+    """The errors (..., n, 6 or 9) of estimates at n times: position, velocity, and attitude where it is
+    given.
+
+    The error is that of the truth from the estimate: p_true - p, v_true - v, Log(q^-1 q_true).
+
+    Args:
+        time: (n,) int64 ns.
+        truth: with fields position, velocity and attitude; interpolated.
+        position, velocity: (..., n, 3).
+        attitude: (..., n, 4).
+    """
+    p, q = interpolate_pose(truth, time)
+    parts = [p - position, _true_velocity(truth, time) - velocity]
+    if attitude is not None:
+        parts.append(_turn(attitude, np.broadcast_to(q, attitude.shape)))
+    return np.concatenate(parts, axis=-1)
+
+
+def nees(error: npt.ArrayLike, covariance: npt.ArrayLike) -> np.ndarray:
+    """The normalised estimation error squared e^T P^-1 e (...), of errors e (..., k) and P (..., k, k).
+
+    Where a P is singular, which claims that something is known exactly, only the rest counts.
+    """
+    e, P = np.asarray(error, dtype=float), np.asarray(covariance, dtype=float)
+    try:
+        weighed = np.linalg.solve(P, e[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        weighed = (np.linalg.pinv(P, hermitian=True) @ e[..., None])[..., 0]
+    return np.asarray(np.vecdot(e, weighed))
+
+
+def nees_summary(error: npt.ArrayLike, covariance: npt.ArrayLike) -> dict[str, float]:
+    """Whether errors (n, k) are as large as their covariances (n, k, k) say.
+
+    Returns:
+        nees_mean, k in a consistent filter; nees_low and nees_high, the 95 % band of a single tick; and
+        nees_inside, the fraction of ticks in it. (Neighbouring ticks err alike, so the mean of one run
+        scatters more than one of as many independent ticks: for a sharp test average over runs.)
+    """
+    values = nees(error, covariance)
+    band = chi_square_band(np.shape(error)[-1])
+    return {
+        "nees_mean": float(np.mean(values)),
+        "nees_low": band[0],
+        "nees_high": band[1],
+        "nees_inside": inside(values, band),
+    }
+
+
+def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare an estimate with the truth at the estimate's times, where the truth covers them.
+
+    Args:
+        estimate: with fields `position` and `attitude`, perhaps `velocity`, and perhaps the `covariance` of
+            a `Belief` or `PoseBelief`.
+        truth: with fields `position` and `attitude`, and perhaps `velocity`.
+        settle: seconds after the estimate's first tick that are left out.
+
+    Returns:
+        position_rmse_m and attitude_rmse_deg, each with mean and max; tilt_rmse_deg, heading_rmse_deg,
+        velocity_rmse_mps where both have one, and compared_ticks (how many); with a covariance also
+        position_3sigma and tilt_3sigma, the fraction of errors within three standard deviations over all axes
+        (99.7 % when the filter is honest), heading_3sigma, and the nine numbers' `nees_summary`.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    position, attitude = interpolate_pose(truth, chosen.time)
+    error = chosen["position"] - position
+    found = {f"position_{name}_m": value for name, value in error_summary(error).items()}
+    found.update(_angles(chosen["attitude"], attitude))
+    moving = "velocity" in chosen.leaves and "velocity" in truth.leaves
+    if moving:
+        speed = chosen["velocity"] - _true_velocity(truth, chosen.time)
+        found["velocity_rmse_mps"] = error_summary(speed)["rmse"]
+    found["compared_ticks"] = float(len(chosen))
+    if "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9:
+        P = chosen["covariance"][:, :9, :9]
+        at = np.sqrt(np.einsum("nii->ni", P[:, :3, :3]))
+        found["position_3sigma"] = float(np.mean(np.abs(error) <= 3.0 * at))
+        found.update(_turn_3sigma(chosen["attitude"], attitude, P[:, 6:9, 6:9]))
+        if moving:
+            turn = _turn(chosen["attitude"], attitude)
+            found.update(nees_summary(np.concatenate([-error, -speed, turn], axis=-1), P))
+    return found
+
+
+def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare attitudes with the truth, at ticks that it covers, `settle` seconds after the first on.
+
+    Returns:
+        attitude_rmse_deg (geodesic) with mean and max, tilt_rmse_deg, heading_rmse_deg, attitude_end_deg
+        (geodesic, at the last tick), compared_ticks and the figures of `orientation_errors`; with a
+        covariance (3, 3) also tilt_3sigma, heading_3sigma and the `nees_summary` of its three numbers.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    q, attitude = chosen["attitude"], interpolate(truth, "attitude", chosen.time)
+    found = {
+        **_angles(q, attitude),
+        **_axes_and_parts(q, attitude),
+        "attitude_end_deg": float(geodesic_angle(q[-1:], attitude[-1:])[0]),
+        "compared_ticks": float(len(chosen)),
+    }
+    if "covariance" in chosen.leaves:
+        found.update(_turn_3sigma(q, attitude, chosen["covariance"]))
+        found.update(nees_summary(_turn(q, attitude), chosen["covariance"]))
+    return found
+
+
+def _angles(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    tilt, heading = tilt_and_heading(estimate, truth)
+    whole = error_summary(geodesic_angle(estimate, truth))
+    return {
+        **{f"attitude_{name}_deg": value for name, value in whole.items()},
+        "tilt_rmse_deg": error_summary(tilt)["rmse"],
+        "heading_rmse_deg": error_summary(heading)["rmse"],
+    }
+
+
+def _turn_3sigma(estimate: np.ndarray, truth: np.ndarray, P: np.ndarray) -> dict[str, float]:
+    """How often tilt and heading are within three deviations, given the covariance (n, 3, 3) in the body."""
+    R = to_matrix(estimate, xp=np)
+    sigma = np.sqrt(((R @ P) * R).sum(axis=-1))  # the diagonal of R P R^T
+    held = np.abs(world_error(estimate, truth)) <= 3.0 * sigma
+    return {"tilt_3sigma": float(np.mean(held[:, :2])), "heading_3sigma": float(np.mean(held[:, 2]))}
+
+
+def _turn(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Log(q^-1 q_true), rad, body."""
+    return np.asarray(to_rotation_vector(multiply(conjugate(estimate, xp=np), truth, xp=np), xp=np))
+
+
+def _true_velocity(truth: Series, time: np.ndarray) -> np.ndarray:
+    """The truth's velocity (n, 3), interpolated."""
+    seconds, at = (truth.time - time[0]) * 1e-9, (time - time[0]) * 1e-9
+    return np.stack([np.interp(at, seconds, column) for column in truth["velocity"].T], axis=-1)
+
+
+def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare attitudes with the truth, at the estimate's times that it covers.
+
+    Args:
+        estimate: with the field `attitude`.
+        truth: with the field `attitude`; where an attitude is NaN, or one of the two on both sides of a time
+            is, there is no truth.
+        settle: seconds after the estimate's first tick that are left out.
+
+    Returns:
+        roll_rmse_rad, pitch_rmse_rad and yaw_rmse_rad, of the differences of Euler angles, each wrapped into
+        (-pi, pi]; total_rmse_deg, heading_rmse_deg and inclination_rmse_deg, of the geodesic angle and its
+        parts (`tilt_and_heading`); compared_ticks.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    q = interpolate(truth, "attitude", chosen.time)
+    return {**_axes_and_parts(chosen["attitude"], q), "compared_ticks": float(len(chosen))}
+
+
+def _axes_and_parts(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    a, b = (np.asarray(angles_from_quaternion(x, order="zyx", xp=np)) for x in (estimate, truth))
+    apart = wrapped(a - b)
+    tilt, heading = tilt_and_heading(estimate, truth)
+    return {
+        **{f"{n}_rmse_rad": _rms(apart[:, k]) for k, n in enumerate(("roll", "pitch", "yaw"))},
+        "total_rmse_deg": _rms(geodesic_angle(estimate, truth)),
+        "heading_rmse_deg": _rms(heading),
+        "inclination_rmse_deg": _rms(tilt),
+    }
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))

@@ -1,0 +1,100 @@
+"""Orientation from an inertial unit alone: attitude and body rate by sigma points, and two simple baselines.
+
+State x = (q, w): attitude body to world, and body rate (rad/s). Nothing drives it: the rate is a random walk,
+and the gyroscope measures it. Gravity is all that an accelerometer is expected to read, so what accelerates
+the body is noise; the heading is not measured, and drifts.
+
+Source: E. Kraft, "A quaternion-based unscented Kalman filter for orientation tracking", Fusion 2003. Two of
+its steps are made to agree: the noise and the correction of the attitude multiply from the right, in the
+body, as the rate does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Array, Signal, block, real
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
+from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, rotate
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.signals import Attitude, Imu
+
+__all__ = [
+    "STATE",
+    "OrientationBelief",
+    "named_orientation",
+    "roll_pitch_attitude",
+    "see_rate_and_gravity",
+    "stacked_imu",
+    "start_orientation",
+    "turn_by_rate",
+]
+
+STATE = StateSpace(quaternion(), euclidean(3))
+"""Attitude, body rate."""
+
+
+class OrientationBelief(Signal):
+    """A belief about attitude and body rate (rad/s), with the covariance of its error.
+
+    Error order, three each: attitude (rad, right rotation vector in the body), rate (rad/s, body).
+    """
+
+    attitude: Array = real(4, unit="1", frame="world<-body")
+    rate: Array = real(3, unit="rad/s", frame="body")
+    covariance: Array = real(6, 6)
+
+
+def turn_by_rate(x: Array, control: Any, noise: Array | None, dt: Any, xp: Any) -> Array:
+    """The motion over dt seconds: q' = q * Exp(w dt), w' = w (Kraft eqs. 8-12), without noise."""
+    q, w = x[..., :4], x[..., 4:]
+    return xp.concat([multiply(q, from_rotation_vector(w * dt, xp=xp), xp=xp), w], axis=-1)
+
+
+def see_rate_and_gravity(x: Array, xp: Any) -> Array:
+    """What an inertial unit that does not accelerate reads: (w, -R(q)^T gravity), rad/s and m/s^2."""
+    q, w = x[..., :4], x[..., 4:]
+    up = 0.0 * w - xp.asarray(GRAVITY, dtype=x.dtype)
+    return xp.concat([w, rotate(conjugate(q, xp=xp), up, xp=xp)], axis=-1)
+
+
+@block
+def stacked_imu(imu: Imu, *, xp: Any) -> Array:
+    """A reading as one vector (6): rate (rad/s), specific force (m/s^2)."""
+    return xp.concat([imu.gyro, imu.specific_force], axis=-1)
+
+
+@block
+def named_orientation(belief: Gaussian) -> OrientationBelief:
+    """The belief over (q, w) with names and units."""
+    x = belief.mean
+    return OrientationBelief(attitude=x[..., :4], rate=x[..., 4:], covariance=belief.covariance)
+
+
+def start_orientation(
+    attitude: npt.ArrayLike, *, attitude_deviation: float = 0.1, rate_deviation: float = 0.1
+) -> Gaussian:
+    """A belief over (q, w) of a body that does not turn, with standard deviations in rad and rad/s."""
+    mean = np.concatenate([np.asarray(attitude, dtype=float), np.zeros(3)])
+    return Gaussian(mean=mean, covariance=np.diag(np.repeat([attitude_deviation, rate_deviation], 3) ** 2))
+
+
+@block
+def roll_pitch_attitude(imu: Imu, *, xp: Any) -> Attitude:
+    """The attitude whose roll and pitch the specific force shows, and whose yaw is zero.
+
+        roll = atan2(f_y, f_z)      pitch = atan2(-f_x, hypot(f_y, f_z))      q = Ry(pitch) Rx(roll)
+
+    Right when the body does not accelerate. Fires with each reading. No state.
+    """
+    f = imu.specific_force
+    x, y, z = f[..., 0:1], f[..., 1:2], f[..., 2:3]
+    roll, pitch = xp.atan2(y, z), xp.atan2(-x, xp.hypot(y, z))
+    about_x = xp.concat([roll, 0.0 * roll, 0.0 * roll], axis=-1)
+    about_y = xp.concat([0.0 * pitch, pitch, 0.0 * pitch], axis=-1)
+    turns = (from_rotation_vector(turn, xp=xp) for turn in (about_y, about_x))
+    return Attitude(attitude=multiply(*turns, xp=xp))

@@ -1,0 +1,303 @@
+"""Complementary filters: a gyroscope for what is fast, gravity or a camera for what is slow.
+
+A gyroscope that is integrated follows every turn at once, and drifts; an accelerometer shows the vertical on
+average, and is noisy. So the one is high-passed, the other low-passed, with one cut-off, so that the two
+shares add up to all of the attitude. On one axis, with w the rate and z the angle seen, this is
+
+    y_k = high_pass(integral of w) + low_pass(z) = a (y_(k-1) + w dt) + (1 - a) z_k
+
+and on rotations the right-hand side becomes a turn by the gyroscope and a step of the share 1 - a on the
+shortest way to the attitude seen (`turn_by_gyro`, then `blend`).
+
+Source: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear complementary filters on the special orthogonal
+group", IEEE Trans. Automatic Control 53(5), 2008, secs. II and III; R. Fiszel, thesis (2017), sections on the
+complementary filters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array, Flight, Series, Signal, block, real
+from flowgraph.blocks.geometry.rotations import (
+    conjugate,
+    from_rotation_vector,
+    level,
+    multiply,
+    normalize,
+    rotate,
+    to_rotation_vector,
+)
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.signals import (
+    Attitude,
+    CoordinateAcceleration,
+    Gyro,
+    Imu,
+    Pose,
+    PoseEstimate,
+    SpecificForce,
+    Thrust,
+)
+from flowgraph.errors import DataError, DeclarationError
+
+__all__ = [
+    "WorldForce",
+    "turn_by_gyro",
+    "carry_to_world",
+    "level_near",
+    "remove_thrust",
+    "blend",
+    "dead_reckon",
+    "correct_by_pose",
+    "first_attitude",
+    "with_parts",
+    "own_density",
+    "reading_deviation",
+    "check_alpha",
+]
+
+
+class WorldForce(Signal):
+    """A specific force in world coordinates, m/s^2; (0, 0, 9.81) at rest."""
+
+    force: Array = real(3, unit="m/s^2", frame="world")
+
+    @classmethod
+    def at_rest(cls) -> WorldForce:
+        """That of a body that does not accelerate."""
+        return cls(force=-np.array(GRAVITY))
+
+
+# -- the gyroscope's side --------------------------------------------------------------------------------
+
+
+@block
+def turn_by_gyro(last, attitude: Attitude, gyro: Gyro, *, dt: float, xp: Any) -> tuple[Any, Attitude]:
+    """Turn an attitude over `dt` seconds by the mean of the rate before and the rate now.
+
+        q' = q * Exp((w_last + w) dt / 2)
+
+    The mean, since either rate alone leads or lags by half a step. With dt = 0, as at the first firing, this
+    is the identity. Fires when its inputs do. State: the last rate (3,), rad/s.
+    """
+    turn = from_rotation_vector(0.5 * (last + gyro.rate) * dt, xp=xp)
+    return gyro.rate, Attitude(attitude=normalize(multiply(attitude.attitude, turn, xp=xp), xp=xp))
+
+
+@turn_by_gyro.init
+def _(attitude: Any, gyro: Any) -> Any:
+    return np.zeros(3)
+
+
+# -- what gravity shows ----------------------------------------------------------------------------------
+
+
+@block
+def carry_to_world(attitude: Attitude, force: SpecificForce, *, xp: Any) -> WorldForce:
+    """The specific force R(q) f in the world, as an attitude says that it is. Fires when its inputs do."""
+    return WorldForce(force=rotate(attitude.attitude, force.force, xp=xp))
+
+
+@block
+def level_near(attitude: Attitude, force: WorldForce, *, xp: Any) -> Attitude:
+    """The attitude nearest to `attitude` in which `force`, which it carried to the world, points up.
+
+    The smallest rotation that takes the direction of `force` to +z, after `attitude`: it is about a
+    horizontal axis, so the heading stays that of `attitude`. Fires when its inputs do.
+    """
+    q = attitude.attitude
+    in_body = rotate(conjugate(q, xp=xp), force.force, xp=xp)
+    return Attitude(attitude=level(q, in_body, xp=xp))
+
+
+@block
+def remove_thrust(acceleration: CoordinateAcceleration, thrust: Thrust, *, xp: Any) -> SpecificForce:
+    """Gravity's reaction, from what a quadrotor's acceleration is beyond its thrust.
+
+    Thrust and gravity are all the forces there are, R^T a = T e_z + R^T g, so
+
+        -R^T g = T e_z - R^T a
+
+    which is what an accelerometer would read at this attitude if the body did not accelerate. Fires when its
+    inputs do.
+    """
+    a = acceleration.acceleration
+    push = thrust.thrust[..., None] * xp.asarray((0.0, 0.0, 1.0), dtype=a.dtype)
+    return SpecificForce(force=push - a)
+
+
+# -- both together ---------------------------------------------------------------------------------------
+
+
+@block
+def blend(attitude: Attitude, seen: Attitude | None, *, alpha: float, xp: Any) -> Attitude:
+    """A step of the share 1 - alpha on the shortest way from `attitude` to the one that was seen.
+
+        q' = q * Exp((1 - alpha) Log(q^-1 q_seen))
+
+    Without `seen` the attitude passes through. Fires with `attitude`.
+    """
+    if seen is None:
+        return attitude
+    q = _towards(attitude.attitude, seen.attitude, 1.0 - alpha, xp)
+    return Attitude(attitude=q)
+
+
+def _towards(q: Array, seen: Array, share: float, xp: Any) -> Array:
+    error = to_rotation_vector(multiply(conjugate(q, xp=xp), seen, xp=xp), xp=xp)
+    return normalize(multiply(q, from_rotation_vector(share * error, xp=xp), xp=xp), xp=xp)
+
+
+@block
+def dead_reckon(
+    last,
+    estimate: PoseEstimate,
+    imu: Imu,
+    *,
+    gravity: tuple[float, float, float] = GRAVITY,
+    dt: float,
+    xp: Any,
+) -> tuple[Any, PoseEstimate]:
+    """Carry a pose and velocity over `dt` seconds on what an IMU read at both ends of the step.
+
+        q' = q * Exp((w_last + w) dt / 2)       a = (R(q) f_last + R(q') f) / 2 + gravity
+        p' = p + v dt + a dt^2 / 2              v' = v + a dt
+
+    (The thesis adds the reading to the velocity as it is, in body coordinates; it is turned to the world
+    here.) With dt = 0 this is the identity. Fires when its inputs do. State: the last reading.
+    """
+    kind = estimate.position.dtype
+    turn = from_rotation_vector(0.5 * (last.gyro + imu.gyro) * dt, xp=xp)
+    q = normalize(multiply(estimate.attitude, turn, xp=xp), xp=xp)
+    before = rotate(estimate.attitude, last.specific_force, xp=xp)
+    now = rotate(q, imu.specific_force, xp=xp)
+    step = (0.5 * (before + now) + xp.asarray(gravity, dtype=kind)) * dt
+    return imu, PoseEstimate(
+        position=estimate.position + (estimate.velocity + 0.5 * step) * dt,
+        velocity=estimate.velocity + step,
+        attitude=q,
+    )
+
+
+@dead_reckon.init
+def _(estimate: Any, imu: Any, **_: Any) -> Any:
+    return Imu.at_rest()
+
+
+@block
+def correct_by_pose(
+    state,
+    prior: PoseEstimate,
+    pose: Pose,
+    *,
+    alpha: float,
+    velocity_alpha: float,
+    attitude_alpha: float,
+    dt: float,
+    xp: Any,
+) -> tuple[Any, PoseEstimate]:
+    """Complement an estimate with a measured pose, `dt` seconds after the one before.
+
+        p = alpha p- + (1 - alpha) z          q = q- * Exp((1 - alpha_q) Log(q-^-1 q_z))
+        v = v- + (1 - alpha_v) ((z - z_last) - (p- - p_last)) / dt
+
+    The velocity is that of the thesis, (1 - alpha) (z - z_last) / dt, compared with like: a difference of
+    positions is a mean over the interval, half of it late, so the filter's own mean over the same interval is
+    taken off it. At the first pose, dt = 0, the velocity stays.
+
+    Fires when its inputs do. State: the last measured position and the estimate's own, after its correction.
+    """
+    moved = (pose.position - state["measured"]) - (prior.position - state["own"])
+    known = dt > 0.0
+    rate = moved * xp.where(known, (1.0 - velocity_alpha) / xp.where(known, dt, 1.0), 0.0)
+    position = prior.position + (1.0 - alpha) * (pose.position - prior.position)
+    corrected = PoseEstimate(
+        position=position,
+        velocity=prior.velocity + rate,
+        attitude=_towards(prior.attitude, pose.attitude, 1.0 - attitude_alpha, xp),
+    )
+    return {"measured": pose.position, "own": position}, corrected
+
+
+@correct_by_pose.init
+def _(prior: Any, pose: Any, **_: Any) -> Any:
+    return {"measured": np.zeros(3), "own": np.zeros(3)}
+
+
+# -- flights and their scores (NumPy) --------------------------------------------------------------------
+
+
+def with_parts(flight: Flight) -> Flight:
+    """The flight, with `gyro` and `accelerometer` taken out of its `imu` where they are missing."""
+    streams = dict(flight.streams)
+    if "imu" in streams:
+        imu = streams["imu"]
+        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
+        force = SpecificForce(force=imu["specific_force"])
+        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
+    return replace(flight, streams=streams)
+
+
+def reading_deviation(flight: Flight, part: str, series: Series, density: float | None) -> float:
+    """The standard deviation of one reading of a gyroscope or accelerometer: its density times sqrt(rate).
+
+    Args:
+        part: gyro, accelerometer or coordinate_acceleration.
+        density: the setting; the flight's own if left out.
+    """
+    step = float(np.median(np.diff(series.time))) * 1e-9 if len(series) > 1 else 1.0
+    return own_density(flight, part, density) / math.sqrt(step)
+
+
+def own_density(flight: Flight, part: str, density: float | None) -> float:
+    """The density of the white noise of an inertial sensor: the setting, or the flight's own.
+
+    Raises:
+        DataError: where nobody says it.
+    """
+    own = flight.info.get("noise", {}).get(part, {}).get("noise")
+    if density is None and own is None and "imu_noise" in flight.info:
+        own = getattr(flight.info["imu_noise"], part, None)
+    if density is None and own is None:
+        raise DataError(
+            f"this flight does not say the noise of its {part}, and a covariance needs it",
+            path=f"{flight.name}: info",
+            expected="imu_noise, or noise by sensor",
+            got=", ".join(flight.info) or "nothing",
+            fix="give it as a setting, or leave the covariance out",
+        )
+    return float(own if density is None else density)
+
+
+def check_alpha(graph: str, *alphas: float) -> None:
+    """Refuse a share outside (0, 1].
+
+    Raises:
+        DeclarationError: for one that is.
+    """
+    for alpha in alphas:
+        if not 0.0 < alpha <= 1.0:
+            raise DeclarationError(
+                "alpha is outside (0, 1]",
+                path=graph,
+                expected="0 < alpha <= 1; 1 is the gyroscope alone",
+                got=f"{alpha!r}",
+                fix="write alpha=0.98",
+            )
+
+
+def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:
+    """The truth's attitude at the gyroscope's first reading; without a truth, that which `force` (3,) shows.
+
+    Args:
+        force: m/s^2, body: the direction that is up at the start. Its heading is taken as zero.
+    """
+    if flight.truth is not None:
+        return Attitude(attitude=interpolate_pose(flight.truth, gyro.time[:1])[1][0])
+    return Attitude(attitude=np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np)))

@@ -1,0 +1,181 @@
+"""Outdoors: which sensors a vehicle carries there, how good they are, and how a filter starts on them.
+
+An inertial unit, a magnetometer, two GPS receivers, an altimeter and optical flow each keep a clock of their
+own. What a filter must know of them beforehand is one object, so that two filters on the same streams can be
+given the very same knowledge, and be compared.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Flight, Series
+from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.errors import DataError, DeclarationError
+
+__all__ = ["STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight"]
+
+STREAMS = ("imu", "gps", "gps2", "altimeter", "magnetometer", "optical_flow")
+"""What an outdoor flight has, by name."""
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class OutdoorSensors:
+    """What is known of the sensors. Deviations are of one sample, each the same on its axes.
+
+    Args:
+        imu: densities of the inertial unit; it has no bias.
+        gps, gps2: m.
+        altimeter: m, along the beam.
+        magnetometer: T.
+        displacement, turn: of optical flow, m and rad.
+        field: the Earth's field in the world, T.
+        gps_lever, gps2_lever: the antennas in the body, m.
+
+    Raises:
+        DeclarationError: for a deviation that is not positive, or a field of zero.
+    """
+
+    imu: ImuNoise
+    gps: float
+    gps2: float
+    altimeter: float
+    magnetometer: float
+    displacement: float
+    turn: float
+    field: Vector
+    gps_lever: Vector = (0.0, 0.0, 0.0)
+    gps2_lever: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        names = ("gps", "gps2", "altimeter", "magnetometer", "displacement", "turn")
+        wrong = [f"{n}={getattr(self, n)!r}" for n in names if not 0.0 < getattr(self, n) < np.inf]
+        if wrong or not np.any(self.field):
+            raise DeclarationError(
+                "these sensors cannot be used",
+                path="OutdoorSensors",
+                expected="positive standard deviations, and a magnetic field that is not zero",
+                got=", ".join([*wrong, f"field={self.field}"]),
+                fix="give each sensor the noise of one of its samples, for example gps=0.3",
+            )
+
+
+@dataclass(frozen=True)
+class OutdoorStart:
+    """Where a filter starts: position (3,) m, attitude (4,) body to world; it is taken to be at rest.
+
+    spread: how sure that is.
+    """
+
+    position: np.ndarray
+    attitude: np.ndarray
+    spread: StartSpread
+
+
+def attitude_of_two(force: npt.ArrayLike, field: npt.ArrayLike, *, earth: npt.ArrayLike) -> np.ndarray:
+    """The attitude (4,) of a body at rest, from its specific force (+z) and the magnetic field it reads.
+
+    Force, and the part of the field across it, are one orthogonal frame in the body and another one in the
+    world; the attitude turns one into the other. The force is believed, the field gives the heading only.
+
+    Source: H. D. Black, "A passive system for determining the attitude of a satellite", AIAA Journal 2(7),
+    1964 (TRIAD).
+    """
+    from scipy.spatial.transform import Rotation  # slow to import, and only a start needs it
+
+    def frame(up: np.ndarray, along: np.ndarray) -> np.ndarray:
+        z = up / np.linalg.norm(up)
+        x = np.cross(np.cross(z, along), z)
+        x = x / np.linalg.norm(x)
+        return np.stack([x, np.cross(z, x), z], axis=1)
+
+    body = frame(np.asarray(force, dtype=float), np.asarray(field, dtype=float))
+    world = frame(np.array([0.0, 0.0, 1.0]), np.asarray(earth, dtype=float))
+    x, y, z, w = Rotation.from_matrix(world @ body.T).as_quat()
+    return np.array([w, x, y, z])
+
+
+def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart]:
+    """The streams of a flight by name, what is known of its sensors, and where to start.
+
+    The position is that of the first GPS reading; the attitude that of the first force and field.
+
+    Args:
+        flight: with all of `STREAMS`; a reading of optical flow covers the time since the one before it, the
+            first one that since the flight's first reading. info: `imu_noise`, `magnetic_field` and `noise`.
+        graph: who asks, for messages.
+
+    Raises:
+        DataError: where a stream or what should be known of it is missing, or optical flow has a gap.
+    """
+    streams = flight.need(graph, *STREAMS)
+    info = flight.info
+    missing = [name for name in ("imu_noise", "noise", "magnetic_field") if name not in info]
+    if missing:
+        raise DataError(
+            f"this flight does not say what {graph} must know of its sensors",
+            path=flight.name,
+            expected="info with imu_noise, noise and magnetic_field",
+            got=f"no {', '.join(missing)}",
+            fix="add them to the flight's info, or build the graph with sensors=OutdoorSensors(...)",
+        )
+    _without_gaps(flight.name, streams)
+    noise = info["noise"]
+    sensors = OutdoorSensors(
+        imu=info["imu_noise"],
+        gps=noise["gps"]["noise"],
+        gps2=noise["gps2"]["noise"],
+        altimeter=noise["altimeter"]["noise"],
+        magnetometer=noise["magnetometer"]["noise"],
+        displacement=noise["optical_flow"]["noise"],
+        turn=noise["optical_flow"]["attitude_noise"],
+        field=_three(info["magnetic_field"]),
+        gps_lever=_three(info.get("gps_lever", (0.0, 0.0, 0.0))),
+        gps2_lever=_three(info.get("gps2_lever", (0.0, 0.0, 0.0))),
+    )
+    force, field = streams["imu"]["specific_force"][0], streams["magnetometer"]["field"][0]
+    turn = attitude_of_two(force, field, earth=sensors.field)
+    return (
+        streams,
+        sensors,
+        OutdoorStart(streams["gps"]["position"][0], turn, _spread(sensors, streams["imu"])),
+    )
+
+
+def _spread(sensors: OutdoorSensors, imu: Series) -> StartSpread:
+    """How wrong an attitude of one force and one field is; what tilts the field turns the heading too."""
+    period = float(np.median(np.diff(imu.time))) * 1e-9 if len(imu) > 1 else 1.0
+    tilt = max(sensors.imu.accelerometer / math.sqrt(period) / 9.81, 0.01)
+    x, y, z = sensors.field
+    level = max(math.hypot(x, y), 1e-12)
+    heading = math.hypot(sensors.magnetometer / level, tilt * z / level)
+    return StartSpread(tilt=tilt, heading=min(heading, math.pi))
+
+
+def _three(values: npt.ArrayLike) -> Vector:
+    x, y, z = np.asarray(values, dtype=float).tolist()
+    return x, y, z
+
+
+def _without_gaps(name: str, streams: dict[str, Series]) -> None:
+    """Refuse optical flow of which a reading does not begin where the one before it ended."""
+    flow = streams["optical_flow"]
+    first = min(int(s.time[0]) for s in streams.values())
+    since = np.diff(flow.time, prepend=first) * 1e-9
+    gap = np.flatnonzero(np.abs(since - flow["interval"]) > 1e-6)
+    if len(gap):
+        k = int(gap[0])
+        raise DataError(
+            "optical flow has a gap",
+            path=f"{name}, optical_flow, row {k}",
+            expected=f"a reading over the {since[k]:g} s since the one before, or since the start",
+            got=f"interval={flow['interval'][k]:g} s",
+            fix="start the flight at a picture, and give it every reading, without latency",
+        )

@@ -1,0 +1,104 @@
+"""What a run is worth, in one table: errors against the truth, consistency, and what a smoother makes of it.
+
+Every graph scores its runs with `scorer`, so all print the same names: those of `metrics` and `consistency`
+for the estimate; for each stream of innovations those of `nis_summary`, with the name of the stream in front
+where there are several; and the errors of the smoothed run behind `smoothed_` and `lagged_` where that was
+asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from flowgraph import Flight, Graph, Result, Series
+from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.metrics.consistency import nis_summary
+from flowgraph.types import leaves_of
+
+__all__ = ["SMOOTHED", "Scorer", "scorer"]
+
+Errors = Callable[..., dict[str, float]]
+
+SMOOTHED = (
+    "position_rmse_m",
+    "position_max_m",
+    "velocity_rmse_mps",
+    "attitude_rmse_deg",
+    "nees_mean",
+    "nees_inside",
+)
+"""The errors of a smoothed run that are worth a line."""
+
+
+def scorer(
+    flight: Flight,
+    errors: Errors,
+    *,
+    estimate: str = "belief",
+    settle: float = 1.0,
+    steps: Callable[[Result], Steps] | None = None,
+    smooth: str = "none",
+    lag: float | None = None,
+) -> Scorer:
+    """The `score` of a `Case`.
+
+    Args:
+        flight: whose truth the estimate is compared with; without one there are innovations only.
+        errors: `pose_errors`, `point_errors` or `attitude_errors`.
+        estimate: the stream that is compared.
+        settle: seconds at the start that the errors leave out.
+        steps: what a smoother needs of a result.
+        smooth: "rts" smooths the whole run, "none" does not.
+        lag: s: with one, each tick is smoothed with what came until so much later.
+    """
+    return Scorer(flight.truth, errors, estimate, settle, steps, smooth, lag)
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """A score that says which streams it reads, so that a run of many need not keep the others."""
+
+    truth: Series | None
+    errors: Errors
+    estimate: str
+    settle: float
+    steps: Callable[[Result], Steps] | None
+    smooth: str
+    lag: float | None
+
+    @property
+    def smoothing(self) -> bool:
+        """Whether the smoothed runs are compared too."""
+        asked = self.smooth == "rts" or self.lag is not None
+        return asked and self.steps is not None and self.truth is not None
+
+    def reads(self, graph: Graph) -> list[str]:
+        """The collected streams of a graph that the score looks at."""
+        types = {c.name: graph.port(c.wire).type for c in graph.collected}
+        if self.smoothing:
+            return list(types)
+        return [n for n, t in types.items() if n == self.estimate or "nis" in dict(leaves_of(t))]
+
+    def __call__(self, result: Result) -> dict[str, float]:
+        found = self._compared(result[self.estimate])
+        innovations = {n: s for n, s in result.series.items() if "nis" in s.leaves and len(s)}
+        for name, series in innovations.items():
+            front = name.removesuffix("innovation")
+            found.update({front + key: value for key, value in nis_summary(series).items()})
+        smoothed: dict[str, Any] = {}
+        if self.smoothing and self.steps is not None:
+            prior, posterior, transition, space, named = self.steps(result)
+            if self.smooth == "rts":
+                smoothed["smoothed"] = rauch_tung_striebel(prior, posterior, transition, space=space)
+            if self.lag is not None:
+                ticks = lag_ticks(posterior.time, self.lag)
+                smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
+            for front, series in smoothed.items():
+                better = self._compared(named(series))
+                found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
+        return found
+
+    def _compared(self, series: Series) -> dict[str, float]:
+        return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)

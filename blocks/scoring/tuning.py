@@ -1,0 +1,167 @@
+"""How a filter is tuned for a flight: with what the user says, or else what the flight says of its sensors.
+
+A filter weighs by the noise that it is told, so a noise of zero is no setting: the first reading would be
+taken for the truth and divided by. That is refused here, by the name of what would have to be said instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Flight, Series
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.signals import Imu
+from flowgraph.errors import DataError, DeclarationError
+from flowgraph.language.checks import need_numbers
+
+__all__ = [
+    "check_choice",
+    "check_settings",
+    "given",
+    "gravity_of",
+    "imu_noise_of",
+    "noise_of",
+    "reading_of",
+    "unbiased_noise_of",
+    "with_imu",
+]
+
+
+WEIGHTLESS = (0.0, 0.0, 0.0)
+
+
+def given(value: Any, otherwise: Any) -> Any:
+    """The value, or what to use where it was left out (None)."""
+    return otherwise if value is None else value
+
+
+def noise_of(
+    graph: str, flight: Flight, name: str, setting: float | None, otherwise: float | None = None
+) -> float:
+    """A standard deviation: the setting, or the flight's own, or `otherwise`.
+
+    Args:
+        graph: who asks.
+        name: of the setting, and of the entry in the flight's `info`.
+
+    Raises:
+        DataError: where nobody says it.
+        DeclarationError: where it is zero.
+    """
+    found = given(setting, flight.info.get(name, otherwise))
+    if found is None:
+        raise DataError(
+            f"this flight does not say its {name}, and {graph} needs it",
+            path=f"{flight.name}: info",
+            expected=f"{name}, in SI units",
+            got=", ".join(flight.info) or "nothing",
+            fix=f"write --set {name}=0.1, or {name}=0.1 in code",
+        )
+    if not found > 0.0:
+        raise DeclarationError(
+            f"{graph} cannot weigh measurements without noise",
+            path=f"{graph}.{name}",
+            expected="a positive number",
+            got=f"{found:g}" + (" (the flight's own)" if setting is None else ""),
+            fix=f"say how far to trust them, --set {name}=0.001, or give the flight's sensor some noise",
+        )
+    return float(found)
+
+
+def imu_noise_of(
+    graph: str, flight: Flight, gyro_factor: float = 1.0, accelerometer_factor: float = 1.0
+) -> ImuNoise:
+    """The noise of the flight's inertial unit, its densities times factors.
+
+    Raises:
+        DataError: where the flight does not say it.
+    """
+    noise = flight.info.get("imu_noise")
+    if not isinstance(noise, ImuNoise):
+        raise DataError(
+            f"this flight does not say the noise of its imu, and {graph} needs it",
+            path=f"{flight.name}: info",
+            expected="imu_noise, an ImuNoise",
+            got=", ".join(flight.info) or "nothing",
+            fix="give the Flight info={'imu_noise': ImuNoise(...)}",
+        )
+    return noise.scaled(gyro=gyro_factor, accelerometer=accelerometer_factor)
+
+
+def unbiased_noise_of(
+    graph: str, flight: Flight, gyro_factor: float | None, accelerometer_factor: float | None
+) -> ImuNoise:
+    """`imu_noise_of` for a filter that knows no biases.
+
+    A factor left out is 20 for a unit whose biases walk, and 1 for one that has none.
+    """
+    noise = imu_noise_of(graph, flight)
+    otherwise = 20.0 if noise.gyro_bias or noise.accelerometer_bias else 1.0
+    return noise.scaled(
+        gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
+    )
+
+
+def reading_of(flight: Flight) -> str:
+    """Whether the flight's imu reads an "instant" or, oversampling, the "mean" since its last reading."""
+    return "mean" if flight.info.get("imu_oversample", 1) > 1 else "instant"
+
+
+def with_imu(flight: Flight) -> Flight:
+    """The flight, with an `imu` of the thesis's unit, `gyro` and `coordinate_acceleration`, if it has none.
+
+    A coordinate acceleration is the specific force of a world without gravity, and the flight then says so.
+    """
+    parts = ("gyro", "coordinate_acceleration")
+    if "imu" in flight.streams or not set(parts) <= set(flight.streams):
+        return flight
+    gyro, push = (flight.streams[name] for name in parts)
+    kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
+    values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
+    streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
+    told = [flight.info["noise"][name] for name in parts]
+    noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
+    return replace(flight, streams=streams, info={**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS})
+
+
+def gravity_of(flight: Flight) -> tuple[float, float, float]:
+    """The gravity, m/s^2, world, that the flight's imu does not feel."""
+    found: tuple[float, float, float] = flight.info.get("gravity", GRAVITY)
+    return found
+
+
+def check_settings(
+    graph: str,
+    positive: Mapping[str, object],
+    *,
+    settle: float,
+    smooth: str = "none",
+    lag: float | None = None,
+) -> None:
+    """Refuse what no filter can be set to: numbers that are not positive, a smoother that there is not.
+
+    Raises:
+        DeclarationError: naming the setting.
+    """
+    need_numbers(graph, positive=positive, not_negative={"settle": settle, "lag": lag})
+    check_choice(graph, "smooth", smooth, ("none", "rts"))
+
+
+def check_choice(graph: str, name: str, value: object, valid: tuple[str, ...]) -> None:
+    """Refuse a setting that is none of a few words.
+
+    Raises:
+        DeclarationError: for one that is.
+    """
+    if value not in valid:
+        raise DeclarationError(
+            f"setting {name!r} has no such value",
+            path=f"{graph}.{name}",
+            expected=" or ".join(valid),
+            got=repr(value),
+            fix=f"write {name}={valid[-1]}",
+        )

@@ -1,0 +1,178 @@
+"""The unscented Kalman filter: sigma points through the model itself, in place of its Jacobian.
+
+Two blocks, over any state that a `StateSpace` describes. Points of the state are drawn from a root of its
+covariance and points of the noise from a root of its own, so the root of neither is ever mixed with the
+other's, and the noise goes through the model as it comes: into a rotation, for example. All sums are over
+deviations (`sigma_points`), and the corrected covariance is a sum of squares,
+
+    P' = W sum (dx_i - K dz_i)(dx_i - K dz_i)^T + (beta - alpha^2) (K c)(K c)^T + K R K^T
+
+with c the central deviation of the measurements: the Joseph form of this filter. It is what P - K S K^T is in
+exact numbers, and stays positive in single precision.
+
+Source: E. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000;
+on manifolds C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound
+state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flowgraph import Array, block
+from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.filters import (
+    Gaussian,
+    KalmanInnovation,
+    Vector,
+    accepts,
+    innovate,
+    masked,
+    moved,
+    where_any,
+)
+from flowgraph.blocks.kalman.roots import semidefinite_root
+from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
+from flowgraph.language.block import Limit
+
+__all__ = ["predict_unscented", "update_unscented"]
+
+
+@block
+def predict_unscented(
+    belief: Gaussian,
+    control,
+    *,
+    move: Callable[..., Array],
+    noise: npt.ArrayLike | None = None,
+    Q: npt.ArrayLike | None = None,
+    Q_first: bool = False,
+    space: StateSpace | None = None,
+    points: SigmaPoints = GAUSSIAN,
+    dt: float,
+    xp: Any,
+) -> Gaussian:
+    """Predict over `dt` seconds with a control that is held over the step.
+
+        X_0 = x, X_i = x plus +-s L_j          L L^T = P (with Q_first: P + Q dt)
+        Y_i = move(X_i, control, w_i, dt)      w_i = 0, or +-s N_j for n_w more pairs with X = x, N N^T =
+                                               noise dt
+        x' and P' the mean and covariance of the Y_i, and Q dt added to P' (not with Q_first)
+
+    With dt = 0, as at the first firing, this is the identity.
+
+    Args:
+        belief: mean (size) and covariance (t, t).
+        control: of any type; it goes to `move` as it is.
+        move: `move(x, control, w, dt, xp) -> x'`, on x (..., k, size) and w (..., k, n_w), a point a row; w
+            is None without noise. w is white noise, integrated over the step.
+        noise: (n_w, n_w) spectral density of the noise that goes through `move`.
+        Q: (t, t) spectral density of noise that is added, in the tangent space of the state.
+        Q_first: whether it is added before the points are drawn, as Kraft does, so that it goes through the
+            model too (Kraft 2003, eqs. 33-35).
+        space: of the state; without one it is a vector.
+        points: the set of sigma points.
+    """
+    x, kind = belief.mean, belief.mean.dtype
+    added = None if Q is None else xp.asarray(Q, dtype=kind) * dt
+    P = belief.covariance + added if added is not None and Q_first else belief.covariance
+    extra = 0 if noise is None else np.asarray(noise).shape[-1]
+    scale = points.scale(P.shape[-1] + extra)
+    apart = points.around(xp.linalg.cholesky(P), scale, xp)
+    w = None
+    if noise is not None:
+        # the root of a constant, scaled: the noise over no time has none
+        root = xp.asarray(semidefinite_root(np.asarray(noise, dtype=float), xp=np), dtype=kind)
+        blown = points.around(root * xp.sqrt(xp.asarray(dt, dtype=kind)), scale, xp)
+        w = xp.concat([xp.zeros((1 + apart.shape[-2], extra), dtype=kind), blown], axis=-2)
+        apart = xp.concat([apart, xp.zeros((*apart.shape[:-2], 2 * extra, P.shape[-1]), dtype=kind)], axis=-2)
+    images = move(_spread(x, apart, space, xp), control, w, dt, xp)
+    cluster = points.cluster(images, space, scale, xp)
+    P = points.covariance(cluster, cluster, scale)
+    if added is not None and not Q_first:
+        P = P + added
+    return Gaussian(mean=cluster.mean, covariance=0.5 * (P + P.mT))
+
+
+@block
+def update_unscented(
+    prior: Gaussian,
+    measured: Vector | None,
+    *,
+    observe: Callable[..., Array],
+    R: npt.ArrayLike,
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    points: SigmaPoints = GAUSSIAN,
+    gate: float | None = None,
+    xp: Any,
+) -> tuple[Gaussian, KalmanInnovation | None]:
+    """Correct with z = h(x) + noise, where there is a measurement; without one the prior passes through.
+
+        Z_i = h(X_i)       S = cov(Z) + R      C = cov(X, Z)       K = C S^-1
+        x' = x plus K (z minus mean(Z))        P' as in the head of this module
+
+    An entry of z that is NaN counts as not measured. If all are, the prior passes through and there is no
+    innovation.
+
+    Args:
+        prior: mean (size) and covariance (t, t).
+        measured: z; or absent.
+        observe: `observe(x, xp) -> h(x)`, on x (..., k, size), a point a row.
+        R: covariance of the noise, in the tangent space of z.
+        space, measured_space: of the state and of z; without one it is a vector.
+        points: the set of sigma points.
+        gate: when given, as in `update_linear`.
+
+    Returns:
+        The posterior, and the innovation where there was one.
+    """
+    if measured is None:
+        return prior, None
+    x, P = prior.mean, prior.covariance
+    scale = points.scale(P.shape[-1])
+    apart = points.around(xp.linalg.cholesky(P), scale, xp)
+    z = points.cluster(observe(_spread(x, apart, space, xp), xp), measured_space, scale, xp)
+    residual, present = innovate(measured, z.mean, measured_space, xp)
+    outer, noise = masked(z.outer.mT, xp.asarray(R, dtype=x.dtype), present, xp)
+    seen = Cluster(z.mean, outer.mT, z.centre * xp.astype(present, x.dtype)[..., None, :])
+    S = points.covariance(seen, seen, scale) + noise
+    C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), seen, scale)
+    column = residual[..., None]
+    solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
+    nis = (column.mT @ solved[..., -1:])[..., 0, 0]
+    accepted = accepts(nis, gate, present, xp)
+    K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
+    shift = (K @ column)[..., 0]
+    turn = None if space is None else space.reset(shift, xp)
+    left, central = apart - seen.outer @ K.mT, -seen.centre @ K.mT
+    if turn is not None:
+        left, central, K = left @ turn.mT, central @ turn.mT, turn @ K
+    rest = Cluster(x, left, central)
+    P = points.covariance(rest, rest, scale) + K @ noise @ K.mT
+    posterior = Gaussian(mean=moved(x, shift, space, xp), covariance=0.5 * (P + P.mT))
+    innovation = KalmanInnovation(
+        residual=residual,
+        covariance=S,
+        nis=nis,
+        parts=xp.sum(xp.astype(present, P.dtype), axis=-1),
+        accepted=accepted,
+    )
+    return posterior, where_any(present, innovation, xp)
+
+
+@predict_unscented.limited
+@update_unscented.limited
+def _limits(*, points: SigmaPoints = GAUSSIAN, **_: Any) -> Sequence[Limit]:
+    return points.limits()
+
+
+def _spread(x: Array, apart: Array, space: StateSpace | None, xp: Any) -> Array:
+    """The centre and the outer points (..., 1 + k, size) around it."""
+    centre = x[..., None, :]
+    outer = centre + apart if space is None else space.plus(centre, apart, xp)
+    return xp.concat([centre, outer], axis=-2)

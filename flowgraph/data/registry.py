@@ -1,0 +1,183 @@
+"""Finding graphs and flights by name, through entry points: the engine imports none of them itself.
+
+A package offers a graph under the entry point group `flowgraph.graphs` (a `@graph` function with
+`on_flight`), a source of flights under `flowgraph.flights` (a function `load(argument, *, seed, settings)`),
+and an experiment under `flowgraph.benches` (a function of keyword settings that returns a `Report`). Ours are
+found the same way as a user's.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import sys
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.result import Result
+from flowgraph.data.series import Flight
+from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.language.graph import Graph
+
+if typing.TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+    from flowgraph.language.declare import GraphFunction
+
+
+@dataclass(frozen=True)
+class Case:
+    """A graph made ready for one flight.
+
+    Args:
+        graph: built, with the start and the noise for this flight.
+        inputs: the flight's streams by source name.
+        score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
+            the names of the streams that it looks at; then a study of many runs at once keeps only those.
+        estimate: name of the collected stream that the score and the pictures are of.
+    """
+
+    graph: Graph
+    inputs: Inputs
+    score: Callable[[Result], dict[str, float]]
+    estimate: str = "belief"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an experiment found.
+
+    Args:
+        rows: the table, a mapping a row; the values are numbers, texts or None.
+        figures: by file name, what draws the picture into a path.
+        notes: what the reader should know of the figures, a sentence each.
+    """
+
+    rows: Sequence[Mapping[str, Any]]
+    figures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@functools.lru_cache(maxsize=8)
+def _entries_along(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    from importlib.metadata import entry_points  # slow to import, and only needed to look names up
+
+    return tuple(entry_points(group=group))
+
+
+def _entries(group: str) -> tuple[EntryPoint, ...]:
+    """The entry points of a group; looked up once, for that reads a file of each installed package."""
+    return _entries_along(group, tuple(sys.path))
+
+
+def graph_names() -> list[str]:
+    """The names of all installed graphs."""
+    return sorted(e.name for e in _entries("flowgraph.graphs"))
+
+
+def flight_names() -> list[str]:
+    """The kinds of flight that can be loaded."""
+    return sorted(e.name for e in _entries("flowgraph.flights"))
+
+
+def bench_names() -> list[str]:
+    """The names of all installed experiments."""
+    return sorted(e.name for e in _entries("flowgraph.benches"))
+
+
+def find_bench(name: str) -> Callable[..., Report]:
+    """The installed experiment of that name.
+
+    Raises:
+        UnknownNameError: listing the names that exist.
+    """
+    found: Callable[..., Report] = _find("flowgraph.benches", "bench", name, bench_names())
+    return found
+
+
+def find_graph(name: str) -> GraphFunction:
+    """The installed graph of that name.
+
+    Raises:
+        UnknownNameError: listing the names that exist.
+    """
+    found: GraphFunction = _find("flowgraph.graphs", "graph", name, graph_names())
+    return found
+
+
+def _find(group: str, kind: str, name: str, valid: list[str]) -> Any:
+    for entry in _entries(group):
+        if entry.name == name:
+            return entry.load()
+    raise UnknownNameError(kind, name, valid)
+
+
+def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
+    """Load the flight that a text such as "sim" or "euroc:PATH" names.
+
+    Raises:
+        UnknownNameError: for a kind that is not installed, or a setting that it does not have.
+        DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
+    """
+    kind, _, argument = spec.partition(":")
+    load: Callable[..., Flight] = _find("flowgraph.flights", "kind of flight", kind, flight_names())
+    return load(argument, seed=seed, settings=dict(settings or {}))
+
+
+def flight_settings(spec: str) -> list[str]:
+    """The settings that the loader of a kind of flight understands."""
+    load = _find("flowgraph.flights", "kind of flight", spec.partition(":")[0], flight_names())
+    module = inspect.getmodule(load)
+    return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
+
+
+def setting_names(function: Callable[..., Any]) -> list[str]:
+    """The keyword-only arguments of a function."""
+    return [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+
+
+def parsed_settings(
+    function: Callable[..., Any], given: Mapping[str, str], *, also: Sequence[str], path: str
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Split `--set` texts into keyword arguments of `function`, as its annotations say, and those of `also`.
+
+    Raises:
+        UnknownNameError: for a key that is in neither; DeclarationError: for a text that is no such value.
+    """
+    hints = typing.get_type_hints(function)
+    own = setting_names(function)
+    mine: dict[str, Any] = {}
+    rest: dict[str, str] = {}
+    for key, text in given.items():
+        if key in also:
+            rest[key] = text
+        elif key in own:
+            mine[key] = _parse(text, hints.get(key, str), f"{path}.{key}")
+        else:
+            raise UnknownNameError("setting", key, [*own, *also], path=path)
+    return mine, rest
+
+
+def _parse(text: str, annotation: Any, path: str) -> Any:
+    kinds = [k for k in (typing.get_args(annotation) or (annotation,)) if k is not type(None)]
+    if text.lower() == "none" and type(None) in typing.get_args(annotation):
+        return None
+    words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+    try:
+        value = words[text.lower()] if kinds[0] is bool else kinds[0](text)
+        if kinds[0] in (int, float) and ("_" in text or not math.isfinite(value)):
+            raise ValueError
+        return value
+    except (KeyError, OverflowError, TypeError, ValueError):
+        raise DeclarationError(
+            "this setting cannot be read",
+            path=path,
+            expected=" or ".join(("finite " if k is float else "") + k.__name__ for k in kinds),
+            got=repr(text),
+            fix=f"write --set {path.rsplit('.', 1)[-1]}=VALUE",
+        ) from None

@@ -1,0 +1,301 @@
+"""Operations with loops of their own: larger products and factorizations, sorts, random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from flowgraph.engines.c.nodes import Macro, View
+from flowgraph.engines.c.syntax import ctype
+
+if TYPE_CHECKING:
+    from flowgraph.engines.c.statements import Writer
+
+
+def write_macro(w: Writer, m: Macro) -> None:
+    """Write a macro's loops."""
+    _MACROS[m.kind](w, m)
+
+
+def element(w: Writer, view: View, index: Sequence[str]) -> str:
+    """An element of a view; an axis of size one, and leading axes that are not there, are left out."""
+    index = index[len(index) - len(view.shape) :]
+    terms = [
+        (i if s == 1 else f"{s} * {i}")
+        for i, s, n in zip(index, view.strides, view.shape, strict=True)
+        if s and n > 1
+    ]
+    if view.offset or not terms:
+        terms.insert(0, str(view.offset))
+    return w.at(view.buffer, " + ".join(terms))
+
+
+class _Loops:
+    """Opens loops over axes and closes them again."""
+
+    def __init__(self, w: Writer, sizes: Sequence[int], letter: str = "b") -> None:
+        self.w, self.sizes, self.letter = w, sizes, letter
+
+    def __enter__(self) -> list[str]:
+        names = []
+        for k, n in enumerate(self.sizes):
+            name = f"{self.letter}{k}"
+            self.w.line(f"for (int32_t {name} = 0; {name} < {n}; {name}++) {{")
+            self.w.depth += 1
+            names.append(name)
+        return names
+
+    def __exit__(self, *_: object) -> None:
+        for _n in self.sizes:
+            self.w.depth -= 1
+            self.w.line("}")
+
+
+def _pointer(w: Writer, view: View, batch: Sequence[str]) -> str:
+    """The address of a view's first element in a batch."""
+    view = View(view.buffer, view.shape[:-2], view.offset, view.strides[:-2])
+    return "&" + element(w, view, list(batch))
+
+
+def _index(strides: Sequence[int], names: Sequence[str]) -> str:
+    """An index into a matrix."""
+    terms = [n if s == 1 else f"{s} * {n}" for s, n in zip(strides, names, strict=True) if s]
+    return " + ".join(terms) or "0"
+
+
+def _call(w: Writer, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
+    """Call the function for these sizes and strides, which a file has once, for each of the batch."""
+    views = [*m.inputs, m.output]
+    key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
+    name = w.write.function(key, kind, make, *views)
+    with _Loops(w, m.output.shape[:-2]) as batch:
+        w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
+
+
+def _matmul(w: Writer, m: Macro) -> None:
+    type_ = ctype(m.output.buffer.dtype, w.write.real)
+
+    def text(name: str, a: View, b: View, out: View) -> str:
+        rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
+        left = _index(a.strides[-2:], ("i", "k"))
+        right = _index(b.strides[-2:], ("k", "j"))
+        made = _index(out.strides[-2:], ("i", "j"))
+        turned = b.strides[-1] != 1 and columns > 1
+        copy = f"""    {type_} turned[{inner * columns}];
+    for (int32_t k = 0; k < {inner}; k++)
+        for (int32_t j = 0; j < {columns}; j++) turned[{columns} * k + j] = b[{right}];
+"""
+        factor = f"turned[{columns} * k + j]" if turned else f"b[{right}]"
+        return f"""/* ({rows} x {inner}) ({inner} x {columns}) */
+static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b, {type_} *restrict out)
+{{
+{copy if turned else ""}    for (int32_t i = 0; i < {rows}; i++) {{
+        {type_} row[{columns}];
+        for (int32_t j = 0; j < {columns}; j++) row[j] = 0;
+        for (int32_t k = 0; k < {inner}; k++) {{
+            const {type_} left = a[{left}];
+            for (int32_t j = 0; j < {columns}; j++) row[j] += left * {factor};
+        }}
+        for (int32_t j = 0; j < {columns}; j++) out[{made}] = row[j];
+    }}
+}}
+"""
+
+    _call(w, "matmul", m, text, type_)
+
+
+def _cholesky(w: Writer, m: Macro) -> None:
+    real, helper = w.write.real, w.write.helper("fg_cholesky")
+
+    def text(name: str, a: View, out: View) -> str:
+        n, at = out.shape[-1], _index(a.strides[-2:], "ij")
+        return f"""/* lower factor of ({n} x {n}) */
+static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
+{{
+    {real} factor[{n * n}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) factor[{n} * i + j] = j <= i ? a[{at}] : 0;
+    {helper}(factor, {n});
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) out[{_index(out.strides[-2:], "ij")}] = factor[{n} * i + j];
+}}
+"""
+
+    _call(w, "cholesky", m, text)
+
+
+def _solve(w: Writer, m: Macro) -> None:
+    real, helper = w.write.real, w.write.helper("fg_solve")
+
+    def text(name: str, a: View, b: View, out: View) -> str:
+        n, columns = out.shape[-2:]
+        made = _index(out.strides[-2:], "ij")
+        return f"""/* ({n} x {n}) x = ({n} x {columns}) */
+static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
+{{
+    {real} matrix[{n * n}], right[{n * columns}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{_index(a.strides[-2:], "ij")}];
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{_index(b.strides[-2:], "ij")}];
+    {helper}(matrix, right, {n}, {columns});
+    for (int32_t i = 0; i < {n}; i++)
+        for (int32_t j = 0; j < {columns}; j++) out[{made}] = right[{columns} * i + j];
+}}
+"""
+
+    _call(w, "solve", m, text)
+
+
+def _reduce(w: Writer, m: Macro) -> None:
+    (x,), out, axes = m.inputs, m.output, m.extra["axes"]
+    kind, dtype = m.extra["joins"], out.buffer.dtype
+    kept = [k for k in range(len(x.shape)) if k not in axes]
+    with _Loops(w, [x.shape[k] for k in kept], "r") as outer:
+        w.line("{")
+        w.depth += 1
+        first = [dict(zip(kept, outer, strict=True)).get(k, "0") for k in range(len(x.shape))]
+        c = ctype(dtype, w.write.real)
+        start = {"sum": "0", "prod": "1", "any": "0", "all": "1"}.get(kind) or element(w, x, first)
+        w.line(f"{c} total = {start};")
+        with _Loops(w, [x.shape[k] for k in axes], "k") as inner:
+            at = dict(zip(kept, outer, strict=True)) | dict(zip(axes, inner, strict=True))
+            w.line(f"const {c} term = {element(w, x, [at[k] for k in range(len(x.shape))])};")
+            if kind in ("max", "min"):
+                sign = ">" if kind == "max" else "<"
+                nan = " || term != term" if dtype == "real" else ""
+                w.line(f"total = (term {sign} total{nan}) ? term : total;")
+            elif dtype == "bool":
+                w.line(f"total = total {'||' if kind == 'any' else '&&'} term;")
+            elif dtype in ("int32", "int64"):
+                sign, wide = "+" if kind == "sum" else "*", f"uint{dtype[3:]}_t"
+                w.line(f"total = ({c})(({wide})total {sign} ({wide})term);")
+            else:
+                w.line(f"total {'+' if kind == 'sum' else '*'}= term;")
+        w.line(f"{element(w, out, outer)} = total;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _lines(w: Writer, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[str], str], str]]:
+    """Loops over all axes but one, and how an element along that one is written."""
+    shape = m.inputs[0].shape
+    others = [n for k, n in enumerate(shape) if k != axis]
+
+    def at(view: View, outer: list[str], inner: str) -> str:
+        short = len(view.shape) < len(shape)
+        return element(w, view, outer if short else [*outer[:axis], inner, *outer[axis:]])
+
+    return _Loops(w, others, "r"), at
+
+
+def _cumulative(w: Writer, m: Macro) -> None:
+    axis, dtype = m.extra["axis"], m.output.buffer.dtype
+    loops, at = _lines(w, m, axis)
+    c = ctype(dtype, w.write.real)
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line(f"{c} total = 0;")
+        with _Loops(w, (m.inputs[0].shape[axis],), "k") as (k,):
+            term = at(m.inputs[0], outer, k)
+            if dtype in ("int32", "int64"):
+                wide = f"uint{dtype[3:]}_t"
+                w.line(f"total = ({c})(({wide})total + ({wide}){term});")
+            else:
+                w.line(f"total += {term};")
+            w.line(f"{at(m.output, outer, k)} = total;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _place(w: Writer, m: Macro) -> None:
+    axis = m.extra["axis"]
+    x = m.inputs[0]
+    sign = ">" if m.kind == "argmax" else "<"
+    loops, at = _lines(w, m, axis)
+    c = ctype(x.buffer.dtype, w.write.real)
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line("int64_t place = 0;")
+        w.line(f"{c} best = {at(x, outer, '0')};")
+        with _Loops(w, (x.shape[axis],), "k") as (k,):
+            w.line(f"const {c} term = {at(x, outer, k)};")
+            nan = " || (term != term && best == best)" if x.buffer.dtype == "real" else ""
+            w.line(f"if (term {sign} best{nan}) {{ best = term; place = {k}; }}")
+        w.line(f"{at(m.output, outer, '0')} = place;")
+        w.depth -= 1
+        w.line("}")
+
+
+def _sort(w: Writer, m: Macro) -> None:
+    """In order by insertion for short lines, by heap for long ones; ties by place, NaN last."""
+    axis = m.extra["axis"]
+    x = m.inputs[0]
+    n = x.shape[axis]
+    loops, at = _lines(w, m, axis)
+    real = x.buffer.dtype == "real"
+
+    def value(place: str) -> str:
+        return at(x, outer, place)
+
+    with loops as outer:
+        w.line("{")
+        w.depth += 1
+        w.line(f"int32_t order[{max(n, 1)}];")
+        w.line(f"for (int32_t k = 0; k < {n}; k++) order[k] = k;")
+        w.line(f"for (int32_t top = {n} / 2, end = {n}; end > 1;) {{")
+        w.depth += 1
+        w.line("int32_t item;")
+        w.line("if (top > 0) { item = order[--top]; }")
+        w.line(
+            "else { item = order[--end]; order[end] = order[0]; if (end == 1) { order[0] = item; break; } }"
+        )
+        w.line("int32_t hole = top;")
+        w.line("for (int32_t child; (child = 2 * hole + 1) < end; hole = child) {")
+        w.depth += 1
+
+        def after(a: str, b: str) -> str:
+            p, q = value(a), value(b)
+            if real:
+                return (
+                    f"({p} > {q} || ({p} != {p} && {q} == {q}) || "
+                    f"(({p} == {q} || ({p} != {p} && {q} != {q})) && {a} > {b}))"
+                )
+            return f"({p} > {q} || ({p} == {q} && {a} > {b}))"
+
+        w.line(f"if (child + 1 < end && {after('order[child + 1]', 'order[child]')}) child++;")
+        w.line(f"if (!{after('order[child]', 'item')}) break;")
+        w.line("order[hole] = order[child];")
+        w.depth -= 1
+        w.line("}")
+        w.line("order[hole] = item;")
+        w.depth -= 1
+        w.line("}")
+        chosen = "order[k]" if m.kind == "argsort" else value("order[k]")
+        w.line(f"for (int32_t k = 0; k < {n}; k++) {at(m.output, outer, 'k')} = {chosen};")
+        w.depth -= 1
+        w.line("}")
+
+
+def _random(w: Writer, m: Macro) -> None:
+    name = w.write.helper(f"fg_{m.extra['draws']}")
+    blocks = m.output.buffer.size // 4
+    seed = w.at(m.inputs[0].buffer, "0")
+    w.line(f"{name}({w.names(m.output.buffer)}, {blocks}, UINT32_C({m.extra['hash']}), time, {seed}, "
+           f"{w.at(m.inputs[0].buffer, '1')});")  # fmt: skip
+
+
+_MACROS: dict[str, Callable[[Writer, Macro], None]] = {
+    "matmul": _matmul,
+    "cholesky": _cholesky,
+    "solve": _solve,
+    "reduce": _reduce,
+    "cumulative_sum": _cumulative,
+    "argmax": _place,
+    "argmin": _place,
+    "sort": _sort,
+    "argsort": _sort,
+    "random": _random,
+}

@@ -1,0 +1,201 @@
+"""When everything is computed: straight code and loops in turn.
+
+Level by level there is straight code, then one loop for each space. An operation belongs to the first level
+at which all it needs is there; what a loop sums up, or stores for a look-up, is there at the next level. So
+a chain of operations over the particles is one loop up to where it needs a sum over all of them. What one
+loop computes and a later one needs is kept in memory in between.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from flowgraph.engines.c.nodes import Buffer, Item, Macro, Node, Space, Store, Tape
+from flowgraph.engines.c.values import row_major
+
+Group = tuple[int, Space]
+REPEATED = ("load", "iota", "const", "given")
+"""Operations that a loop does again rather than read from memory."""
+
+
+@dataclass
+class Schedule:
+    """What is computed where.
+
+    Args:
+        items: all that is needed, in order; those of a group have its level and space.
+        uses: how often a node is named.
+        spills: the memory that keeps a node of one loop for later ones; where it is stored anyway, that.
+        late: state buffers that cannot be written in place, with the work buffer that stands in.
+        span: first and last level at which a work buffer is in use.
+    """
+
+    items: list[Item] = field(default_factory=list)
+    uses: dict[Node, int] = field(default_factory=lambda: defaultdict(int))
+    spills: dict[Node, Buffer] = field(default_factory=dict)
+    late: dict[Buffer, Buffer] = field(default_factory=dict)
+    span: dict[Buffer, tuple[int, int]] = field(default_factory=dict)
+    levels: int = 1
+
+
+def arguments(item: Item) -> tuple[Node, ...]:
+    """The nodes an item names."""
+    return (item.node,) if isinstance(item, Store) else item.args
+
+
+def reads(item: Item) -> list[Buffer]:
+    """The buffers an item reads."""
+    if isinstance(item, Macro):
+        return [v.buffer for v in item.inputs]
+    if isinstance(item, Node) and item.op in ("load", "gather", "search"):
+        return [item.extra[0]]
+    return []
+
+
+def group_of(item: Item) -> Group:
+    """Level and space in which an item is written down; a reduction stands in the loop it sums over."""
+    if isinstance(item, Node) and item.op == "reduce":
+        return item.level - 1, item.extra[1]
+    return item.level, () if isinstance(item, Macro) else item.space
+
+
+def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
+    """Order what the roots need."""
+    live = _live(roots)
+    made = Schedule(sorted(live, key=lambda i: i.order))
+    for item in made.items:
+        _level(item)
+    made.levels = 1 + max((group_of(i)[0] for i in made.items), default=0)
+    users: dict[Node, list[Group]] = defaultdict(list)
+    for item in made.items:
+        for node in arguments(item):
+            made.uses[node] += 1
+            users[node].append(group_of(item))
+    kept = {i.node: i.buffer for i in made.items if isinstance(i, Store) and _is_whole(i)}
+    for node, groups in users.items():
+        if node.space and node.op not in REPEATED and any(g[0] > node.level for g in groups):
+            made.spills[node] = kept.get(node) or Buffer("", node.dtype, _size(node.space), "work")
+    _write_state(made, users)
+    _spans(made, users)
+    return made
+
+
+def _is_whole(store: Store) -> bool:
+    """Whether it keeps its node as a spill would: all of it, in C's order."""
+    plain = store.buffer.kind == "work" and not store.offset and store.space == store.node.space != ()
+    return plain and store.strides == row_major(store.space)
+
+
+def _size(space: Space) -> int:
+    size = 1
+    for n in space:
+        size *= n
+    return size
+
+
+def _live(roots: Iterable[Item]) -> set[Item]:
+    found: set[Item] = set()
+    waiting = list(roots)
+    while waiting:
+        item = waiting.pop()
+        if item in found:
+            continue
+        found.add(item)
+        waiting.extend(arguments(item))
+        for buffer in reads(item):
+            if buffer.kind == "work":
+                waiting.extend(buffer.writers)
+    return found
+
+
+def _level(item: Item) -> None:
+    needed = [a.level for a in arguments(item)] + [b.ready for b in reads(item)]
+    level = max(needed, default=0)
+    if isinstance(item, Macro):
+        item.level = level
+        _ready(item.output.buffer, level)
+    elif isinstance(item, Store):
+        item.level = level
+        _ready(item.buffer, level + 1 if item.space else level)
+    else:
+        item.level = level + 1 if item.op == "reduce" else level
+
+
+def _ready(buffer: Buffer, level: int) -> None:
+    if buffer.kind == "work":
+        buffer.ready = max(buffer.ready, level)
+
+
+def _write_state(made: Schedule, users: dict[Node, list[Group]]) -> None:
+    """Find the state that something still reads, or reads elsewhere, when it is to be written."""
+    stores: dict[Buffer, list[Store]] = defaultdict(list)
+    for item in made.items:
+        if isinstance(item, Store) and item.buffer.kind == "state" and item.space:
+            stores[item.buffer].append(item)
+    for buffer, written in stores.items():
+        places = {(s.offset, s.strides): group_of(s) for s in written}
+        first = min(level for level, _ in places.values())
+        for item in made.items:
+            if buffer not in reads(item):
+                continue
+            if isinstance(item, Node) and item.op == "load":
+                at = places.get((item.extra[1], item.extra[2]))
+                ends = users[item] if item.space else []
+                safe = all(g[0] < first or (at is not None and (g[0] < at[0] or g == at)) for g in ends)
+            else:
+                level, space = group_of(item)
+                safe = level < first or (level == first and not space)
+            if not safe:
+                made.late[buffer] = Buffer("", buffer.dtype, buffer.size, "work")
+                break
+
+
+def _spans(made: Schedule, users: dict[Node, list[Group]]) -> None:
+    """From where to where each work buffer is in use."""
+
+    def extend(buffer: Buffer, *levels: int) -> None:
+        first, last = made.span.get(buffer, (levels[0], levels[0]))
+        made.span[buffer] = (min(first, *levels), max(last, *levels))
+
+    for item in made.items:
+        level = group_of(item)[0]
+        if isinstance(item, Store) and item.buffer.kind == "work":
+            extend(item.buffer, level)
+        if isinstance(item, Store) and item.buffer in made.late:
+            extend(made.late[item.buffer], level, made.levels)
+        if isinstance(item, Macro):
+            extend(item.output.buffer, level)
+        for buffer in reads(item):
+            if buffer.kind == "work":
+                extend(buffer, level)
+                if isinstance(item, Node) and item.op == "load" and item.space:
+                    extend(buffer, *(g[0] for g in users[item]))
+    for node, buffer in made.spills.items():
+        extend(buffer, node.level, *(g[0] for g in users[node]))
+
+
+def is_flat(items: Iterable[Node | Store], space: Space) -> bool:
+    """Whether all that a nest of loops reads and writes lies in their order, so that one loop will do."""
+    for item in items:
+        for part in (item, *arguments(item)):
+            if isinstance(part, Node) and part.op in ("iota", "gather", "search"):
+                return False
+            strides = _strides(part)
+            steps = zip(strides, strides[1:], space[1:], strict=False)
+            if any(wide != step * n for wide, step, n in steps):
+                return False
+    return True
+
+
+def _strides(part: Node | Store) -> tuple[int, ...]:
+    """Its steps through memory in the loops around it."""
+    if isinstance(part, Store):
+        return part.strides
+    return part.extra[2] if part.op == "load" else ()
+
+
+def strides_of(space: Space) -> tuple[int, ...]:
+    """Of a spill."""
+    return row_major(space)

@@ -1,0 +1,396 @@
+"""A pipeline as C: one header, one source file, and nothing else.
+
+Each pattern of present inputs has a reaction of its own, in which everything that depends on presence is
+folded away. Beyond `MOST_PATTERNS` there is one reaction in which presence is data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flowgraph.engines.c.expand import Expander
+from flowgraph.engines.c.expressions import Expressions
+from flowgraph.engines.c.helpers import helper_text
+from flowgraph.engines.c.names import Names, names_of
+from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
+from flowgraph.engines.c.schedule import schedule
+from flowgraph.engines.c.statements import Writer
+from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.engines.c.values import Value, row_major
+from flowgraph.errors import LoweringError
+from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
+from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder.ops import Spec
+
+MOST_PATTERNS = 8
+_LOCAL_BYTES = 512
+_BYTES = {"bool": 1, "int32": 4, "uint32": 4, "int64": 8, "uint64": 8}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Generated C.
+
+    Args:
+        names: of everything in it.
+        real: "double" or "float".
+        header, source: the texts of the two files.
+        patterns: the keys that have a reaction of their own, or None where one serves all.
+        presence: by key, or None for all, the outputs that are present for certain and those that can be, a
+            bit each.
+    """
+
+    names: Names
+    real: str
+    header: str
+    source: str
+    patterns: tuple[int, ...] | None
+    presence: Mapping[int | None, tuple[int, int]]
+
+    def presence_of(self, key: int) -> tuple[int, int]:
+        """The outputs that are present for certain in a tick of this pattern, and those that can be."""
+        return self.presence.get(None if self.patterns is None else key, (0, 0))
+
+
+def generate(
+    pipeline: Pipeline,
+    dtype: str = "float64",
+    *,
+    patterns: Sequence[int] | None = None,
+    program: Callable[[Pipeline, int | None], Program] = specialise,
+) -> Source:
+    """The C of a pipeline.
+
+    Args:
+        pipeline: what to write down.
+        dtype: "float64" or "float32", what `real` is.
+        patterns: the patterns of present inputs that can come; all if left out.
+        program: makes the program of a pattern, or with None that of all patterns.
+
+    Raises:
+        LoweringError: for an operation that C has no rule for, or more ports than a word has bits.
+    """
+    if max(len(pipeline.inputs), len(pipeline.outputs)) > 64:
+        raise LoweringError(
+            "too many ports for C",
+            path=pipeline.name,
+            expected="at most 64 inputs and 64 outputs",
+            got=f"{len(pipeline.inputs)} and {len(pipeline.outputs)}",
+            fix="join signals that come together into one struct",
+        )
+    chosen: list[int] | None = sorted(k for k in patterns if k) if patterns is not None else None
+    if chosen is None and 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS:
+        chosen = list(range(1, 2 ** len(pipeline.inputs)))
+    if chosen is not None and len(chosen) > MOST_PATTERNS:
+        chosen = None
+    return _File(pipeline, "double" if dtype == "float64" else "float", chosen, program).source()
+
+
+class _File:
+    def __init__(self, pipeline: Pipeline, real: str, patterns: list[int] | None, program: Any) -> None:
+        self.pipeline, self.real, self.patterns, self.program = pipeline, real, patterns, program
+        self.names = names_of(pipeline)
+        self.expressions = Expressions(real)
+        self.constants: dict[Any, tuple[str, Buffer]] = {}
+        self.pool: dict[str, list[int]] = {}
+        self.presence: dict[int | None, tuple[int, int]] = {}
+
+    def source(self) -> Source:
+        from flowgraph.engines.c.header import header
+
+        m = self.names.module
+        reactions = [self.reaction(key) for key in ([None] if self.patterns is None else self.patterns)]
+        reset = self._reset()
+        parts = [
+            f'#include "{m}.h"',
+            "",
+            "#include <math.h>",
+            "#include <stddef.h>",
+            "",
+            _MACROS,
+            helper_text(self.expressions.helpers, self.real),
+            *(text for _, text in self.expressions.functions.values()),
+            *(self._constant(name, b) for name, b in self.constants.values()),
+            reset,
+            *reactions,
+            self._dispatch(),
+        ]
+        text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
+        return Source(
+            self.names,
+            self.real,
+            header(self.pipeline, self.names, self.real, self.patterns, self.pool),
+            text,
+            None if self.patterns is None else tuple(self.patterns),
+            self.presence,
+        )
+
+    # -- one reaction --------------------------------------------------------------------------------
+
+    def reaction(self, key: int | None) -> str:
+        """The function of one pattern of present inputs."""
+        pipeline, tape = self.pipeline, Tape()
+        program = self.program(pipeline, key)
+        values = self._given(tape, program, key)
+        expander = Expander(tape, values)
+        sites = {site.value: site for site in pipeline.random}
+        for i in program.instructions:
+            if i.out in sites:
+                values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
+            else:
+                expander.tell(program.elements, i)
+                expander.play(i)
+        roots: list[Any] = []
+        flags: list[tuple[int, Node]] = []
+        for k, ((flag, leaves), port) in enumerate(zip(program.outputs, pipeline.outputs, strict=True)):
+            if flag is None:
+                continue
+            for name, leaf, n in zip(self.names.output_leaves[k], port.leaves, leaves, strict=True):
+                buffer = self._place(f"{self.names.outputs[k]}->{name}", "output", leaf)
+                roots += self._write(expander, buffer, values[n])
+            present = expander.form.elements(values[flag]).item()
+            flags.append((k, present))
+            roots.append(present)
+        cells = [c for r in pipeline.registers for c in r.cells]
+        for cell, n, name in zip(cells, program.writes, self._cell_names(), strict=True):
+            if n != cell.read:
+                roots += self._write(expander, self.state[name], values[n])
+        plan = schedule(tape, roots)
+        work, local = self._memory(plan.span)
+        writer = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
+        body = writer.body()
+        body += ["    uint64_t made = 0;"]
+        must = may = 0
+        for k, present in flags:
+            bit = f"made |= UINT64_C({1 << k}); /* {comment(pipeline.outputs[k].name)} */"
+            text = writer.ref(present)
+            body.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
+            must, may = must | (text == "true") << k, may | 1 << k
+        self.presence[key] = must, may
+        body.append("    return made;")
+        all_text = "\n".join(body)
+        unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
+        head = [f"    (void){n};" for n in unused]
+        return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
+
+    def signature(self, key: int | None) -> str:
+        return f"static uint64_t {_reaction_name(key)}({self._typed(key)})"
+
+    def _parameters(self, key: int | None) -> list[str]:
+        inputs = [n for k, n in enumerate(self.names.inputs) if key is None or key >> k & 1]
+        return ["s", "time", *(["present"] if key is None else []), *inputs, *self.names.outputs]
+
+    def _typed(self, key: int | None) -> str:
+        m = self.names.module
+        given = [f"{m}_state *restrict s", "int64_t time"] + (["uint64_t present"] if key is None else [])
+        given += [
+            f"const {m}_{n} *restrict {n}"
+            for k, n in enumerate(self.names.inputs)
+            if key is None or key >> k & 1
+        ]
+        return ", ".join(given + [f"{m}_{n} *restrict {n}" for n in self.names.outputs])
+
+    def _cell_names(self) -> list[str]:
+        return [n for names in self.names.registers for n in names]
+
+    def _place(self, name: str, kind: str, leaf: Leaf | Cell) -> Buffer:
+        return Buffer(name, leaf.dtype, math.prod(leaf.shape), kind, bare=leaf.shape == ())
+
+    def _given(self, tape: Tape, program: Program, key: int | None) -> dict[int, Value]:
+        """The values that no instruction makes."""
+        pipeline = self.pipeline
+        values: dict[int, Value] = {}
+
+        def scalar(n: int, node: Node) -> None:
+            values[n] = Value(Spec((), node.dtype), np.array(node, object).reshape(()))
+
+        scalar(pipeline.time, tape.given("time", "int64"))
+        seed = Buffer("s->seed", "uint32", 2, "state")
+        values[pipeline.seed] = Value(Spec((2,), "uint32"), view=View(seed, (2,), 0, (1,)))
+        self.state: dict[str, Buffer] = {}
+        for cell, name in zip(
+            (c for r in pipeline.registers for c in r.cells), self._cell_names(), strict=True
+        ):
+            self.state[name] = self._place(f"s->{name}", "state", cell)
+            values[cell.read] = _whole(self.state[name], cell.shape)
+        for k, port in enumerate(pipeline.inputs):
+            here = key is None or key >> k & 1
+            if key is None:
+                scalar(port.present, tape.given(f"((present >> {k}) & 1u)", "bool"))
+            for name, leaf in zip(self.names.input_leaves[k], port.leaves, strict=True):
+                if here:
+                    values[leaf.value] = _whole(
+                        self._place(f"{self.names.inputs[k]}->{name}", "input", leaf), leaf.shape
+                    )
+                else:
+                    zeros = np.zeros(leaf.shape, _HOST.get(leaf.dtype, leaf.dtype))
+                    values[leaf.value] = self._known(zeros, leaf.dtype)
+        for n, array in program.constants.items():
+            if n not in values:
+                values[n] = self._known(np.asarray(array), program.specs[n].dtype)
+        return values
+
+    def _known(self, array: np.ndarray, dtype: str) -> Value:
+        key = (array.tobytes(), array.shape, dtype)
+        if key not in self.constants:
+            name = f"k{len(self.constants)}"
+            self.constants[key] = name, Buffer(name, dtype, array.size, "const", data=array)
+        return _whole(self.constants[key][1], array.shape)
+
+    def _drawn(self, tape: Tape, site: Any, seed: Value) -> Value:
+        blocks = -(-math.prod(site.shape) // 4)
+        assert seed.view is not None
+        view = View(tape.work("real", 4 * blocks), site.shape, 0, row_major(site.shape))
+        if blocks:
+            tape.origin = f"random numbers {site.name}"
+            tape.macro("random", [seed.view], view, draws=site.kind, hash=site.hash)
+        return Value(Spec(site.shape, "real"), view=view)
+
+    def _write(self, expander: Expander, buffer: Buffer, value: Value) -> list[Store]:
+        before = len(buffer.writers)
+        view = View(buffer, value.shape, 0, row_major(value.shape))
+        expander.form.write(view, expander.form.elements(value))
+        return [
+            w
+            for w in buffer.writers[before:]
+            if isinstance(w, Store)
+            and not (w.node.op == "load" and w.node.extra == (buffer, w.offset, w.strides))
+        ]
+
+    # -- memory --------------------------------------------------------------------------------------
+
+    def _name(self, buffer: Buffer) -> str:
+        if buffer.kind == "const" and not buffer.name:
+            assert buffer.data is not None
+            value = self._known(buffer.data, buffer.dtype)
+            assert value.view is not None
+            buffer.name = value.view.buffer.name
+        if buffer.kind == "const":
+            self.used_constants.add(buffer.name)
+        return buffer.name
+
+    @property
+    def used_constants(self) -> set[str]:
+        used: set[str] = self.__dict__.setdefault("_used", set())
+        return used
+
+    def _memory(self, spans: dict[Buffer, tuple[int, int]]) -> tuple[dict[Buffer, str], list[str]]:
+        """Names of the work buffers: small ones on the stack, large ones in the state, which are reused."""
+        names: dict[Buffer, str] = {}
+        local: list[str] = []
+        ends: dict[str, list[int]] = {}
+        pool: dict[str, list[int]] = {}
+        for buffer, (first, last) in sorted(spans.items(), key=lambda item: item[1][0]):
+            size = _BYTES.get(buffer.dtype, 8 if self.real == "double" else 4) * buffer.size
+            if size <= _LOCAL_BYTES:
+                names[buffer] = f"w{len(local)}"
+                local.append(f"    {ctype(buffer.dtype, self.real)} w{len(local)}[{max(buffer.size, 1)}];")
+                continue
+            slots, busy = pool.setdefault(buffer.dtype, []), ends.setdefault(buffer.dtype, [])
+            free = [k for k in range(len(slots)) if busy[k] < first]
+            fits = [k for k in free if slots[k] >= buffer.size] or free
+            k = min(fits, key=lambda j: abs(slots[j] - buffer.size), default=len(slots))
+            if k == len(slots):
+                slots.append(0)
+                busy.append(0)
+            slots[k], busy[k] = max(slots[k], buffer.size), last
+            names[buffer] = f"s->work_{buffer.dtype}_{k}"
+        for dtype, slots in pool.items():
+            mine = self.pool.setdefault(dtype, [])
+            mine += [0] * (len(slots) - len(mine))
+            for k, size in enumerate(slots):
+                mine[k] = max(mine[k], size)
+        return names, local
+
+    # -- the rest of the file ------------------------------------------------------------------------
+
+    def _constant(self, name: str, buffer: Buffer) -> str | None:
+        if name not in self.used_constants or buffer.data is None:
+            return None
+        numbers = [number(v, buffer.dtype, self.real) for v in buffer.data.ravel().tolist()] or ["0"]
+        rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
+        type_ = ctype(buffer.dtype, self.real)
+        return (
+            f"static const {type_} {name}[{max(buffer.size, 1)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
+        )
+
+    def _reset(self) -> str:
+        m = self.names.module
+        lines = [f"void {m}_reset({m}_state *s, uint64_t seed)", "{"]
+        for name, cell in zip(
+            self._cell_names(), (c for r in self.pipeline.registers for c in r.cells), strict=True
+        ):
+            reset = np.asarray(cell.reset)
+            flat = [number(v, cell.dtype, self.real) for v in reset.ravel().tolist()]
+            if cell.shape == ():
+                lines.append(f"    s->{name} = {flat[0]};")
+            elif flat and len(set(flat)) == 1:
+                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {flat[0]};")
+            elif len(flat) <= 16:
+                lines += [f"    s->{name}[{i}] = {v};" for i, v in enumerate(flat)]
+            elif flat:
+                buffer = self._known(reset, cell.dtype).view
+                assert buffer is not None
+                start = self._name(buffer.buffer)
+                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {start}[i];")
+        lines += ["    s->seed[0] = (uint32_t)seed;", "    s->seed[1] = (uint32_t)(seed >> 32);", "}", ""]
+        return "\n".join(lines)
+
+    def _dispatch(self) -> str:
+        from flowgraph.engines.c.header import react_signature
+
+        lines = [react_signature(self.pipeline, self.names, None), "{"]
+        outputs = ", ".join(self.names.outputs)
+        if self.patterns is None:
+            m = self.names.module
+            pointers = []
+            for k, n in enumerate(self.names.inputs):
+                lines.append(f"    static const {m}_{n} no_{n};")
+                pointers.append(f"((present >> {k}) & 1u) ? {n} : &no_{n}")
+            call = ", ".join(["s", "time", "present", *pointers, *([outputs] if outputs else [])])
+            lines += [f"    return {_reaction_name(None)}({call});", "}", ""]
+            return "\n".join(lines)
+        lines.append("    switch (present) {")
+        for key in self.patterns:
+            inputs = [n for k, n in enumerate(self.names.inputs) if key >> k & 1]
+            call = ", ".join(["s", "time", *inputs, *([outputs] if outputs else [])])
+            lines.append(f"    case {key}: return {_reaction_name(key)}({call});")
+        lines += ["    default: return 0;", "    }", "}", ""]
+        return "\n".join(lines)
+
+
+def _reaction_name(key: int | None) -> str:
+    return "fg_react" if key is None else f"fg_react_{key}"
+
+
+def _names_it(text: str, name: str) -> bool:
+    import re
+
+    return re.search(rf"(?<![A-Za-z0-9_>.]){re.escape(name)}\b", text) is not None
+
+
+def _whole(buffer: Buffer, shape: tuple[int, ...]) -> Value:
+    return Value(Spec(shape, buffer.dtype), view=View(buffer, shape, 0, row_major(shape)))
+
+
+_HOST = {"real": np.float64, "bool": np.bool_}
+
+_MACROS = """#if defined(__GNUC__)
+#define FG_INLINE inline __attribute__((always_inline))
+#define FG_APART __attribute__((noinline))
+#else
+#define FG_INLINE inline
+#define FG_APART
+#endif
+/* with FLOWGRAPH_SIMD (and -fopenmp-simd) loops say that their turns may be done together */
+#ifdef FLOWGRAPH_SIMD
+#define FG_SIMD(text) _Pragma(#text)
+#else
+#define FG_SIMD(text)
+#endif
+"""

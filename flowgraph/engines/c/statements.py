@@ -1,0 +1,286 @@
+"""A scheduled tick as statements of C: straight code, loops, and operations with loops of their own."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+
+from flowgraph.engines.c.expressions import Expressions
+from flowgraph.engines.c.macros import write_macro
+from flowgraph.engines.c.nodes import Buffer, Macro, Node, Space, Store
+from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
+from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.recorder.ops import FUNCTIONS
+
+_SHORT = 50  # characters of an expression that is written where it is used
+
+
+class Writer:
+    """Writes one reaction.
+
+    Args:
+        plan: what is computed where.
+        expressions: of the file.
+        names: the C expression of a buffer.
+    """
+
+    def __init__(self, plan: Schedule, expressions: Expressions, names: Callable[[Buffer], str]) -> None:
+        self.plan, self.write, self.names = plan, expressions, names
+        self.lines: list[str] = []
+        self.depth = 1
+        self.uniform: dict[Node, str] = {}
+        self.local: dict[Node, str] = {}
+        self.place, self.flat = "", False
+        self.kept = {i.node for i in plan.items if isinstance(i, Store) and i.buffer.kind == "state"}
+        self.groups: dict[tuple[int, Space], list[Node | Store]] = defaultdict(list)
+        self.straight: dict[int, list[Node | Store | Macro]] = defaultdict(list)
+        self.ends: list[Store] = []
+        for item in plan.items:
+            level, space = group_of(item)
+            if isinstance(item, Store) and item.buffer.kind == "state" and not space:
+                self.ends.append(item)
+            elif space and not isinstance(item, Macro):
+                if not (isinstance(item, Node) and item.op in REPEATED):
+                    self.groups[level, space].append(item)
+            else:
+                self.straight[level].append(item)
+
+    def body(self) -> list[str]:
+        """The lines of the reaction."""
+        for level in range(self.plan.levels):
+            self._straight(level)
+            for (at, space), items in sorted(self.groups.items()):
+                if at == level:
+                    self._loop(space, items)
+        for buffer, stand_in in self.plan.late.items():
+            self._note("state that was still in use until here")
+            self._copy(buffer, stand_in)
+        for store in self.ends:
+            self.line(f"{self.at(store.buffer, str(store.offset))} = {self.ref(store.node)};")
+        return self.lines
+
+    def line(self, text: str) -> None:
+        self.lines.append("    " * self.depth + text)
+
+    def _note(self, text: str) -> None:
+        if text != self.place:
+            self.place = text
+            self.line(f"/* {comment(text)} */")
+
+    def at(self, buffer: Buffer, index: str) -> str:
+        """A place in a buffer."""
+        return self.names(buffer) if buffer.bare else f"{self.names(buffer)}[{index}]"
+
+    # -- straight code -------------------------------------------------------------------------------
+
+    def _straight(self, level: int) -> None:
+        for item in self.straight[level]:
+            if isinstance(item, Macro):
+                self._note(item.origin)
+                write_macro(self, item)
+            elif isinstance(item, Store):
+                self.line(f"{self.at(item.buffer, str(item.offset))} = {self.ref(item.node)};")
+            elif item.op not in ("const", "given", "reduce"):
+                self._compute(item, self.uniform)
+
+    def _compute(self, node: Node, names: dict[Node, str]) -> None:
+        text = self.expression(node)
+        inline = (
+            self.plan.uses[node] == 1
+            and len(text) <= _SHORT
+            and node not in self.kept
+            and node not in self.plan.spills
+            and not self._reads_memory(node)
+            and (node.space or node.op not in FUNCTIONS)  # once, not in each turn of a loop
+        )
+        if inline:
+            names[node] = text if node.op in ("load", "given") or _closed(text) else f"({text})"
+            return
+        if node.op not in REPEATED:
+            self._note(node.origin)
+        names[node] = f"v{node.order}"
+        self.line(f"const {ctype(node.dtype, self.write.real)} v{node.order} = {text};")
+
+    def _reads_memory(self, node: Node) -> bool:
+        if node.op not in ("load", "gather", "search"):
+            return False
+        kind = node.extra[0].kind
+        return bool(kind == "state" or (kind == "work" and not node.space))
+
+    # -- loops ---------------------------------------------------------------------------------------
+
+    def _loop(self, space: Space, items: list[Node | Store]) -> None:
+        reductions = [i for i in items if isinstance(i, Node) and i.op == "reduce"]
+        for node in reductions:
+            self.uniform[node] = f"v{node.order}"
+            kind = node.extra[0]
+            self.line(f"{self._sum_type(node)} v{node.order} = {self._start(kind, node.dtype)};")
+            if kind in ("max", "min") and node.dtype == "real":
+                self.line(f"int n{node.order} = 0;")
+        clauses = "".join(self._clause(n) for n in reductions)
+        gathers = any(isinstance(i, Node) and i.op == "search" for i in items)
+        self.flat = len(space) > 1 and is_flat(items, space)
+        sizes = (math.prod(space),) if self.flat else space
+        if len(sizes) == 1 and clauses:
+            self.line(f"FG_SIMD(omp simd{clauses})")
+        elif len(sizes) == 1 and not gathers:
+            self.line("FG_SIMD(omp simd)")
+        for k, n in enumerate(sizes):
+            self.line(f"for (int32_t i{k} = 0; i{k} < {n}; i{k}++) {{")
+            self.depth += 1
+        self.local = {}
+        late: list[Store] = []
+        for item in items:
+            if isinstance(item, Store):
+                if item.buffer.kind == "state":
+                    self.ref(item.node)
+                    late.append(item)
+                else:
+                    self._store(item)
+            elif item.op == "reduce":
+                self._accumulate(item)
+            else:
+                self._compute(item, self.local)
+        for node in [n for n in items if isinstance(n, Node) and n in self.plan.spills]:
+            if not self.plan.spills[node].writers:
+                self.line(f"{self._spilled(node)} = {self.local[node]};")
+        for item in late:
+            self._store(item)
+        for _ in sizes:
+            self.depth -= 1
+            self.line("}")
+        self.flat = False
+        for node in reductions:
+            if node.extra[0] in ("max", "min") and node.dtype == "real":
+                self.line(f"if (n{node.order}) v{node.order} = NAN;")
+        self.local = {}
+        self.place = ""
+
+    def _sum_type(self, node: Node) -> str:
+        return "int" if node.dtype == "bool" else ctype(node.dtype, self.write.real)
+
+    def _start(self, kind: str, dtype: str) -> str:
+        if kind in ("sum", "any"):
+            return "0"
+        if kind in ("prod", "all"):
+            return "1"
+        if dtype == "real":
+            return number(float("-inf" if kind == "max" else "inf"), dtype, self.write.real)
+        low, high = {"int32": ("INT32_MIN", "INT32_MAX"), "int64": ("INT64_MIN", "INT64_MAX")}.get(
+            dtype, ("0", f"{dtype.upper()}_MAX")
+        )
+        return low if kind == "max" else high
+
+    def _clause(self, node: Node) -> str:
+        kind, name = node.extra[0], f"v{node.order}"
+        sign = {"sum": "+", "prod": "*", "max": "max", "min": "min", "any": "|", "all": "&"}[kind]
+        more = f" reduction(|:n{node.order})" if kind in ("max", "min") and node.dtype == "real" else ""
+        return f" reduction({sign}:{name}){more}"
+
+    def _accumulate(self, node: Node) -> None:
+        kind, name, value = node.extra[0], f"v{node.order}", self.ref(node.args[0])
+        if kind in ("sum", "prod"):
+            sign = "+" if kind == "sum" else "*"
+            if node.dtype in ("int32", "int64"):
+                wide = f"uint{node.dtype[3:]}_t"
+                self.line(f"{name} = ({node.dtype}_t)(({wide}){name} {sign} ({wide}){value});")
+            else:
+                self.line(f"{name} {sign}= {value};")
+        elif kind in ("any", "all"):
+            self.line(f"{name} {'|' if kind == 'any' else '&'}= {value};")
+        else:
+            sign = ">" if kind == "max" else "<"
+            self.line(f"{name} = {value} {sign} {name} ? {value} : {name};")
+            if node.dtype == "real":
+                self.line(f"n{node.order} |= {value} != {value};")
+
+    def _store(self, item: Store) -> None:
+        buffer = self.plan.late.get(item.buffer, item.buffer)
+        self.line(f"{self.at(buffer, self.index(item.offset, item.strides))} = {self.ref(item.node)};")
+
+    def _spilled(self, node: Node) -> str:
+        return self.at(self.plan.spills[node], self.index(0, strides_of(node.space)))
+
+    def _copy(self, buffer: Buffer, stand_in: Buffer) -> None:
+        """Carry over the places that were written."""
+        for item in self.plan.items:
+            if isinstance(item, Store) and item.buffer is buffer and item.space:
+                for k, n in enumerate(item.space):
+                    self.line(f"for (int32_t i{k} = 0; i{k} < {n}; i{k}++) {{")
+                    self.depth += 1
+                index = self.index(item.offset, item.strides)
+                self.line(f"{self.at(buffer, index)} = {self.at(stand_in, index)};")
+                for _ in item.space:
+                    self.depth -= 1
+                    self.line("}")
+
+    # -- names ---------------------------------------------------------------------------------------
+
+    def index(self, offset: int, strides: tuple[int, ...]) -> str:
+        """An index in the loops at hand; where one loop stands for all, its steps are those of the last."""
+        strides = strides[-1:] if self.flat else strides
+        terms = [f"i{k}" if s == 1 else f"{s} * i{k}" for k, s in enumerate(strides) if s]
+        if offset or not terms:
+            terms = [str(offset), *terms] if offset >= 0 or not terms else [*terms, f"({offset})"]
+        return " + ".join(terms)
+
+    def ref(self, node: Node) -> str:
+        """How a node is called here."""
+        if node.op == "const":
+            return number(node.extra[0], node.dtype, self.write.real)
+        if node.op == "given":
+            return str(node.extra)
+        if not node.space:
+            return self.uniform[node]
+        if node not in self.local:
+            if node.op in REPEATED:
+                self.local[node] = f"v{node.order}"
+                self.line(
+                    f"const {ctype(node.dtype, self.write.real)} v{node.order} = {self.expression(node)};"
+                )
+            else:
+                self.local[node] = self._spilled(node)
+        return self.local[node]
+
+    def expression(self, node: Node) -> str:
+        """A node written out."""
+        if node.op == "load":
+            buffer, offset, strides = node.extra
+            return self.at(buffer, self.index(offset, strides))
+        if node.op == "iota":
+            return f"(int64_t)i{node.extra}"
+        if node.op == "gather":
+            buffer, offset, strides, step, size = node.extra
+            clip = f"{self.write.helper('fg_clip')}((int64_t){self.ref(node.args[0])}, {size})"
+            scaled = clip if step == 1 else f"{step} * {clip}"
+            rest = self.index(offset, strides)
+            return self.at(buffer, scaled if rest == "0" else f"{rest} + {scaled}")
+        if node.op == "search":
+            buffer, offset, size, side = node.extra
+            kind = "r" if buffer.dtype == "real" else "b" if buffer.dtype == "bool" else buffer.dtype
+            name = self.write.helper(f"fg_search_{kind}")
+            whole = self.names(buffer) + (f" + {offset}" if offset else "")
+            array = f"&{whole}" if buffer.bare else whole
+            return f"{name}({array}, {size}, {self.ref(node.args[0])}, {int(side == 'right')})"
+        return self.write.write(node, [self.ref(a) for a in node.args])
+
+
+def _closed(text: str) -> bool:
+    """Whether an expression is one word or one call."""
+    if text.replace("_", "").isalnum():
+        return True
+    name, _, rest = text.partition("(")
+    if not rest or not name.replace("_", "").isalnum():
+        return False
+    depth = 1
+    for k, c in enumerate(rest):
+        depth += (c == "(") - (c == ")")
+        if depth == 0:
+            return k == len(rest) - 1
+    return False
+
+
+def indices(sizes: tuple[int, ...]) -> Iterator[str]:
+    """Names of loop counters."""
+    return (f"i{k}" for k in range(len(sizes)))

@@ -1,0 +1,268 @@
+"""A run of a graph in the Python engine: all state is here, none in the graph.
+
+`run.step()` advances one tick, `run.push(time, imu=...)` makes one from live events, and `run.state` is a
+plain tree of arrays, which can be saved, loaded and resumed to the same bits.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from time import perf_counter
+from typing import Any, NoReturn, Protocol
+
+from flowgraph.data.inputs import Inputs, batches, check_event, merged, prepare, stack
+from flowgraph.data.result import Result, statistics
+from flowgraph.data.series import Series
+from flowgraph.engines.python.plan import Plan, bindings, bound, plan
+from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
+from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
+from flowgraph.language.graph import NEVER, CallNode, Graph
+from flowgraph.recorder.random import NumpyDraw, seed_words
+
+
+class Meter(Protocol):
+    """Something that is told how far a run has come."""
+
+    def update(self, ticks: int, time: int) -> None:
+        """`ticks` done so far, and the time of the last in ns."""
+
+
+_BATCH = 2048
+
+
+class Run:
+    """One run in plain NumPy.
+
+    Args:
+        graph: what to run.
+        inputs: a `Flight`, or events by source name; left out for a run that is fed with `push`.
+        init: other initial values, by register path.
+        state: a `run.state` from which to go on; give it the inputs that come after.
+        seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
+    """
+
+    engine = "python"
+
+    def __init__(
+        self,
+        graph: Graph,
+        inputs: Inputs | None = None,
+        *,
+        init: Mapping[str, Any] | None = None,
+        state: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.graph = graph
+        self.ticks = 0
+        self.wall_s = 0.0
+        self._registers = initial_registers(graph, init)
+        self._last = dict.fromkeys(graph.sources, NEVER)
+        self._key = seed_words(seed)
+        self._stopped: int | None = None
+        check_start(init, state, path=graph.name)
+        if state is not None:
+            self.state = state
+        self._recorded = True
+        self._values: list[list[Any]] = [[] for _ in graph.collected]
+        self._times: list[list[int]] = [[] for _ in graph.collected]
+        self._pushed: list[deque[Any]] | None = None
+        if inputs is None:
+            self._pushed = [deque() for _ in graph.sources]
+            self._ticks: Iterator[tuple[int, int]] = iter(())
+            feeds: list[Callable[[], Any]] = [q.popleft for q in self._pushed]
+        else:
+            self._prepared = prepare(graph, inputs, self._last)
+            self._ticks, feeds = merged(self._prepared)
+            self._recorded = all(isinstance(s, Series) for s in self._prepared.values())
+        self._names = {
+            **bindings(graph),
+            "r": self._registers,
+            "overflow": self._overflow,
+            **{
+                f"d{index}": partial(NumpyDraw, call.draws, self._key)
+                for index, call in graph.calls
+                if "draw" in call.block.handed
+            },
+            **{f"n{k}": feed for k, feed in enumerate(feeds)},
+            **{f"c{k}": values.append for k, values in enumerate(self._values)},
+            **{f"u{k}": times.append for k, times in enumerate(self._times)},
+        }
+        self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        self.time = max(self._last.values(), default=NEVER)
+
+    def step(self) -> bool:
+        """Advance one tick; False when the inputs have ended."""
+        self._refuse_if_stopped()
+        tick = next(self._ticks, None)
+        if tick is None:
+            return False
+        self._advance([tick])
+        return True
+
+    def push(self, time: int, /, **values: Any) -> None:
+        """One tick at `time` (int ns) in which the named sources have these values."""
+        if self._pushed is None:
+            raise DataError(
+                "this run reads recorded inputs",
+                path=self.graph.name,
+                expected="a run without inputs",
+                got="push",
+                fix="start it as Run(graph)",
+            )
+        if not values:
+            raise DataError(
+                "a tick needs an event",
+                path=self.graph.name,
+                expected="a value for one source or more: " + ", ".join(self.graph.sources),
+                got="none",
+                fix="call push(time, name=value)",
+            )
+        key = 0
+        checked: list[tuple[deque[Any], Any]] = []
+        for k, (name, node) in enumerate(self.graph.sources.items()):
+            if name in values:
+                before, timing = self._last[name], node.clock.timing
+                time, value = check_event(name, time, values.pop(name), node.type, timing, before)
+                checked.append((self._pushed[k], value))
+                key |= 1 << k
+        if values:
+            raise UnknownNameError("source", next(iter(values)), self.graph.sources, path=self.graph.name)
+        if time <= self.time:
+            raise DataError(
+                "time goes backwards",
+                path=self.graph.name,
+                expected=f"a time after {self.time} ns",
+                got=f"{time} ns",
+                fix="push all events of one time in one call, in order",
+            )
+        for queue, value in checked:
+            queue.append(value)
+        try:
+            self._advance([(time, key)])
+        except BaseException:
+            for queue, _ in checked:
+                queue.clear()
+            self._stopped = None  # this tick did not happen; the next may be pushed
+            raise
+
+    def to_end(self, meter: Meter | None = None) -> Run:
+        """Run until the inputs end, telling `meter` now and then."""
+        self._refuse_if_stopped()
+        for batch in batches(self._ticks, _BATCH if self._recorded else 1):
+            self._advance(batch)
+            if meter is not None:
+                meter.update(self.ticks, self.time)
+        return self
+
+    def _advance(self, batch: list[tuple[int, int]]) -> None:
+        start = perf_counter()
+        reactions = self._reactions
+        done = 0
+        try:
+            for time, key in batch:
+                reactions[key](time)
+                done += 1
+        except BaseException as error:
+            self._account(batch[:done])
+            self._stopped = batch[done][0]
+            self._explain(error, self._stopped)
+            raise
+        self._account(batch)
+        self.wall_s += perf_counter() - start
+
+    def _refuse_if_stopped(self) -> None:
+        if self._stopped is not None:
+            raise DataError(
+                "this run stopped at an error and cannot go on",
+                path=f"{self.graph.name}, t = {self._stopped} ns",
+                expected="a run without errors",
+                got="another step after one",
+                fix="start a new one: Run(graph, inputs from that time on, state=run.state)",
+            )
+
+    def _account(self, batch: list[tuple[int, int]]) -> None:
+        self.ticks += len(batch)
+        keys = 0
+        for time, key in reversed(batch):
+            self.time = max(self.time, time)
+            for k, name in enumerate(self._last):
+                if key & ~keys & (1 << k):
+                    self._last[name] = time
+            keys |= key
+            if keys == (1 << len(self._last)) - 1:
+                break
+
+    def _explain(self, error: BaseException, time: int) -> None:
+        """Add to an error from a block's step the graph path and the time."""
+        trace = error.__traceback__
+        while trace is not None:
+            if trace.tb_frame.f_code.co_name == "react":
+                for known in list(self.graph.plans.values()):
+                    if (
+                        isinstance(known, Plan)
+                        and known.code.co_filename == trace.tb_frame.f_code.co_filename
+                    ):
+                        error.add_note(
+                            f"in {self.graph.name}, at {known.nodes.get(trace.tb_lineno)}, t = {time} ns"
+                        )
+            trace = trace.tb_next
+
+    def _overflow(self, index: int, time: int) -> NoReturn:
+        call = self.graph.nodes[index]
+        assert isinstance(call, CallNode)
+        raise overflow_error(call, time)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All registers by path, and the last time of each source: a tree of arrays."""
+        return state_tree(self.graph, self._registers, self._last, self.seed)
+
+    @state.setter
+    def state(self, tree: Mapping[str, Any]) -> None:
+        self._registers[:], self._last, seed = load_registers(self.graph, tree)
+        self._key[:] = seed_words(seed)
+        self.time = max(self._last.values(), default=NEVER)
+
+    @property
+    def seed(self) -> int:
+        """The seed of the random numbers."""
+        return int(self._key[0]) | int(self._key[1]) << 32
+
+    @property
+    def stats(self) -> dict[str, int]:
+        """What joins discarded by definition, by path."""
+        return statistics(self.graph, self.state)
+
+    def result(self) -> Result:
+        """The collected streams so far."""
+        series = {
+            c.name: stack(times, values, self.graph.port(c.wire).type, c.name)
+            for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)
+        }
+        return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
+
+
+class _Reactions(dict[int, Callable[[int], None]]):
+    """Reactions by pattern, compiled when a pattern first occurs."""
+
+    def __init__(self, graph: Graph, names: dict[str, Any]) -> None:
+        super().__init__()
+        self._graph, self._names = graph, names
+
+    def __missing__(self, key: int) -> Callable[[int], None]:
+        self[key] = bound(plan(self._graph, key), self._names)
+        return self[key]
+
+
+def overflow_error(call: CallNode, time: int) -> FifoOverflowError:
+    """The error of a queue that was full at `time`."""
+    size = call.settings.get("size")
+    return FifoOverflowError(
+        call.block.fault[1] if call.block.fault else "a queue is full",
+        path=call.path,
+        expected=f"at most {size} waiting values of one stream",
+        got=f"one more at t = {time} ns",
+        fix="raise size=, or look why the other stream is silent",
+    )

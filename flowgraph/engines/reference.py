@@ -1,0 +1,112 @@
+"""The reference interpreter: plays a pipeline's instructions in NumPy, one after the other.
+
+It is the definition that every backend is tested against. A singular factorization gives NaN, as in a
+compiled backend, and never an exception.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder.namespaces import NumpyNamespace
+from flowgraph.recorder.ops import OPS, bound_attrs
+from flowgraph.types import DTYPES
+
+
+class _LinearAlgebra:
+    """`numpy.linalg`, with NaN in place of an exception."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        function = getattr(np.linalg, name)
+
+        def total(*args: Any, **attrs: Any) -> Any:
+            try:
+                return function(*args, **attrs)
+            except np.linalg.LinAlgError:
+                return np.full_like(args[-1], np.nan)
+
+        return total if name in ("cholesky", "solve") else function
+
+
+class _TotalNumpy(NumpyNamespace):
+    linalg = _LinearAlgebra()
+
+
+TOTAL_NUMPY = _TotalNumpy()
+
+
+class Player:
+    """Plays ticks of one pipeline, keeping its registers.
+
+    Args:
+        pipeline: what to play.
+        cells: the value of each register cell, in order.
+        dtype: what `real` is.
+        seed: (2,) uint32.
+        passes: of the optimiser; without them the list is played as it was lowered, which is the definition.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        cells: list[Any],
+        dtype: Any,
+        seed: np.ndarray,
+        passes: Collection[str] = (),
+    ) -> None:
+        self.pipeline, self.cells, self.dtype, self.seed = pipeline, cells, dtype, seed
+        self._passes = passes
+        self._reads = [c.read for r in pipeline.registers for c in r.cells]
+        self._leaves = [[leaf.value for leaf in port.leaves] for port in pipeline.inputs]
+        self._programs: dict[int, tuple[Program, list[Any], dict[int, Any]]] = {}
+
+    def tick(self, time: int, key: int, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...] | None]:
+        """One tick: `values` are the leaves of the present inputs; returns those of each output, or None."""
+        if key not in self._programs:
+            program = specialise(self.pipeline, key)
+            if self._passes:
+                from flowgraph.pipeline.optimise import optimise  # folds constants with this interpreter
+
+                program = optimise(program, self._passes)
+            known = {n: _as(a, self.dtype) for n, a in program.constants.items()} | self._blanks(key)
+            self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions], known
+        program, steps, known = self._programs[key]
+        env = dict(known)
+        env[self.pipeline.time] = np.int64(time)
+        env[self.pipeline.seed] = self.seed
+        env.update(zip(self._reads, self.cells, strict=True))
+        present = iter(values)
+        for k, numbers in enumerate(self._leaves):
+            if key >> k & 1:
+                env.update(zip(numbers, next(present), strict=True))
+        for run, args, out in steps:
+            env[out] = run(*[env[a] for a in args])
+        self.cells = [env[n] for n in program.writes]
+        return [
+            None if flag is None or not env.get(flag, True) else tuple(env[n] for n in leaves)
+            for flag, leaves in program.outputs
+        ]
+
+    def _blanks(self, key: int) -> dict[int, Any]:
+        """Zeros for the leaves of absent inputs, which a selection may name without taking."""
+        absent = [p for k, p in enumerate(self.pipeline.inputs) if not key >> k & 1]
+        return {
+            leaf.value: _as(np.zeros(leaf.shape, DTYPES[leaf.dtype]), self.dtype)
+            for port in absent
+            for leaf in port.leaves
+        }
+
+
+def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:
+    return partial(OPS[i.op].run, TOTAL_NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
+
+
+def _as(array: Any, real: Any) -> Any:
+    found = np.asarray(array)
+    return found.astype(real) if found.dtype.kind == "f" else found

@@ -1,0 +1,176 @@
+"""Many runs in XLA: chunks of one size, each through one compiled scan under `vmap`.
+
+The runs of a batch share their ticks. Their inputs go in as dense arrays, and of the outputs only what is
+kept is computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.engines.many import Batch, Runs, initial_cells, is_shared, of_run, one_by_one
+from flowgraph.engines.playback import check_faults, dense, real_leaves
+from flowgraph.engines.python.run import Meter
+from flowgraph.errors import DataError
+from flowgraph.language.graph import Graph
+from flowgraph.pipeline.lowering import lower
+from flowgraph.pipeline.optimise import RELYING, for_engine, without
+from flowgraph.pipeline.pipeline import Pipeline, Port
+from flowgraph.recorder.random import seed_words
+
+if TYPE_CHECKING:
+    from flowgraph.engines.xla.scan import Chunk
+
+_TICKS_AT_ONCE = 512
+_CHUNK_BYTES = 64 * 2**20
+
+
+def vectorised(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
+    kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None, passes: Collection[str] | None,
+) -> Batch:  # fmt: skip
+    from flowgraph.engines.xla.scan import Scan, bytes_per_tick, import_jax
+
+    import_jax()
+    real = np.dtype(dtype)
+    whole = lower(graph, dtype=dtype)
+    pipeline = _pruned(whole, kept)
+    shared = is_shared(inputs)
+    first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
+    if not len(first.time):  # nothing to compile for
+        nothing = one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress, None)
+        return replace(nothing, engine="xla")
+    keys = tuple(int(k) for k in np.unique(first.key))
+    per_tick = runs_at_once * bytes_per_tick(pipeline)
+    ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
+    chosen = for_engine("xla", passes)
+    if init is not None:
+        chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
+    which = (keys, real.name, ticks, runs_at_once, shared, repr(kept), tuple(chosen))
+    compiled: dict[Any, Scan] = whole.__dict__.setdefault("_batched", {})  # they live as long as it does
+    if which not in compiled:
+        compiled[which] = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen)
+    scan = compiled[which]
+    dense_first = _columns([first], True, real)
+    chunks: list[list[Chunk]] = []
+    wall = 0.0
+    for n, members in enumerate(_chunks(len(seeds), runs_at_once)):
+        columns = (
+            dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
+        )
+        last = cells = _cells_of(graph, init, seeds, members)
+        words = np.stack([seed_words(seeds[k]) for k in members])
+        scan.compile(cells, words, columns)
+        start = perf_counter()
+        parts = []
+        for part, after in scan(cells, words, first.time, first.key, columns):
+            parts.append(_without_absent(part))
+            last = after
+        wall += perf_counter() - start
+        chunks.append(parts)
+        done = min((n + 1) * runs_at_once, len(seeds))
+        for row in range(done - n * runs_at_once):
+            check_faults(pipeline, [cell[row] for cell in last])
+        if progress is not None:
+            progress.update(done, 0)
+    series = {
+        port.name: _collected(port, k, first.time, chunks, len(seeds))
+        for k, port in enumerate(pipeline.outputs)
+    }
+    return Batch(graph.name, "xla", seeds, series, len(first.time), wall)
+
+
+def _pruned(pipeline: Pipeline, kept: dict[str, list[str]]) -> Pipeline:
+    ports = tuple(
+        replace(port, leaves=tuple(leaf for leaf in port.leaves if leaf.name in kept[port.name]))
+        for port in pipeline.outputs
+        if port.name in kept
+    )
+    return replace(pipeline, outputs=ports)
+
+
+def _chunks(count: int, size: int) -> Iterator[tuple[int, ...]]:
+    """Places of runs in chunks of one size; the last is filled up with its last run."""
+    for start in range(0, count, size):
+        part = tuple(range(start, min(start + size, count)))
+        yield part + (part[-1],) * (size - len(part))
+
+
+def _tapes(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], members: tuple[int, ...], first: Tape
+) -> list[Tape]:
+    made: dict[int, Tape] = {}
+    for run in members:
+        if run not in made:
+            made[run] = tape(prepare(graph, of_run(inputs, run, seeds[run])), graph)
+            _same_ticks(graph, first, made[run], seeds[run])
+    return [made[run] for run in members]
+
+
+def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
+    if np.array_equal(first.time, other.time) and np.array_equal(first.key, other.key):
+        return
+    raise DataError(
+        "runs in one batch must have their events at the same times",
+        path=f"{graph.name}, seed {seed}",
+        expected=f"the {len(first.time)} ticks of the first run",
+        got=f"{len(other.time)} ticks, or others",
+        fix='run them one by one: engine="python", or a simulate(...) each',
+    )
+
+
+def _cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
+    """Register cells with a leading axis of runs."""
+    made = {run: initial_cells(graph, of_run(init, run, seeds[run])) for run in set(members)}
+    return [np.stack(column) for column in zip(*(made[run] for run in members), strict=True)]
+
+
+def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray]]:
+    """Dense leaves of each input; with a leading axis of runs where inputs differ."""
+    made = [
+        [
+            [dense(leaf, (t.key >> k & 1).astype(bool)) for leaf in real_leaves(s, real)]
+            for k, s in enumerate(t.series)
+        ]
+        for t in tapes
+    ]
+    if shared:
+        return made[0]
+    return [[np.stack(leaves) for leaves in zip(*ports, strict=True)] for ports in zip(*made, strict=True)]
+
+
+def _without_absent(part: Chunk) -> Chunk:
+    """The chunk without the ticks at which an output is known to be absent in all runs."""
+    outputs = [
+        (mask, leaves if mask.ndim > 1 or mask.all() else [leaf[:, mask] for leaf in leaves])
+        for mask, leaves in part.outputs
+    ]
+    return replace(part, outputs=outputs)
+
+
+def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], runs: int) -> Runs:
+    """One output of all runs, at the ticks in which it is present in any."""
+
+    def joined(pick: Callable[[Chunk], np.ndarray]) -> np.ndarray:
+        rows = [np.concatenate([pick(part) for part in parts], axis=1) for parts in chunks]
+        return (rows[0] if len(rows) == 1 else np.concatenate(rows))[:runs]
+
+    masks = [part.outputs[k][0] for part in chunks[0]]
+    if all(mask.ndim == 1 for mask in masks):  # the same in all runs, and already left out where absent
+        some: np.ndarray = np.concatenate(masks)
+        present = np.ones((runs, int(some.sum())), dtype=bool)
+        leaves = {leaf.name: joined(lambda p, n=n: p.outputs[k][1][n]) for n, leaf in enumerate(port.leaves)}  # type: ignore[misc]
+        return Runs(port.name, time[some], present, leaves)
+    present = joined(lambda part: part.outputs[k][0])
+    some = np.asarray(present.any(axis=0))
+    leaves = {
+        leaf.name: joined(lambda p, n=n: p.outputs[k][1][n])[:, some]  # type: ignore[misc]
+        for n, leaf in enumerate(port.leaves)
+    }
+    return Runs(port.name, time[some], present[:, some], leaves)

@@ -1,0 +1,293 @@
+"""The XLA engine: a pipeline's instructions played in `jax.numpy` inside one compiled scan over the ticks.
+
+Few source patterns: each has its own specialised program, chosen by a switch. Many patterns, or programs so
+small that the switch would cost more than it saves: one program in which presence is data. Ticks go in
+chunks of a fixed size, so that one compilation serves recordings of any length and memory stays bounded;
+the last chunk is filled up with ticks in which nothing is present.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flowgraph.errors import MissingDependencyError
+from flowgraph.pipeline.optimise import ARRAYS, optimise
+from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder.ops import OPS, bound_attrs
+
+_MOST_PATTERNS = 8
+_SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
+_CHUNK_BYTES = 64 * 2**20
+_LARGEST_CHUNK = 131072
+
+
+def import_jax() -> Any:
+    """The `jax` module.
+
+    Raises:
+        MissingDependencyError: with what to install.
+    """
+    try:
+        import jax
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the XLA engine needs JAX",
+            path='engine="xla"',
+            expected="an installed jax",
+            got=str(error),
+            fix='pip install "flowgraph-filters[xla]", or use engine="python"',
+        ) from None
+    return jax
+
+
+class _JaxNamespace:
+    """`jax.numpy` with the two operations that pipelines add to it, and a faster `take`."""
+
+    def __init__(self, jax: Any) -> None:
+        self._jax = jax
+
+    def float32_bits(self, x: Any) -> Any:
+        jnp = self._jax.numpy
+        return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
+
+    def materialise(self, x: Any) -> Any:
+        return self._jax.lax.optimization_barrier(x)
+
+    def take(self, x: Any, indices: Any, *, axis: int = 0, mode: str = "clip") -> Any:
+        """`jnp.take`, along the last axis from a flat array.
+
+        For a gather of columns XLA lays the whole array out column by column, and as a scan carries it, every
+        tick that does not gather then pays for the change to and fro.
+        """
+        jnp = self._jax.numpy
+        x = jnp.asarray(x)
+        if x.ndim == 1 or axis % x.ndim != x.ndim - 1 or not x.size:
+            return jnp.take(x, indices, axis=axis, mode=mode)
+        n = x.shape[-1]
+        starts = np.arange(0, x.size, n, dtype=np.int32 if x.size < 2**31 else np.int64)
+        column = jnp.clip(jnp.asarray(indices), 0, n - 1).astype(starts.dtype)
+        at = starts.reshape(*x.shape[:-1], *(1,) * column.ndim) + column
+        return jnp.take(x.reshape(-1), at, axis=0, mode=mode)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jax.numpy, name)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks.
+
+    With a leading axis of runs, a mask that is the same in all runs has no such axis.
+    """
+
+    ticks: int
+    outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+
+
+class Scan:
+    """A compiled scan for one pipeline, dtype, set of patterns and chunk size.
+
+    Args:
+        pipeline: what to play.
+        keys: the source patterns that occur, in order.
+        dtype: what `real` is.
+        chunk: ticks a call.
+        runs: how many runs go at once, under `vmap`; None for one, without a leading axis.
+        shared: with `runs`, whether all runs have the same inputs.
+        passes: of the optimiser.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int, *,
+        runs: int | None = None, shared: bool = True, passes: Collection[str] = ARRAYS,
+    ) -> None:  # fmt: skip
+        self.jax = import_jax()
+        self.pipeline, self.keys, self.dtype, self.chunk = pipeline, keys, dtype, chunk
+        self.passes = passes
+        shared_program = self._program(None)
+        programs = [self._program(key) for key in keys]
+        saved = shared_program.work - min((p.work for p in programs), default=0)
+        self.branches = None if len(keys) > _MOST_PATTERNS or saved < _SMALL_WORK else programs
+        self.shared = shared_program
+        self.follows = [_known_presence(programs, k) for k in range(len(pipeline.outputs))]
+        self._input_axis = 0 if shared or runs is None else 1
+        self._output_axis = 0 if runs is None else 1
+        play = self._chunk
+        if runs is not None:
+            play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
+        self._compiled: Any = None
+        self._play_chunk = self.jax.jit(play)
+
+    def _program(self, key: int | None) -> Program:
+        return optimise(specialise(self.pipeline, key), self.passes)
+
+    def compile(self, cells: list[Any], seed: np.ndarray, inputs: list[list[np.ndarray]]) -> None:
+        """Compile for these shapes, once."""
+        if self._compiled is None:
+            with self.jax.enable_x64(True):
+                now = tuple(_as(c, self.dtype) for c in cells)
+                xs = self._slice(np.zeros(1, np.int64), np.zeros(1, np.int64), inputs, 0)
+                self._compiled = self._play_chunk.lower(now, seed, xs).compile()
+
+    def _slice(self, choice: np.ndarray, time: np.ndarray, inputs: list[list[np.ndarray]], start: int) -> Any:
+        """The ticks of one chunk, filled up with ticks in which nothing is present."""
+        here = slice(start, min(start + self.chunk, len(time)))
+        axis = self._input_axis
+        part = (slice(None),) * axis + (here,)
+        leaves = tuple(tuple(_padded(x[part], self.chunk, 0, axis) for x in port) for port in inputs)
+        kind, idle = (np.int64, 0) if self.branches is None else (np.int32, len(self.keys))
+        return (
+            _padded(choice[here], self.chunk, idle).astype(kind, copy=False),
+            _padded(time[here], self.chunk, int(time[here.stop - 1])),
+            leaves,
+        )
+
+    def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
+        step = self._switched if self.branches is not None else self._flagged
+        return self.jax.lax.scan(partial(step, seed), cells, xs)
+
+    def _start(
+        self, program: Program, cells: tuple[Any, ...], seed: Any, time: Any, inputs: Any
+    ) -> dict[int, Any]:
+        jnp = self.jax.numpy
+        env: dict[int, Any] = {n: jnp.asarray(_as(a, self.dtype)) for n, a in program.constants.items()}
+        env[self.pipeline.time], env[self.pipeline.seed] = time, seed
+        env.update(zip((c.read for r in self.pipeline.registers for c in r.cells), cells, strict=True))
+        for port, leaves in zip(self.pipeline.inputs, inputs, strict=True):
+            env.update(zip((leaf.value for leaf in port.leaves), leaves, strict=True))
+        return env
+
+    def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
+        jnp, xp = self.jax.numpy, _JaxNamespace(self.jax)
+        for i in program.instructions:
+            env[i.out] = OPS[i.op].run(
+                xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
+            )
+        outputs = []
+        ports = zip(program.outputs, self.pipeline.outputs, self.follows, strict=True)
+        for (flag, leaves), port, follows in ports:
+            mask = None if follows is not None else jnp.asarray(flag is not None and env.get(flag, True))
+            if flag is None:
+                blank = tuple(jnp.zeros(x.shape, _dtype(x.dtype, self.dtype)) for x in port.leaves)
+                outputs.append((mask, blank))
+            else:
+                outputs.append((mask, tuple(env[n] for n in leaves)))
+        return tuple(env[n] for n in program.writes), outputs
+
+    def _switched(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
+        key, time, inputs = x
+        assert self.branches is not None
+
+        def branch(program: Program) -> Callable[..., Any]:
+            return lambda cells, time, inputs: self._play(
+                program, self._start(program, cells, seed, time, inputs)
+            )
+
+        nothing = self._program(0)
+        return self.jax.lax.switch(key, [branch(p) for p in [*self.branches, nothing]], cells, time, inputs)
+
+    def _flagged(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
+        key, time, inputs = x
+        env = self._start(self.shared, cells, seed, time, inputs)
+        for k, port in enumerate(self.pipeline.inputs):
+            env[port.present] = (key >> k) & 1 == 1
+        return self._play(self.shared, env)
+
+    def __call__(
+        self,
+        cells: list[Any],
+        seed: np.ndarray,
+        time: np.ndarray,
+        key: np.ndarray,
+        inputs: list[list[np.ndarray]],
+    ) -> Iterator[tuple[Chunk, list[Any]]]:
+        """Play all ticks; yields each chunk of outputs with the register cells after it.
+
+        Args:
+            cells: register cells before the first tick.
+            seed: (2,) uint32.
+            time, key: (T,) int64.
+            inputs: for each input port its leaves, dense: (T, ...), zero where absent.
+
+        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs.
+        """
+        varies = any(known is not None and not known.all() for known in self.follows)
+        pattern = _places(self.keys, key) if varies or self.branches is not None else key
+        choice = key if self.branches is None else pattern
+        self.compile(cells, seed, inputs)
+        now: Any = tuple(_as(c, self.dtype) for c in cells)
+        for start in range(0, len(time), self.chunk):
+            count = min(self.chunk, len(time) - start)
+            kept = (slice(None),) * self._output_axis + (slice(count),)
+            part = pattern[start : start + count]
+            xs = self._slice(choice, time, inputs, start)
+            with self.jax.enable_x64(True):
+                now, ys = self._compiled(now, seed, xs)
+                outputs = [
+                    (
+                        np.asarray(mask)[kept] if known is None else _picked(known, part),
+                        [np.asarray(leaf)[kept] for leaf in leaves],
+                    )
+                    for (mask, leaves), known in zip(ys, self.follows, strict=True)
+                ]
+            yield Chunk(count, outputs), [np.asarray(c) for c in now]
+
+
+def _places(keys: tuple[int, ...], key: np.ndarray) -> np.ndarray:
+    """For each of `key` its place in `keys`, which are in order."""
+    if max(keys, default=0) >= 2**16:
+        return np.asarray(np.searchsorted(keys, key))
+    table = np.zeros(max(keys, default=0) + 1, np.int32)
+    table[list(keys)] = range(len(keys))
+    return np.asarray(table[key])
+
+
+def _picked(known: np.ndarray, places: np.ndarray) -> np.ndarray:
+    return np.ones(len(places), bool) if known.all() else np.asarray(known[places])
+
+
+def _known_presence(programs: list[Program], k: int) -> np.ndarray | None:
+    """Whether output k is present, for each source pattern, where that is known beforehand."""
+    facts = []
+    for program in programs:
+        flag = program.outputs[k][0]
+        if flag is not None and flag not in program.constants:
+            return None
+        facts.append(flag is not None and bool(program.constants[flag]))
+    return np.array(facts, dtype=bool)
+
+
+def bytes_per_tick(pipeline: Pipeline) -> int:
+    """What the inputs and outputs of one tick take, at 8 bytes a number."""
+    ports = (*pipeline.outputs, *pipeline.inputs)
+    return sum(math.prod(leaf.shape) * 8 for port in ports for leaf in port.leaves)
+
+
+def chunk_size(pipeline: Pipeline, ticks: int) -> int:
+    """A power of two that holds all ticks, or as many as keep the outputs of a chunk in bounds."""
+    most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(bytes_per_tick(pipeline), 1)))
+    return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
+
+
+def _padded(array: np.ndarray, size: int, fill: int, axis: int = 0) -> np.ndarray:
+    short = size - array.shape[axis]
+    if not short:
+        return array
+    shape = (*array.shape[:axis], short, *array.shape[axis + 1 :])
+    return np.concatenate([array, np.full(shape, fill, array.dtype)], axis=axis)
+
+
+def _dtype(kind: str, real: Any) -> Any:
+    return real if kind == "real" else kind
+
+
+def _as(array: Any, real: Any) -> Any:
+    found = np.asarray(array)
+    return found.astype(real) if found.dtype.kind == "f" else found

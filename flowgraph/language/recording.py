@@ -1,0 +1,356 @@
+"""Recording a step: a block's function runs once on symbolic arrays, and what it does is written down.
+
+The result is a `StepTrace`: instructions, and the numbers of the values at its ends (arguments, state, time,
+draws, outputs). It is made when a block is wired, which is also how output types are found.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections import OrderedDict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, fields, is_dataclass, replace
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
+from flowgraph.language.block import Block, Port, When
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.random import Site, site
+from flowgraph.recorder.symbolic import MACHINERY, Symbolic, Trace
+from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.types import (
+    ArrayType,
+    StructType,
+    Type,
+    bind,
+    check_fits,
+    flatten,
+    leaves_of,
+    tuple_type,
+    type_of,
+    unflatten,
+)
+
+
+class StepOutput(NamedTuple):
+    """What one variant of a step gives at an output; `presence` is "always", "never" or a value number."""
+
+    presence: str | int
+    type: Type | None
+    leaves: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StepTrace:
+    """The instructions of one variant of a step, with the numbers of its ends."""
+
+    trace: Trace
+    arguments: tuple[tuple[int, ...] | None, ...]
+    state: tuple[int, ...]
+    time: int
+    dt: int
+    outputs: tuple[StepOutput, ...]
+    next_state: tuple[int, ...]
+    sites: tuple[tuple[Site, int], ...] = ()
+
+
+class SymbolicDraw:
+    """`draw` while a step is recorded: each site becomes a value that comes from outside."""
+
+    def __init__(self, trace: Trace, prefix: str) -> None:
+        self._trace, self._prefix = trace, prefix
+        self.sites: dict[Site, Symbolic] = {}
+
+    def normal(self, name: str, shape: tuple[int, ...]) -> Symbolic:
+        return self._at(site(self._prefix, "normal", name, shape))
+
+    def uniform(self, name: str, shape: tuple[int, ...]) -> Symbolic:
+        return self._at(site(self._prefix, "uniform", name, shape))
+
+    def _at(self, found: Site) -> Symbolic:
+        if any(known.name == found.name and known != found for known in self.sites):
+            raise DeclarationError(
+                "a random stream is drawn in two shapes",
+                path=found.name,
+                expected="one draw a name",
+                got=f"{found.kind}{found.shape} and another",
+                fix="give each draw a name of its own",
+            )
+        if found not in self.sites:
+            self.sites[found] = self._trace.input(Spec(found.shape, "real"))
+        return self.sites[found]
+
+
+@contextmanager
+def remembering(memory: OrderedDict[Any, Any]) -> Iterator[None]:
+    """Within it, a step recorded before with the same settings and types is not recorded again.
+
+    For those who build the same graph many times over. Only steps whose settings are plain values, arrays,
+    dataclasses of these, hashable objects that compare by value and functions without a closure are
+    remembered; the oldest are forgotten beyond a few hundred.
+    """
+    token = _memory.set(memory)
+    try:
+        yield
+    finally:
+        _memory.reset(token)
+
+
+_memory: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("recorded steps", default=None)
+_REMEMBERED = 512
+
+
+class _NotPlainError(Exception):
+    """A setting whose value cannot be told from another's."""
+
+
+def _fingerprint(value: Any) -> Any:
+    """What tells plain values apart, to the last bit."""
+    if value is None or isinstance(value, bool | int | str):
+        return type(value), value
+    if isinstance(value, float):
+        return float, value.hex()
+    if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
+        return np.ndarray, value.dtype.str, value.shape, value.tobytes()
+    if type(value) in (tuple, list):
+        return type(value), *map(_fingerprint, value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value), *(_fingerprint(getattr(value, f.name)) for f in fields(value))
+    if isinstance(value, FunctionType) and value.__closure__ is None:
+        return FunctionType, value  # as itself; the rule for ties of a `merge` is one
+    kind = type(value)
+    if isinstance(kind.__eq__, FunctionType) and isinstance(value, Hashable):
+        return kind, value  # an immutable value, such as a state space
+    raise _NotPlainError
+
+
+def record(
+    block: Block[Any],
+    types: Sequence[Type | None],
+    settings: Mapping[str, Any],
+    state: Type | None,
+    path: str,
+    draws: str = "",
+) -> StepTrace:
+    """Run the step on symbolic arguments (None: absent) and return what it did.
+
+    Raises:
+        LoweringError: where it does something a pipeline cannot hold; names the line.
+    """
+    memory = _memory.get()
+    if memory is None:
+        return _record(block, types, settings, state, path, draws)
+    try:
+        plain = tuple((n, _fingerprint(v)) for n, v in settings.items())
+    except _NotPlainError:
+        return _record(block, types, settings, state, path, draws)
+    which = (id(block), tuple(types), plain, state, path, draws)
+    if which not in memory:
+        memory[which] = block, _record(block, types, settings, state, path, draws)  # id is of what is alive
+        while len(memory) > _REMEMBERED:
+            memory.popitem(last=False)
+    memory.move_to_end(which)
+    found: StepTrace = memory[which][1]
+    return found
+
+
+def _record(
+    block: Block[Any],
+    types: Sequence[Type | None],
+    settings: Mapping[str, Any],
+    state: Type | None,
+    path: str,
+    draws: str,
+) -> StepTrace:
+    trace = Trace()
+
+    def symbolic(type_: Type) -> tuple[Any, tuple[int, ...]]:
+        leaves = [trace.input(Spec(_sizes(t, path), t.dtype)) for _, t in leaves_of(type_)]
+        return unflatten(type_, iter(leaves)), tuple(leaf.number for leaf in leaves)
+
+    time, dt = trace.input(Spec((), "int64")), trace.input(Spec((), "real"))
+    args = [None if t is None else symbolic(t) for t in types]
+    known = {
+        number: leaf
+        for t, a in zip(types, args, strict=True)
+        if t is not None and a is not None
+        for number, (_, leaf) in zip(a[1], leaves_of(t), strict=True)
+    }
+    values = [None if a is None else a[0] for a in args]
+    memory = symbolic(state) if state is not None else None
+    draw = SymbolicDraw(trace, draws or block.name)
+    handed = {"dt": dt, "t": time, "xp": namespace, "path": path, "draw": draw}
+    try:
+        result = block.step(
+            *([memory[0]] if memory else []), *values, **settings, **{h: handed[h] for h in block.handed}
+        )
+    except FlowgraphError as error:
+        error.path = f"{path} ({error.path})" if error.path else path
+        raise
+    except Exception as error:
+        raise LoweringError(
+            f"the step cannot be traced: {type(error).__name__}: {error}",
+            path=f"{path} ({_line_of(error)})",
+            expected="array-API operations through xp on fixed shapes",
+            got=f"{type(error).__name__}",
+            fix="use functions of xp, or declare @block(host=True) with annotated outputs",
+        ) from error
+    next_state: tuple[int, ...] = ()
+    if memory is not None and state is not None:
+        new_state, result = _split(result, path)
+        _fits_state(new_state, state, path)
+        next_state = _numbers(trace, new_state, state)
+    outputs = tuple(
+        _output(trace, value, port, known, path)
+        for value, port in zip(
+            _outputs(block, result, path), block.outputs or [Port("out", None, False)], strict=True
+        )
+    )
+    return StepTrace(
+        trace,
+        tuple(None if a is None else a[1] for a in args),
+        memory[1] if memory else (),
+        time.number,
+        dt.number,
+        outputs,
+        next_state,
+        tuple((known, value.number) for known, value in draw.sites.items()),
+    )
+
+
+def _split(result: Any, path: str) -> tuple[Any, Any]:
+    if not isinstance(result, tuple) or len(result) != 2 or isinstance(result, When):
+        raise DeclarationError(
+            "a block with a state must return (state, outputs)",
+            path=path,
+            expected="a pair",
+            got=type(result).__name__,
+            fix="return new_state, output",
+        )
+    return result
+
+
+def _outputs(block: Block[Any], result: Any, path: str) -> tuple[Any, ...]:
+    """The outputs one by one."""
+    if block.outputs is None or len(block.outputs) == 1:
+        return (result,)
+    if not isinstance(result, tuple) or len(result) != len(block.outputs):
+        raise DeclarationError(
+            "the step returns another number of outputs than it declares",
+            path=path,
+            expected=f"{len(block.outputs)} outputs ({', '.join(p.name for p in block.outputs)})",
+            got=f"{len(result)}" if isinstance(result, tuple) else type(result).__name__,
+            fix="return one value an output, as annotated",
+        )
+    return result
+
+
+def _fits_state(new: Any, state: Type, path: str) -> None:
+    """Check that a step's new state has the type of its initial state."""
+    check_fits(
+        type_of(new), state, given_at=f"the state returned by {path}", wanted_at=f"{path} state", sizes={}
+    )
+
+
+def _numbers(trace: Trace, value: Any, type_: Type) -> tuple[int, ...]:
+    lifted = [leaf if isinstance(leaf, Symbolic) else trace.constant(leaf) for leaf in flatten(value, type_)]
+    kinds = [t.dtype for _, t in leaves_of(type_)]
+    return tuple(leaf.cast(kind).number for leaf, kind in zip(lifted, kinds, strict=True))
+
+
+def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str) -> StepOutput:
+    if value is None:
+        return StepOutput("never", None, ())
+    presence: str | int = "always"
+    if isinstance(value, When):
+        flag = value.present
+        if getattr(flag, "shape", ()) != ():
+            raise DeclarationError(
+                "an output is present or absent as a whole",
+                path=f"{path}.{port.name}",
+                expected="one truth value",
+                got=f"shape {flag.shape}",
+                fix="reduce it with xp.all(...) or xp.any(...)",
+            )
+        presence = (flag if isinstance(flag, Symbolic) else trace.constant(bool(flag))).cast("bool").number
+        value = value.value
+    given = _typed(value, known)
+    if port.type is not None:
+        sizes: dict[str, int] = {}
+        wanted = _reals(port.type, given)
+        try:
+            check_fits(
+                wanted, port.type, given_at=f"{path}'s result", wanted_at=f"{path}.{port.name}", sizes=sizes
+            )
+        except TypeMismatchError as error:
+            error.fix = "return what the annotation promises, or mend the annotation"
+            raise
+        given = _with_units(wanted, bind(port.type, sizes))
+    return StepOutput(presence, given, _numbers(trace, value, given))
+
+
+def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
+    """The type of a result; a leaf passed through unchanged keeps its unit and frame."""
+    if isinstance(value, list):
+        raise DeclarationError(
+            "a step returns a list",
+            expected="an array, a signal or a tuple",
+            got="list",
+            fix="write xp.stack([...]), or xp.asarray([...]) of constants",
+        )
+    if isinstance(value, Symbolic) and value.number in known:
+        return known[value.number]
+    if isinstance(value, tuple):
+        return tuple_type([_typed(v, known) for v in value])
+    return type_of(value)
+
+
+def _reals(wanted: Type, given: Type) -> Type:
+    """`given`, with Python integers where `wanted` has a real taken as reals."""
+    if isinstance(wanted, ArrayType) and isinstance(given, ArrayType) and wanted.dtype == "real":
+        return ArrayType(given.shape, "real" if given.dtype != "bool" else "bool", given.unit, given.frame)
+    return given
+
+
+def _with_units(given: Type, named: Type) -> Type:
+    if isinstance(given, ArrayType) and isinstance(named, ArrayType):
+        return replace(
+            given,
+            unit=named.unit or given.unit,
+            frame=named.frame or given.frame,
+            axes=named.axes or given.axes,
+        )
+    if isinstance(given, StructType) and isinstance(named, StructType):
+        pairs = zip(given.fields, named.fields, strict=True)
+        return StructType(given.name, tuple((n, _with_units(g, w)) for (n, g), (_, w) in pairs), given.cls)
+    return given
+
+
+def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
+    unbound = [d for d in leaf.shape if isinstance(d, str)]
+    if unbound:
+        raise DeclarationError(
+            f"size {unbound[0]!r} is not bound",
+            path=path,
+            expected="every size known when the graph is built",
+            got=str(leaf),
+            fix=f"give it to build: build(sizes={{{unbound[0]!r}: ...}})",
+        )
+    return typing.cast(tuple[int, ...], leaf.shape)
+
+
+def _line_of(error: BaseException) -> str:
+    """module:line of the last frame of the user's code in a traceback."""
+    place = "?"
+    step = error.__traceback__
+    while step is not None:
+        module = step.tb_frame.f_globals.get("__name__", "?")
+        if module not in (__name__, *MACHINERY):
+            place = f"{module}:{step.tb_lineno}"
+        step = step.tb_next
+    return place

@@ -1,0 +1,144 @@
+"""Programs: a pipeline specialised for what is known of a tick, and cleaned of what is then unused.
+
+With a pattern of present sources, every selection on presence folds to one of its sides, and the
+instructions that only the other side needed disappear. Without one, presence stays an input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from flowgraph.pipeline.pipeline import Pipeline, work
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.symbolic import Instruction
+
+
+@dataclass(frozen=True)
+class Program:
+    """Instructions in order, with what they start from and end in.
+
+    Args:
+        constants: value number -> array.
+        instructions: only those that an output or a register needs.
+        outputs: for each output port, (presence, leaves) as value numbers; presence None: known absent.
+        writes: for each register cell in order, the value number written back.
+        reads: for each register cell in order, the number of its value in a tick.
+        symmetric: of those, the square matrices that are symmetric at reset.
+        lanes: sizes of axes along which the same is done many times, such as particles.
+        origin: for a value that an optimisation has added, the value of the pipeline that it serves.
+        elements: for factors of products that are mostly zero, what each element is: a float that is known,
+            the number of the scalar value that it equals, or None.
+    """
+
+    constants: Mapping[int, np.ndarray]
+    instructions: tuple[Instruction, ...]
+    outputs: tuple[tuple[int | None, tuple[int, ...]], ...]
+    writes: tuple[int, ...]
+    specs: Mapping[int, Spec]
+    reads: tuple[int, ...] = ()
+    symmetric: frozenset[int] = frozenset()
+    lanes: frozenset[int] = frozenset()
+    origin: Mapping[int, int] = field(default_factory=dict)
+    elements: Mapping[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def work(self) -> int:
+        """About how many scalar operations it takes."""
+        return sum(work(i, self.specs) for i in self.instructions)
+
+
+def specialise(pipeline: Pipeline, key: int | None) -> Program:
+    """The program for the pattern `key` (bit k: input k is present), or for any pattern with None."""
+    known: dict[int, bool] = {
+        n: bool(a) for n, a in pipeline.constants.items() if a.dtype == bool and a.shape == ()
+    }
+    if key is not None:
+        known.update({port.present: bool(key >> k & 1) for k, port in enumerate(pipeline.inputs)})
+    same: dict[int, int] = {}
+    kept: list[Instruction] = []
+    for i in pipeline.instructions:
+        args = tuple(same.get(a, a) for a in i.args)
+        fact = _fold(i, args, known, pipeline.specs)
+        if isinstance(fact, bool):
+            known[i.out] = fact
+        elif fact is not None:
+            same[i.out] = fact
+        else:
+            kept.append(Instruction(i.op, args, i.attrs, i.out, i.spec, i.line))
+    outputs = []
+    for port in pipeline.outputs:
+        present = same.get(port.present, port.present)
+        absent = known.get(present) is False
+        outputs.append(
+            (
+                None if absent else present,
+                () if absent else tuple(same.get(x.value, x.value) for x in port.leaves),
+            )
+        )
+    writes = tuple(same.get(c.write, c.write) for r in pipeline.registers for c in r.cells)
+    constants = dict(pipeline.constants) | {n: np.asarray(v) for n, v in known.items()}
+    live, needed = _live(
+        kept, [*writes, *(n for p, leaves in outputs for n in (*leaves, *([] if p is None else [p])))]
+    )
+    cells = [c for r in pipeline.registers for c in r.cells]
+    return Program(
+        {n: a for n, a in constants.items() if n in needed},
+        live,
+        tuple(outputs),
+        writes,
+        pipeline.specs,
+        tuple(c.read for c in cells),
+        frozenset(c.read for c in cells if is_symmetric(c.reset)),
+        _lanes(pipeline),
+    )
+
+
+_WIDE = 32
+
+
+def _lanes(pipeline: Pipeline) -> frozenset[int]:
+    """Sizes of named axes that are wider than any matrix of a filter."""
+    parts = [c for r in pipeline.registers for c in r.cells]
+    parts += [x for port in (*pipeline.inputs, *pipeline.outputs) for x in port.leaves]  # type: ignore[misc]
+    named = (n for part in parts for n, axis in zip(part.shape, part.axes, strict=False) if axis)
+    return frozenset(n for n in named if n > _WIDE)
+
+
+def is_symmetric(value: Any) -> bool:
+    """Whether this is a square matrix that equals its transpose to the bit."""
+    array = np.asarray(value)
+    return array.ndim == 2 and array.shape[0] == array.shape[1] and bool((array == array.T).all())
+
+
+def _fold(
+    i: Instruction, args: tuple[int, ...], known: dict[int, bool], specs: Mapping[int, Spec]
+) -> bool | int | None:
+    """What an instruction's result is known to be: a truth value, another value, or None for not known."""
+    facts = [known.get(a) for a in args]
+    if i.op == "where" and facts[0] is not None:
+        chosen = args[1] if facts[0] else args[2]
+        if specs[chosen] == i.spec:
+            return known.get(chosen, chosen) if i.spec == Spec((), "bool") else chosen
+    if i.op == "logical_not" and facts[0] is not None:
+        return not facts[0]
+    if i.op in ("logical_and", "logical_or") and i.spec.shape == ():
+        ends = i.op == "logical_or"
+        if ends in facts:
+            return ends
+        unknown = [a for a, f in zip(args, facts, strict=True) if f is None]
+        return (not ends) if not unknown else unknown[0] if len(unknown) == 1 else None
+    return None
+
+
+def _live(instructions: list[Instruction], wanted: list[int]) -> tuple[tuple[Instruction, ...], set[int]]:
+    needed = set(wanted)
+    live = []
+    for i in reversed(instructions):
+        if i.out in needed:
+            live.append(i)
+            needed.update(i.args)
+    return tuple(reversed(live)), needed

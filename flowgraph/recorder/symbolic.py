@@ -1,0 +1,380 @@
+"""The symbolic array: runs through a block's step once and writes down what it does.
+
+A `Symbolic` has a shape and a dtype but no values. Every operation of the array API on it appends one
+typed instruction in single-assignment form to its `Trace`, with the source line that asked for it.
+Whatever a fixed-size pipeline cannot hold (a Python branch on a value, an in-place write, a shape that
+depends on data, an operation outside the list) is refused there, by line.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+
+from flowgraph.errors import LoweringError
+from flowgraph.recorder.ops import OPS, ShapeError, Spec, promote
+from flowgraph.types import DTYPES, dtype_name
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """`out = op(*args, **attrs)`: `args` are value numbers; `line` is module:line of the block's source."""
+
+    op: str
+    args: tuple[int, ...]
+    attrs: dict[str, Any]
+    out: int
+    spec: Spec
+    line: str
+
+
+class Trace:
+    """Instructions in the order recorded, and the constants they use."""
+
+    def __init__(self) -> None:
+        self.instructions: list[Instruction] = []
+        self.constants: dict[int, np.ndarray] = {}
+        self._interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
+        self._count = 0
+
+    def new(self) -> int:
+        """A fresh value number."""
+        self._count += 1
+        return self._count - 1
+
+    def input(self, spec: Spec) -> Symbolic:
+        """A value that comes from outside."""
+        return Symbolic(self, self.new(), spec)
+
+    def constant(self, value: Any) -> Symbolic:
+        """A value known now; equal constants share one number."""
+        array = np.asarray(value)
+        dtype = dtype_name(array)
+        array = array.astype(DTYPES[dtype])
+        key = (array.tobytes(), array.shape, dtype)
+        number = self._interned.get(key)
+        if number is None:
+            number = self._interned[key] = self.new()
+            self.constants[number] = array
+        return Symbolic(self, number, Spec(array.shape, dtype))
+
+    def apply(self, op: str, *args: Any, **attrs: Any) -> Symbolic:
+        """Record one instruction, bringing its operands to a common kind of number first."""
+        rule = OPS[op]
+        operands = self._operands(rule.operands, op, args)
+        try:
+            spec = rule.rule(*(a.spec for a in operands), **attrs)
+        except ShapeError as error:
+            raise LoweringError(
+                f"{op}: {error}",
+                path=caller(),
+                expected="shapes that fit",
+                got=str([a.shape for a in operands]),
+                fix="reshape or transpose one side",
+            ) from None
+        out = Symbolic(self, self.new(), spec)
+        numbers = tuple(a.number for a in operands)
+        self.instructions.append(Instruction(op, numbers, attrs, out.number, spec, caller()))
+        return out
+
+    def _operands(self, kind: str, op: str, args: Sequence[Any]) -> list[Symbolic]:
+        peers = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Symbolic)]
+        lifted = []
+        for arg in args:
+            if isinstance(arg, Symbolic):
+                if arg.trace is not self:
+                    refuse(
+                        "this mixes values of two blocks",
+                        "only values of this step",
+                        "a value kept from elsewhere",
+                        "pass it through a port",
+                    )
+                lifted.append(arg)
+            elif isinstance(arg, bool | int | float) and not isinstance(arg, np.generic) and peers:
+                dtypes = [p.dtype_name for p in peers] + (["real"] if isinstance(arg, float) else [])
+                weak = promote(*dtypes)
+                if weak == "bool" and not isinstance(arg, bool):
+                    weak = "int64"  # True + 1 is a number
+                lifted.append(
+                    self.constant(
+                        np.asarray(arg, DTYPES["bool" if isinstance(arg, bool) and weak == "bool" else weak])
+                    )
+                )
+            else:
+                lifted.append(self.constant(arg))
+        if op == "where":
+            common = promote(lifted[1].dtype_name, lifted[2].dtype_name)
+            return [lifted[0].cast("bool"), lifted[1].cast(common), lifted[2].cast(common)]
+        if kind == "same":
+            common = promote(*(a.dtype_name for a in lifted))
+            return [a.cast(common) for a in lifted]
+        if kind in ("real", "bool"):
+            return [a.cast(kind) for a in lifted]
+        if kind == "int" and any(a.dtype_name == "real" for a in lifted):
+            refuse(f"{op} of real numbers", "integers", "real", "convert with xp.astype first")
+        return lifted
+
+
+def caller() -> str:
+    """module:line of the nearest frame outside the recording machinery."""
+    frame = sys._getframe(1)
+    while frame.f_back and _is_machinery(frame.f_globals.get("__name__", "?")):
+        frame = frame.f_back
+    return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
+
+
+MACHINERY = (__name__, f"{__name__}_namespace", "flowgraph.recorder.ops")
+"""Modules whose frames are not the user's code."""
+
+
+def _is_machinery(module: str) -> bool:
+    return module in MACHINERY or module.partition(".")[0] == "numpy"
+
+
+def refuse(what: str, expected: str, got: str, fix: str, *, in_every_engine: bool = False) -> NoReturn:
+    """Raise the error that names the block's source line."""
+    error = LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
+    error.in_every_engine = in_every_engine
+    raise error
+
+
+class Symbolic:
+    """An array of known shape and dtype whose values are not known yet."""
+
+    __slots__ = ("number", "spec", "trace")
+    __array_ufunc__ = None  # NumPy arrays on the left defer to this class
+    __array_priority__ = 1000
+
+    def __init__(self, trace: Trace, number: int, spec: Spec) -> None:
+        self.trace, self.number, self.spec = trace, number, spec
+
+    shape = property(lambda self: self.spec.shape)
+    ndim = property(lambda self: len(self.spec.shape))
+    size = property(lambda self: int(np.prod(self.spec.shape)))
+    dtype_name = property(lambda self: self.spec.dtype)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(DTYPES[self.spec.dtype])
+
+    @property
+    def mT(self) -> Symbolic:
+        return self.trace.apply("matrix_transpose", self)
+
+    @property
+    def T(self) -> Symbolic:
+        return (
+            self.mT
+            if self.ndim == 2
+            else refuse(".T of other than two axes", "a matrix", f"{self.shape}", "use .mT")
+        )
+
+    def cast(self, dtype: str) -> Symbolic:
+        if dtype == self.dtype_name:
+            return self
+        known = self.trace.constants.get(self.number)
+        if known is not None:
+            return self.trace.constant(known.astype(DTYPES[dtype]))
+        return self.trace.apply("astype", self, dtype=dtype)
+
+    def __array_namespace__(self, *, api_version: str | None = None) -> Any:
+        from flowgraph.recorder.symbolic_namespace import namespace
+
+        return namespace
+
+    def __getitem__(self, index: Any) -> Symbolic:
+        entries = list(index) if isinstance(index, tuple) else [index]
+        if len(entries) == 1 and isinstance(entries[0], Symbolic):
+            if entries[0].dtype_name == "bool":
+                refuse(
+                    "the shape of x[mask] depends on data",
+                    "a fixed shape",
+                    "a Boolean index",
+                    "use xp.where(mask, x, ...)",
+                )
+            return self.trace.apply("take", self, entries[0], axis=0)
+        return _getitem(self, entries)
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        refuse(
+            "in-place write",
+            "a new array",
+            "x[...] = value",
+            "build it with xp.concat, xp.stack or xp.where",
+            in_every_engine=True,
+        )
+
+    def __bool__(self) -> bool:
+        refuse(
+            "Python branch on a traced value",
+            "one flow for all values",
+            "if, while, and, or, not, min() or max() on an array",
+            "select with xp.where(condition, a, b), or split the stream with filter",
+        )
+
+    def __float__(self) -> float:
+        refuse(
+            "Python number from a traced value",
+            "arrays throughout",
+            "float(x) or math.f(x)",
+            "use xp functions",
+        )
+
+    def __int__(self) -> int:
+        refuse(
+            "Python number from a traced value", "arrays throughout", "int(x)", "use xp.astype(x, xp.int64)"
+        )
+
+    def __index__(self) -> int:
+        refuse(
+            "Python index from a traced value",
+            "a fixed index",
+            "a value as index or size",
+            "use xp.take(x, i)",
+        )
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        refuse(
+            "NumPy function on a traced value",
+            "functions of xp",
+            "np.f(x)",
+            "take xp as keyword parameter and call xp.f(x)",
+        )
+
+    def __len__(self) -> int:
+        return int(self.shape[0])
+
+    def __iter__(self) -> Iterator[Symbolic]:
+        if not self.shape:
+            refuse("iteration over a scalar", "an array with an axis", "a scalar", "do not unpack it")
+        return (self[i] for i in range(self.shape[0]))
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        hint = f"use xp.{name}(x)" if hasattr(np, name) else "use functions of xp"
+        refuse(
+            f"arrays have no attribute {name!r} in the array API",
+            "the standard's attributes",
+            f".{name}",
+            hint,
+        )
+
+    def __repr__(self) -> str:
+        return f"<Symbolic %{self.number} {self.dtype_name}{list(self.shape)}>"
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _getitem(x: Symbolic, entries: list[Any]) -> Symbolic:
+    """Basic indexing by whole numbers, slices, None and Ellipsis."""
+    used = sum(e is not None and e is not Ellipsis for e in entries)
+    if used > x.ndim:
+        refuse(f"too many indices for shape {x.shape}", f"at most {x.ndim}", str(used), "drop some")
+    if Ellipsis in [e for e in entries if e is Ellipsis]:
+        at = next(i for i, e in enumerate(entries) if e is Ellipsis)
+        entries[at : at + 1] = [slice(None)] * (x.ndim - used)
+    else:
+        entries = entries + [slice(None)] * (x.ndim - used)
+    index: list[Any] = []
+    for entry in entries:
+        if entry is None:
+            continue
+        if isinstance(entry, slice):
+            parts = (entry.start, entry.stop, entry.step)
+            if any(isinstance(p, Symbolic) for p in parts):
+                refuse(
+                    "a slice with a traced bound", "fixed bounds", str(entry), "use xp.take with fixed size"
+                )
+            index.append([None if p is None else int(p) for p in parts])
+        elif isinstance(entry, int | np.integer):
+            index.append(int(entry))
+        else:
+            refuse(
+                "this index is not supported",
+                "whole numbers, slices, None, ...",
+                repr(entry),
+                "use xp.take(x, indices, axis=...)",
+            )
+    whole = all(e == [None, None, None] for e in index)
+    out = x if whole else x.trace.apply("getitem", x, index=index)
+    shape, sizes = [], iter(out.shape)
+    for entry in entries:
+        if entry is None:
+            shape.append(1)
+        elif isinstance(entry, slice):
+            shape.append(next(sizes))
+    return out if tuple(shape) == out.shape else out.trace.apply("reshape", out, shape=shape)
+
+
+def _operator(op: str, swap: bool = False) -> Callable[..., Any]:
+    def method(self: Symbolic, other: Any) -> Any:
+        pair = (other, self) if swap else (self, other)
+        return self.trace.apply(op, *pair)
+
+    return method
+
+
+for _name, _op in {
+    "add": "add",
+    "sub": "subtract",
+    "mul": "multiply",
+    "truediv": "divide",
+    "floordiv": "floor_divide",
+    "mod": "remainder",
+    "pow": "pow",
+    "matmul": "matmul",
+    "and": "bitwise_and",
+    "or": "bitwise_or",
+    "xor": "bitwise_xor",
+    "lshift": "bitwise_left_shift",
+    "rshift": "bitwise_right_shift",
+}.items():
+    setattr(Symbolic, f"__{_name}__", _operator(_op))
+    setattr(Symbolic, f"__r{_name}__", _operator(_op, swap=True))
+for _name, _op in {
+    "lt": "less",
+    "le": "less_equal",
+    "gt": "greater",
+    "ge": "greater_equal",
+    "eq": "equal",
+    "ne": "not_equal",
+}.items():
+    setattr(Symbolic, f"__{_name}__", _operator(_op))
+for _name, _op in {"neg": "negative", "pos": "positive", "abs": "abs", "invert": "bitwise_invert"}.items():
+    setattr(Symbolic, f"__{_name}__", lambda self, _op=_op: self.trace.apply(_op, self))
+
+
+def _augmented(name: str) -> Callable[..., NoReturn]:
+    def method(self: Symbolic, other: Any) -> NoReturn:
+        refuse(
+            "in-place write",
+            "a new array",
+            f"x {name}= y",
+            f"write x = x {name} y: NumPy would change x itself",
+            in_every_engine=True,
+        )
+
+    return method
+
+
+for _name, _op in {
+    "add": "+",
+    "sub": "-",
+    "mul": "*",
+    "truediv": "/",
+    "floordiv": "//",
+    "mod": "%",
+    "pow": "**",
+    "matmul": "@",
+    "and": "&",
+    "or": "|",
+    "xor": "^",
+    "lshift": "<<",
+    "rshift": ">>",
+}.items():
+    setattr(Symbolic, f"__i{_name}__", _augmented(_op))
