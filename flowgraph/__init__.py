@@ -2,12 +2,13 @@
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
+from flowgraph.data.batch import Batch
 from flowgraph.data.export import write_tum
 from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
 from flowgraph.data.registry import Case, Report, find_graph, load_flight
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
-from flowgraph.engines.many import Batch, simulate_many
+from flowgraph.engines.many import simulate_many
 from flowgraph.engines.python.run import Run
 from flowgraph.engines.simulate import simulate
 from flowgraph.engines.state import load_state, save_state

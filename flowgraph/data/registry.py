@@ -75,19 +75,24 @@ def _entries(group: str) -> tuple[EntryPoint, ...]:
     return _entries_along(group, tuple(sys.path))
 
 
+def entry_names(group: str) -> list[str]:
+    """The names of all that is installed under a group."""
+    return sorted(e.name for e in _entries(group))
+
+
 def graph_names() -> list[str]:
     """The names of all installed graphs."""
-    return sorted(e.name for e in _entries("flowgraph.graphs"))
+    return entry_names("flowgraph.graphs")
 
 
 def flight_names() -> list[str]:
     """The kinds of flight that can be loaded."""
-    return sorted(e.name for e in _entries("flowgraph.flights"))
+    return entry_names("flowgraph.flights")
 
 
 def bench_names() -> list[str]:
     """The names of all installed experiments."""
-    return sorted(e.name for e in _entries("flowgraph.benches"))
+    return entry_names("flowgraph.benches")
 
 
 def find_bench(name: str) -> Callable[..., Report]:
@@ -96,7 +101,7 @@ def find_bench(name: str) -> Callable[..., Report]:
     Raises:
         UnknownNameError: listing the names that exist.
     """
-    found: Callable[..., Report] = _find("flowgraph.benches", "bench", name, bench_names())
+    found: Callable[..., Report] = find_entry("flowgraph.benches", "bench", name)
     return found
 
 
@@ -106,15 +111,20 @@ def find_graph(name: str) -> GraphFunction:
     Raises:
         UnknownNameError: listing the names that exist.
     """
-    found: GraphFunction = _find("flowgraph.graphs", "graph", name, graph_names())
+    found: GraphFunction = find_entry("flowgraph.graphs", "graph", name)
     return found
 
 
-def _find(group: str, kind: str, name: str, valid: list[str]) -> Any:
+def find_entry(group: str, kind: str, name: str) -> Any:
+    """What is installed under a name of a group.
+
+    Raises:
+        UnknownNameError: listing the names that exist.
+    """
     for entry in _entries(group):
         if entry.name == name:
             return entry.load()
-    raise UnknownNameError(kind, name, valid)
+    raise UnknownNameError(kind, name, entry_names(group))
 
 
 def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
@@ -125,13 +135,13 @@ def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None 
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
     """
     kind, _, argument = spec.partition(":")
-    load: Callable[..., Flight] = _find("flowgraph.flights", "kind of flight", kind, flight_names())
+    load: Callable[..., Flight] = find_entry("flowgraph.flights", "kind of flight", kind)
     return load(argument, seed=seed, settings=dict(settings or {}))
 
 
 def flight_settings(spec: str) -> list[str]:
     """The settings that the loader of a kind of flight understands."""
-    load = _find("flowgraph.flights", "kind of flight", spec.partition(":")[0], flight_names())
+    load = find_entry("flowgraph.flights", "kind of flight", spec.partition(":")[0])
     module = inspect.getmodule(load)
     return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
 
