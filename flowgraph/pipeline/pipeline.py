@@ -24,6 +24,7 @@ from flowgraph.language.clock import Timing
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.symbolic import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
+from flowgraph.verbs import verb
 
 if TYPE_CHECKING:
     from flowgraph.data.result import Result
@@ -199,9 +200,8 @@ class Pipeline:
             **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress`, `passes` as in
                 `simulate`.
         """
-        from flowgraph.engines.playback import run_pipeline
-
-        return run_pipeline(self, inputs, **options)
+        result: Result = verb("Pipeline.run")(self, inputs, **options)
+        return result
 
     def totals(self) -> dict[str, int]:
         """Scalar operations of a tick in which everything fires, bytes of memory, and the longest chain."""
