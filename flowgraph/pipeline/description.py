@@ -37,7 +37,7 @@ from flowgraph.pipeline.pipeline import (
     type_of_leaves,
 )
 from flowgraph.recorder.ops import OPS, Spec, bound_attrs
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, leaves_of
 
 _TRIED = 2**24

@@ -23,8 +23,8 @@ from flowgraph.pipeline.cut import cut
 from flowgraph.pipeline.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
 from flowgraph.recorder.ops import OPS, Spec
 from flowgraph.recorder.random import Site
-from flowgraph.recorder.symbolic import Instruction, Trace
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Instruction, Trace
 from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 
 

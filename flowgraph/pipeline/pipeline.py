@@ -22,7 +22,7 @@ from flowgraph.errors import LoweringError, PipelineError, UnknownNameError, wri
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
 from flowgraph.verbs import verb
 

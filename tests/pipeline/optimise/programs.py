@@ -11,8 +11,8 @@ import numpy as np
 from flowgraph.engines.reference import TOTAL_NUMPY
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import OPS, Spec, bound_attrs
-from flowgraph.recorder.symbolic import Trace
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Trace
 
 
 def record(
