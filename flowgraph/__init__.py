@@ -56,6 +56,9 @@ _provide(
         "Graph.text": "flowgraph.drawing.text:draw_text",
         "Graph.to_networkx": "flowgraph.drawing.text:to_networkx",
         "Result.plot": "flowgraph.drawing.plot:plot_result",
+        "Pipeline.from_json": "flowgraph.pipeline.description:from_json",
+        "Pipeline.to_json": "flowgraph.pipeline.description:to_json",
+        "Pipeline.listing": "flowgraph.pipeline.listing:listing",
         "Pipeline.run": "flowgraph.engines.playback:run_pipeline",
     }
 )

@@ -260,6 +260,15 @@ def firing_order(nodes: list[Node]) -> tuple[int, ...]:
     return tuple(i for i in done if not isinstance(nodes[i], RegisterNode))
 
 
+def join_states(graph: Graph) -> set[int]:
+    """The registers that hold the state of a join: what its clock is was proven from where they start."""
+    return {
+        call.state
+        for _, call in graph.calls
+        if call.state is not None and (call.block.clock_rule or call.block.fault)
+    }
+
+
 def find_output(graph: Graph, name: str) -> Collected:
     """The collected stream of that name.
 

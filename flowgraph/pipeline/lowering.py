@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.state import join_states
 from flowgraph.errors import LoweringError
 from flowgraph.language.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source, Timing
-from flowgraph.language.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
+from flowgraph.language.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire, join_states
 from flowgraph.language.recording import StepTrace
 from flowgraph.pipeline.cut import cut
 from flowgraph.pipeline.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
