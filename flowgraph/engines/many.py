@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.series import Series
+from flowgraph.data.tape import tape
 from flowgraph.engines.python.run import Meter
 from flowgraph.engines.state import initial_registers
 from flowgraph.errors import DeclarationError, UnknownNameError

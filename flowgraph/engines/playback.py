@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Inputs, Tape, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.pipeline_inputs import cells_at_start, events_of
 from flowgraph.engines.python.run import Meter
 from flowgraph.engines.reference import Player

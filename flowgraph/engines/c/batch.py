@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.data.inputs import prepare
 from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.c.engine import Compiled, Room, State, Structs, compiled, shrunk
 from flowgraph.engines.many import Batch, Runs, initial_cells, is_shared, joined, leaf_type, of_run
 from flowgraph.engines.playback import check_faults, real_leaves

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.data.inputs import prepare
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.many import Batch, Runs, initial_cells, is_shared, of_run, one_by_one
 from flowgraph.engines.playback import check_faults, dense, real_leaves
 from flowgraph.engines.python.run import Meter
