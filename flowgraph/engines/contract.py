@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.batch import Runs
-from flowgraph.data.inputs import Inputs, Tape
+from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape
 from flowgraph.engines.options import DTYPES, Meter, RunOptions
 from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import Graph

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.batch import Batch, joined
-from flowgraph.data.inputs import Inputs, Tape, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.contract import ManyRuns, PipelineEngine
 from flowgraph.engines.options import RUNS_AT_ONCE, Meter, PerSeed, RunOptions
 from flowgraph.engines.parts import run_graph

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
+from flowgraph.data.tape import tape
 from flowgraph.engines.contract import BlockEngine
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.playback import play

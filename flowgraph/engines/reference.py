@@ -13,37 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape
+from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import Outcome, PipelineEngine, Player, real_leaves
 from flowgraph.engines.options import Meter
+from flowgraph.pipeline.evaluate import TOTAL_NUMPY
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
-from flowgraph.recorder.namespaces import NumpyNamespace
 from flowgraph.recorder.ops import OPS, bound_attrs
 from flowgraph.types import DTYPES
-
-
-class _LinearAlgebra:
-    """`numpy.linalg`, with NaN in place of an exception."""
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        function = getattr(np.linalg, name)
-
-        def total(*args: Any, **attrs: Any) -> Any:
-            try:
-                return function(*args, **attrs)
-            except np.linalg.LinAlgError:
-                return np.full_like(args[-1], np.nan)
-
-        return total if name in ("cholesky", "solve") else function
-
-
-class _TotalNumpy(NumpyNamespace):
-    linalg = _LinearAlgebra()
-
-
-TOTAL_NUMPY = _TotalNumpy()
 
 
 class Interpreter:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape
+from flowgraph.data.tape import Tape
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import DTYPES
 

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.data.inputs import prepare
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.pipeline_inputs import cells_at_start, events_of
 from flowgraph.engines.state import check_start, initial_registers, load_registers, read_tree

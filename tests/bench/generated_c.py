@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
-from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.series import Series
+from flowgraph.data.tape import tape
 from flowgraph.engines.c.library import Compiled, State
 from flowgraph.engines.contract import real_leaves
 from flowgraph.pipeline.optimise import COMPILED, DEFAULT, check_passes

@@ -16,8 +16,8 @@ from time import perf_counter
 import numpy as np
 
 from flowgraph.data.batch import Runs, joined, leaf_type
-from flowgraph.data.inputs import Tape
 from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape
 from flowgraph.engines.c.library import Compiled, Room, State, Structs, compiled, shrunk
 from flowgraph.engines.contract import ManyOutcome, ManyRuns, real_leaves
 from flowgraph.engines.options import RunOptions

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Inputs, Tape
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.tape import Tape
 from flowgraph.engines.c.batch import threaded
 from flowgraph.engines.c.compile import compiler
 from flowgraph.engines.c.harness import write_c, write_events

@@ -12,9 +12,10 @@ from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn
 
-from flowgraph.data.inputs import Inputs, batches, check_event, merged, prepare, stack
+from flowgraph.data.inputs import Inputs, check_event, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
+from flowgraph.data.tape import batches, merged, stack
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.batch import Runs
-from flowgraph.data.inputs import Tape
+from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import ManyOutcome, ManyRuns, dense, real_leaves
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick

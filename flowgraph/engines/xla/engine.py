@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape
+from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import (
     ManyOutcome,
     ManyRuns,
