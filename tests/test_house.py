@@ -1,8 +1,8 @@
 """The house: which way imports run, that none run in a circle, how long a module is, how many lie where.
 
-The rooms and their order stand once, in the layers contract of pyproject.toml, and `lint-imports` holds it. What
-is read here from the text of the modules goes further: imports by a literal string, circles of modules and of
-packages, and the reason of each import that waits inside a function.
+The rooms and their order stand once, in the layers contract of pyproject.toml, which `lint-imports` holds.
+The tests read the text of the modules and go further: imports by a literal string, circles of modules and
+of packages, and the reason of each import that waits inside a function.
 """
 
 from __future__ import annotations
@@ -303,7 +303,8 @@ def test_what_is_no_circle_passes(sources: Mapping[Path, str]) -> None:
 def unexplained(path: Path, source: str) -> list[str]:
     """The imports inside functions, but for those of the standard library, that do not say why they wait.
 
-    The reason is a comment on the line of the import, or above it or above the imports that it follows.
+    The reason is a comment on the line of an import, or above it, or of the import that it follows, or of the
+    condition that it stands under.
     """
     lines = source.splitlines()
 
@@ -320,8 +321,11 @@ def unexplained(path: Path, source: str) -> list[str]:
         first = line
         while first - 1 in starts:
             first -= 1
-        above = lines[first - 2].strip() if first > 1 else ""
-        if not comment(lines[line - 1]) and not above.startswith("#"):
+        above = lines[first - 2].strip()
+        said = [comment(text) for text in lines[first - 1 : line]]
+        if above.startswith("#") or above.partition("#")[0].rstrip().endswith(":"):
+            said.append(comment(above))
+        if not any(said):
             found.append(f"{path}:{line} imports {name}")
     return list(dict.fromkeys(found))
 
@@ -341,6 +345,10 @@ def test_imports_inside_functions_say_why(path: Path) -> None:
         ("# JAX is optional.\n    import jax\n    import jax.numpy as jnp", 0),
         ("# JAX is optional.\n    x = 1\n    import jax", 1),
         ("import json", 0),
+        ("import jax  # optional, with what follows\n    import jaxlib", 0),
+        ("if fast:  # only then\n        import jax", 0),
+        ("if fast:\n        import jax", 1),
+        ("x = 1  # one\n    import jax", 1),
         ("importlib.import_module('jax')", 1),
     ],
 )
