@@ -22,6 +22,7 @@ from flowgraph.errors import (
     MissingDependencyError,
     OutputError,
     PipelineError,
+    PluginError,
     TypeMismatchError,
     UnknownNameError,
 )
@@ -70,6 +71,7 @@ __all__ = [
     "OutputError",
     "Pipeline",
     "PipelineError",
+    "PluginError",
     "ProgressBar",
     "Report",
     "Result",
