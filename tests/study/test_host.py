@@ -128,7 +128,8 @@ def installed(monkeypatch):
             return mixed
 
     monkeypatch.setattr(
-            "_entries",
+        registry,
+        "_entries",
         lambda group: [*real(group), *([Entry()] if group == "flowgraph.graphs" else [])],
     )
 
