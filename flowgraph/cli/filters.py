@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, DataOrNone, Name, Seed, Settings, case_of, graph_of
+from flowgraph.cli.options import AsJson, Data, DataOrNone, Engine, Name, Seed, Settings, case_of, graph_of
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -32,7 +32,7 @@ from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
-from flowgraph.engines.simulate import ENGINES, simulate
+from flowgraph.engines.simulate import simulate
 from flowgraph.errors import DataError, FlowgraphError, writes
 
 
@@ -74,7 +74,7 @@ def show(
 def run(
     graph: Name,
     data: Data,
-    engine: Annotated[str, typer.Option(help=", ".join(ENGINES))] = "python",
+    engine: Engine = "python",
     dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     seed: Seed = 0,
     settings: Settings = None,

@@ -69,6 +69,7 @@ KINDS = {
     "flowgraph.graphs": "graph",
     "flowgraph.flights": "kind of flight",
     "flowgraph.benches": "bench",
+    "flowgraph.engines": "engine",
 }
 
 
@@ -117,14 +118,19 @@ def installed(group: str) -> tuple[dict[str, Any], list[PluginError]]:
     return found, failed
 
 
+def entry_names(group: str) -> list[str]:
+    """The names of all that is installed under a group."""
+    return sorted(e.name for e in _entries(group))
+
+
 def graph_names() -> list[str]:
     """The names of all installed graphs."""
-    return sorted(e.name for e in _entries("flowgraph.graphs"))
+    return entry_names("flowgraph.graphs")
 
 
 def flight_names() -> list[str]:
     """The kinds of flight that can be loaded."""
-    return sorted(e.name for e in _entries("flowgraph.flights"))
+    return entry_names("flowgraph.flights")
 
 
 def find_bench(name: str) -> Callable[..., Report]:
@@ -133,7 +139,7 @@ def find_bench(name: str) -> Callable[..., Report]:
     Raises:
         UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
     """
-    found: Callable[..., Report] = _find("flowgraph.benches", name)
+    found: Callable[..., Report] = find_entry("flowgraph.benches", name)
     return found
 
 
@@ -143,15 +149,20 @@ def find_graph(name: str) -> GraphFunction:
     Raises:
         UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
     """
-    found: GraphFunction = _find("flowgraph.graphs", name)
+    found: GraphFunction = find_entry("flowgraph.graphs", name)
     return found
 
 
-def _find(group: str, name: str) -> Any:
+def find_entry(group: str, name: str) -> Any:
+    """What is installed under a name of a group.
+
+    Raises:
+        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
+    """
     for entry in _entries(group):
         if entry.name == name:
             return _loaded(group, entry)
-    raise UnknownNameError(KINDS[group], name, [e.name for e in _entries(group)])
+    raise UnknownNameError(KINDS[group], name, entry_names(group))
 
 
 def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
@@ -163,13 +174,13 @@ def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None 
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
     """
     kind, _, argument = spec.partition(":")
-    load: Callable[..., Flight] = _find("flowgraph.flights", kind)
+    load: Callable[..., Flight] = find_entry("flowgraph.flights", kind)
     return load(argument, seed=seed, settings=dict(settings or {}))
 
 
 def flight_settings(spec: str) -> list[str]:
     """The settings that the loader of a kind of flight understands."""
-    load = _find("flowgraph.flights", spec.partition(":")[0])
+    load = find_entry("flowgraph.flights", spec.partition(":")[0])
     module = inspect.getmodule(load)
     return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
 

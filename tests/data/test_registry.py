@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from flowgraph import PluginError, UnknownNameError, find_graph, load_flight
 from flowgraph.cli import app
 from flowgraph.data.registry import KINDS, find_bench, graph_names, installed
+from flowgraph.engines.registry import find_engine, find_pipeline_engine, writers
 
 GOOD = '''
 from flowgraph import Report, Scalar, Series, Stream, graph
@@ -76,6 +77,7 @@ CAUSES = {
         ("flowgraph.graphs", find_graph),
         ("flowgraph.flights", lambda name: load_flight(f"{name}:anything")),
         ("flowgraph.benches", find_bench),
+        ("flowgraph.engines", find_engine),
     ],
 )
 def test_what_cannot_be_imported_is_an_error_of_ours(install: Install, group, find, text, cause):
@@ -121,8 +123,21 @@ def test_a_broken_package_is_named_and_the_rest_is_listed(install: Install):
     benches = invoke("bench")
     assert benches.exit_code == 0
     assert "apriltag" in benches.stdout
-    assert benches.stderr.splitlines() == expected[-1:]
+    assert benches.stderr.splitlines() == [expected[list(KINDS).index("flowgraph.benches")]]
     assert installed("flowgraph.graphs")[0].keys() == {row["graph"] for row in before["rows"]}
+
+
+def test_a_broken_engine_is_in_no_other_engines_way(install: Install):
+    before = writers()
+    install(
+        "broken-plug", {"broken_module": "1 / 0"}, {"flowgraph.engines": {"broken": "broken_module:thing"}}
+    )
+    assert writers() == before
+    with pytest.raises(UnknownNameError) as caught:
+        find_pipeline_engine("python")
+    assert caught.value.valid == ["c", "reference", "xla"]
+    with pytest.raises(PluginError):
+        find_pipeline_engine("broken")
 
 
 def test_a_command_that_needs_a_broken_package_says_so(install: Install):
@@ -138,7 +153,9 @@ def test_a_command_that_needs_a_broken_package_says_so(install: Install):
 
 @pytest.mark.parametrize(("group", "kind"), KINDS.items())
 def test_an_unknown_name_lists_what_there_is(group, kind):
-    find = {"graph": find_graph, "kind of flight": load_flight, "bench": find_bench}[kind]
+    find = {"graph": find_graph, "kind of flight": load_flight, "bench": find_bench, "engine": find_engine}[
+        kind
+    ]
     with pytest.raises(UnknownNameError, match=f"no {kind} is called 'nothing'") as caught:
         find("nothing")
     assert caught.value.valid == sorted(installed(group)[0])

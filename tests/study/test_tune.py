@@ -243,7 +243,7 @@ def test_what_fails_at_every_point_is_said_and_not_searched(monkeypatch, engine)
             "needs a C compiler", path="c", expected="cc", got="none", fix="install one"
         )
 
-    for name in ("simulate", "simulate_together"):
+    for name in ("run_graph", "simulate_together"):
         monkeypatch.setattr(trials, name, missing)
     with pytest.raises(MissingDependencyError, match="C compiler"):
         tune("ekf", NOISES[:1], [Recording("sim")], settings={"imu.rate": 50}, engine=engine, most=2)
