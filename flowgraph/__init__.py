@@ -23,6 +23,7 @@ from flowgraph.errors import (
     MissingDependencyError,
     OutputError,
     PipelineError,
+    PluginError,
     TypeMismatchError,
     UnknownNameError,
 )
@@ -92,6 +93,7 @@ __all__ = [
     "OutputError",
     "Pipeline",
     "PipelineError",
+    "PluginError",
     "ProgressBar",
     "Report",
     "Result",

@@ -64,7 +64,7 @@ def lower(
             err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:
-        from flowgraph.pipeline.costs import cost_report
+        from flowgraph.pipeline.costs import cost_report  # only a report needs it
 
         costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
         for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):

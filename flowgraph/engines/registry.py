@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flowgraph.data.registry import entry_names, find_entry
+from flowgraph.data.registry import entry_names, find_entry, installed
 from flowgraph.engines.contract import Engine, PipelineEngine
 from flowgraph.errors import DeclarationError, UnknownNameError
 
@@ -18,10 +18,10 @@ def find_engine(name: str) -> Engine:
     """The installed engine of that name.
 
     Raises:
-        UnknownNameError: listing the names that exist.
+        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
         DeclarationError: where what is installed under the name is no engine.
     """
-    found = find_entry(GROUP, "engine", name)
+    found = find_entry(GROUP, name)
     if not isinstance(found, Engine):
         raise DeclarationError(
             "what is installed under this name is no engine",
@@ -41,12 +41,15 @@ def find_pipeline_engine(name: str) -> PipelineEngine:
     """
     found = find_engine(name) if name in engine_names() else None
     if not isinstance(found, PipelineEngine):
-        valid = [n for n in engine_names() if isinstance(find_engine(n), PipelineEngine)]
-        raise UnknownNameError("engine of a pipeline", name, valid)
+        raise UnknownNameError("engine of a pipeline", name, _pipeline_engines())
     return found
 
 
 def writers() -> dict[str, PipelineEngine]:
     """The engines that write pipelines as source text, by name."""
-    found = {n: find_engine(n) for n in engine_names()}
-    return {n: e for n, e in found.items() if isinstance(e, PipelineEngine) and e.writes}
+    return {n: e for n, e in _pipeline_engines().items() if e.writes}
+
+
+def _pipeline_engines() -> dict[str, PipelineEngine]:
+    found, _ = installed(GROUP)
+    return {n: e for n, e in found.items() if isinstance(e, PipelineEngine)}

@@ -363,7 +363,7 @@ def _unit(method: str, count: int, size: int, seed: int) -> np.ndarray:
     """Points (count, size) in the unit cube; those of a Sobol sequence start alike for any count."""
     if method == "random":
         return np.random.default_rng(seed).random((count, size))
-    from scipy.stats import qmc
+    from scipy.stats import qmc  # a second that only these draws need
 
     bits = max(1, math.ceil(math.log2(count)))
     drawn = qmc.Sobol(size, scramble=True, rng=np.random.default_rng(seed)).random_base2(bits)

@@ -210,7 +210,7 @@ def _search(
         steps = np.array([(a - b).sum() for a, b in zip(ends[::2], ends[1::2], strict=True)])
         return float(found[0]), (found[1::2] - found[2::2]) / steps
 
-    from scipy import optimize
+    from scipy import optimize  # half a second that only a search needs
 
     minimize: Callable[..., Any] = optimize.minimize
     limits: dict[str, Any]
