@@ -16,8 +16,8 @@ from flowgraph.blocks.inertial.imu_calibration import (
 )
 from flowgraph.blocks.signals import Attitude
 from tests.blocks.test_datasets import course
-from tests.data import recordings
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+from tests.recordings import recordings
 
 
 @pytest.fixture(scope="module")
