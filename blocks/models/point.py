@@ -18,11 +18,10 @@ import numpy.typing as npt
 
 from flowgraph import Array, Flight, Series, Signal, block, real
 from flowgraph.blocks.geometry.rotations import to_matrix
-from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.inertial.imu import GRAVITY, reading_of
 from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.metrics.errors import interpolate_pose
-from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.errors import DataError
 
 __all__ = [

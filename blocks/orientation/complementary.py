@@ -44,7 +44,7 @@ from flowgraph.blocks.signals import (
     SpecificForce,
     Thrust,
 )
-from flowgraph.errors import DataError, DeclarationError
+from flowgraph.errors import DataError
 
 __all__ = [
     "WorldForce",
@@ -59,7 +59,6 @@ __all__ = [
     "with_parts",
     "own_density",
     "reading_deviation",
-    "check_alpha",
 ]
 
 
@@ -273,23 +272,6 @@ def own_density(flight: Flight, part: str, density: float | None) -> float:
             fix="give it as a setting, or leave the covariance out",
         )
     return float(own if density is None else density)
-
-
-def check_alpha(graph: str, *alphas: float) -> None:
-    """Refuse a share outside (0, 1].
-
-    Raises:
-        DeclarationError: for one that is.
-    """
-    for alpha in alphas:
-        if not 0.0 < alpha <= 1.0:
-            raise DeclarationError(
-                "alpha is outside (0, 1]",
-                path=graph,
-                expected="0 < alpha <= 1; 1 is the gyroscope alone",
-                got=f"{alpha!r}",
-                fix="write alpha=0.98",
-            )
 
 
 def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:

@@ -17,9 +17,9 @@ from flowgraph.blocks.models.point import (
     start_point,
     told_acceleration,
 )
+from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.signals import Position, Velocity
 from flowgraph.graphs import async_kalman, kalman
-from flowgraph.graphs.async_kalman import positions
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, thesis
 
 RUNS = 50
@@ -46,7 +46,10 @@ def start(seed: int) -> dict[str, Gaussian]:
 
 
 def inputs(seed: int) -> dict[str, Series]:
-    return {"acceleration": told_acceleration(flight(seed)), "position": positions(flight(seed))}
+    return {
+        "acceleration": told_acceleration(flight(seed)),
+        "position": positions(flight(seed).streams["vicon"]),
+    }
 
 
 @cache
