@@ -28,20 +28,13 @@ from flowgraph import (
     graph,
     latest,
 )  # fmt: skip
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.kalman.smoothing import point_steps
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
 from flowgraph.blocks.metrics.consistency import point_errors
-from flowgraph.blocks.models.point import (
-    WorldAcceleration,
-    between,
-    point_belief,
-    point_model,
-    start_point,
-    told_acceleration,
-)  # fmt: skip
+from flowgraph.blocks.models.point import between, point_belief, point_model, point_steps, start_point
 from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
-from flowgraph.blocks.signals import Position, Velocity
+from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 
 
 @graph

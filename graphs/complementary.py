@@ -33,20 +33,11 @@ from flowgraph import (
     low_pass,
 )  # fmt: skip
 from flowgraph.blocks.metrics.errors import attitude_errors
-from flowgraph.blocks.orientation.complementary import (
-    WorldForce,
-    carry_to_world,
-    check_alpha,
-    first_attitude,
-    level_near,
-    own_density,
-    reading_deviation,
-    turn_by_gyro,
-    with_parts,
-)  # fmt: skip
+from flowgraph.blocks.orientation.complementary import carry_to_world, check_alpha, level_near, turn_by_gyro
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 from flowgraph.language.checks import need_numbers
 
 

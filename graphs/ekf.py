@@ -19,16 +19,15 @@ from __future__ import annotations
 
 from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.smoothing import pose_steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import (
-    QuaternionBelief,
     between_imu,
     pose_belief,
+    pose_steps,
     predict_pose,
     start_pose,
     update_pose,
-)  # fmt: skip
+)
 from flowgraph.blocks.scoring.scorer import scorer
 from flowgraph.blocks.scoring.tuning import (
     check_settings,
@@ -38,7 +37,7 @@ from flowgraph.blocks.scoring.tuning import (
     unbiased_noise_of,
     with_imu,
 )
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 
 
 @graph

@@ -12,10 +12,10 @@ import numpy as np
 from flowgraph import Case, Flight, Result, Series
 from flowgraph.blocks.geometry.euler import need_order
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
 from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.signals import Gaussian
 from flowgraph.data.inputs import clocks_of
 from flowgraph.graphs.tag_pose import poses_of
 from flowgraph.language.checks import need_numbers

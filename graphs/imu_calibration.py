@@ -18,15 +18,13 @@ from flowgraph.blocks.inertial.imu_calibration import (
     LEAST,
     SAMPLES,
     CountsCalibration,
-    ImuCounts,
-    NormalEquations,
     collect_equations,
     solve_equations,
     sum_counts,
     window_means,
     windows_of,
 )
-from flowgraph.blocks.signals import Attitude
+from flowgraph.blocks.signals import Attitude, ImuCounts, NormalEquations
 from flowgraph.language.checks import need_numbers
 
 _NOTHING = NormalEquations(

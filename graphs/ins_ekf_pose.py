@@ -14,7 +14,6 @@ from typing import Any
 
 from flowgraph import Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     euler_angles,
     navigation_belief,
@@ -22,8 +21,7 @@ from flowgraph.blocks.models.euler_ins import (
     update_pose_angles,
 )
 from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.graphs.euler_flight import on_pose_flight
 
 

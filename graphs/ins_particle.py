@@ -17,18 +17,16 @@ from typing import Any
 from flowgraph import Case, Flight, Stream, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
-from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.particles.resampling import MOST_PARTICLES
-from flowgraph.blocks.particles.states import (
-    StateCloud,
+from flowgraph.blocks.models.particle_ins import (
     average_state,
     propagate_states,
     resample_states,
     start_states,
     weigh_states,
 )
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.euler_flight import need_settings, pose_case
 from flowgraph.language.checks import need_count, need_numbers
 

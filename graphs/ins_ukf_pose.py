@@ -17,7 +17,6 @@ import numpy as np
 
 from flowgraph import Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
@@ -27,9 +26,8 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import carried, far_points
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
-from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.graphs.euler_flight import on_pose_flight
 
 

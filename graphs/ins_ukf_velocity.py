@@ -17,7 +17,6 @@ import numpy as np
 
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -28,10 +27,9 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
-from flowgraph.blocks.vision.motion import CameraMotion
 from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.euler_flight import need_settings, noise_of, scored

@@ -25,7 +25,6 @@ from flowgraph.blocks.inertial.alignment import static_alignment
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
-    HeadingBelief,
     join_orientation,
     predict_heading,
     start_heading,
@@ -33,7 +32,6 @@ from flowgraph.blocks.orientation.heading import (
 )
 from flowgraph.blocks.orientation.marg import (
     UNIT,
-    LevelBelief,
     RestRule,
     detect_rest,
     hold_velocity,
@@ -41,7 +39,7 @@ from flowgraph.blocks.orientation.marg import (
     start_level,
 )
 from flowgraph.blocks.scoring.orientation import scored_errors
-from flowgraph.blocks.signals import Imu, MagneticField
+from flowgraph.blocks.signals import HeadingBelief, Imu, LevelBelief, MagneticField
 from flowgraph.language.checks import need_numbers
 
 _REST, _TRUST = RestRule(), FieldTrust()

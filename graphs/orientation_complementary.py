@@ -44,16 +44,13 @@ from flowgraph.blocks.orientation.complementary import (
     blend,
     carry_to_world,
     check_alpha,
-    first_attitude,
     level_near,
-    own_density,
-    reading_deviation,
     remove_thrust,
     turn_by_gyro,
-    with_parts,
 )
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.scoring.scorer import scorer
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
 from flowgraph.blocks.scoring.tuning import check_choice, noise_of
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
 from flowgraph.language.checks import need_numbers

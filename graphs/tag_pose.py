@@ -15,11 +15,11 @@ import numpy as np
 
 from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, simulate
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.signals import Pose
+from flowgraph.blocks.signals import Pose, PoseMeasurement, Tags
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.mapping import build_map, frames_of
-from flowgraph.blocks.vision.pnp import PoseMeasurement, as_measurements, find_pose, no_pose
-from flowgraph.blocks.vision.tags import TagMap, Tags
+from flowgraph.blocks.vision.pnp import as_measurements, find_pose, no_pose
+from flowgraph.blocks.vision.tags import TagMap
 from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import UnknownNameError
 from flowgraph.language.checks import need_numbers

@@ -35,7 +35,6 @@ from flowgraph import (
     latest,
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import POSE, between_imu
 from flowgraph.blocks.models.unscented_pose import (
@@ -55,7 +54,7 @@ from flowgraph.blocks.scoring.tuning import (
     unbiased_noise_of,
     with_imu,
 )
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.signals import Gaussian, Imu, Pose
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 

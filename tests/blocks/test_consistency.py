@@ -8,10 +8,9 @@ import pytest
 from flowgraph import DataError, Series
 from flowgraph.blocks import consistency as c
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.kalman.filters import Gaussian, KalmanInnovation, update_linear
+from flowgraph.blocks.kalman.filters import update_linear
 from flowgraph.blocks.metrics.chi_square import gate_table
-from flowgraph.blocks.models.point import PointBelief
-from flowgraph.blocks.signals import Innovation, NavigationState
+from flowgraph.blocks.signals import Gaussian, Innovation, KalmanInnovation, NavigationState, PointBelief
 
 RNG = np.random.default_rng(8)
 TIME = np.arange(400) * 5_000_000

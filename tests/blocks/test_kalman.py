@@ -22,21 +22,16 @@ from flowgraph import (
 )
 from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.kalman.filters import (
-    Gaussian,
-    predict_linear,
-    update_extended,
-    update_linear,
-)
+from flowgraph.blocks.kalman.filters import predict_linear, update_extended, update_linear
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.roots import (
-    GaussianRoot,
     lower_root,
     predict_root,
     semidefinite_root,
     update_extended_root,
     update_root,
 )
+from flowgraph.blocks.signals import Gaussian, GaussianRoot
 from flowgraph.language.block import When
 from tests.support import all_engines
 

@@ -12,7 +12,6 @@ from scipy.stats import multivariate_normal
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor.cloud import (
-    OutdoorCloud,
     correct_distance,
     correct_field,
     correct_flow,
@@ -20,7 +19,7 @@ from flowgraph.blocks.outdoor.cloud import (
     predict_outdoor,
     take_picture,
 )
-from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 N = 4

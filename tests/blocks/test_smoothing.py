@@ -9,9 +9,10 @@ import pytest
 
 from flowgraph import DataError, Series
 from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.smoothing import fixed_lag, rauch_tung_striebel
+from flowgraph.blocks.signals import Gaussian
 
 MODEL = LinearModel([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], np.diag([0.0, 0.5]))
 STEPS = np.random.default_rng(3).integers(5, 40, 80)  # ms: ticks need not be even

@@ -15,8 +15,9 @@ from flowgraph.blocks.geometry.rotations import (
     multiply,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_extended, update_linear
+from flowgraph.blocks.kalman.filters import predict_linear, update_extended, update_linear
 from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints, mean_turn
 from flowgraph.language.block import When

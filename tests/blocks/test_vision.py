@@ -11,20 +11,12 @@ from scipy.spatial.transform import Rotation
 from flowgraph import DataError, DeclarationError, Series, UnknownNameError
 from flowgraph.blocks.datasets.course import Motion, see
 from flowgraph.blocks.datasets.parameters import Parameters
-from flowgraph.blocks.datasets.rob6213 import MotionTruth
 from flowgraph.blocks.geometry.rotations import to_matrix
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.unscented_ins import update_camera_velocity
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, MotionTruth
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount
 from flowgraph.blocks.vision.mapping import _first_guess, _Problem, build_map
-from flowgraph.blocks.vision.motion import (
-    CameraMotion,
-    adjoint,
-    camera_velocity,
-    find_delay,
-    velocity_error,
-)
+from flowgraph.blocks.vision.motion import adjoint, camera_velocity, find_delay, velocity_error
 from flowgraph.blocks.vision.pnp import measure, quaternion_of, rotation_of, solve
 from flowgraph.blocks.vision.tags import TagMap, course_map
 

@@ -18,6 +18,7 @@ from flowgraph.blocks.geometry.euler import (
 )
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.vision.camera import Camera
+from flowgraph.blocks.vision.mapping import frames_of
 from flowgraph.blocks.vision.pnp import measure, rotation_of
 from flowgraph.errors import DataError
 
@@ -113,8 +114,6 @@ def estimate_covariances(filename: str | Path, *, parameters: str | Path | None 
 
 
 def _frames(flight: Any) -> tuple[list[int], list[Any]]:
-    from flowgraph.blocks.vision.mapping import frames_of
-
     if "tags" not in flight.streams:
         return [], []
     return flight.streams["tags"].time.tolist(), list(frames_of(flight.streams["tags"]))

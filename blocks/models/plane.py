@@ -16,53 +16,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Flight, Scalar, Series, Signal, block, real
-from flowgraph.blocks.metrics.errors import error_summary, interpolate, nees_summary, within_truth
+from flowgraph import Flight, Scalar, Series, block
 from flowgraph.blocks.particles.cloud import log_sum_exp
 from flowgraph.blocks.particles.resampling import ancestor_index
-from flowgraph.blocks.signals import Ancestors
+from flowgraph.blocks.signals import Ancestors, PlaneBelief, PlaneCloud, PlanePosition, PlaneVelocity
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 __all__ = [
-    "PlaneBelief",
-    "PlaneCloud",
-    "PlanePosition",
-    "PlaneVelocity",
     "average_plane",
     "exact",
     "move_plane",
-    "plane_errors",
     "plane_sample_size",
     "resample_plane",
     "start_plane",
     "weigh_plane",
 ]
-
-
-class PlanePosition(Signal):
-    """A position in the plane, m."""
-
-    position: Array = real(2, unit="m", frame="world")
-
-
-class PlaneVelocity(Signal):
-    """The mean velocity in the plane since the reading before, m/s."""
-
-    velocity: Array = real(2, unit="m/s", frame="world")
-
-
-class PlaneCloud(Signal):
-    """Weighted points: log_weight, whose exponentials add up to 1, and positions in m."""
-
-    log_weight: Array = real("particles")
-    position: Array = real(2, "particles", unit="m", frame="world")
-
-
-class PlaneBelief(Signal):
-    """Mean (m) and covariance (m^2) of a cloud."""
-
-    position: Array = real(2, unit="m", frame="world")
-    covariance: Array = real(2, 2)
 
 
 @block
@@ -166,22 +134,3 @@ def exact(flight: Flight, *, spread: float) -> Series:
         variances.append(p * np.eye(2))
     belief = PlaneBelief(position=np.array(means), covariance=np.array(variances))
     return Series(time, belief, name="exact")
-
-
-def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
-    """Compare `PlaneBelief`s with the truth, where it covers them and after `settle` seconds.
-
-    Returns:
-        position_rmse_m, position_mean_m, position_max_m, the `nees_summary` (2 on average in a consistent
-        filter) and compared_ticks.
-
-    Raises:
-        DataError: when no tick of the estimate lies within the truth.
-    """
-    chosen = within_truth(estimate, truth, settle)
-    error = interpolate(truth, "position", chosen.time) - chosen["position"]
-    return {
-        **{f"position_{name}_m": value for name, value in error_summary(error).items()},
-        **nees_summary(error, chosen["covariance"]),
-        "compared_ticks": float(len(chosen)),
-    }

@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Scalar, Signal, block, real
+from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     increment_variances,
@@ -32,24 +31,15 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.particles.cloud import log_sum_exp
 from flowgraph.blocks.particles.resampling import ancestor_index
-from flowgraph.blocks.signals import Ancestors, Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.signals import Ancestors, Gaussian, Imu, PoseMeasurement, StateCloud
 
 __all__ = [
-    "StateCloud",
     "average_state",
     "propagate_states",
     "resample_states",
     "start_states",
     "weigh_states",
 ]
-
-
-class StateCloud(Signal):
-    """Weighted states. log_weight: natural logarithm, the weights add up to 1. state: (p, e, v, b_g, b_a)."""
-
-    log_weight: Array = real("particles")
-    state: Array = real("particles", 15)
 
 
 @block
