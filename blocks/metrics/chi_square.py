@@ -50,7 +50,7 @@ def gate_table(gate: float, parts: int) -> np.ndarray:
     n = np.arange(1, parts + 1)
     if gate < 1.0:
         return np.r_[0.0, chi_square(gate, n)]
-    from scipy.special import gammaincc, gammainccinv  # as above
+    from scipy.special import gammaincc, gammainccinv  # slow to import, and only gates need it
 
     beyond = gammaincc(0.5 * parts, 0.5 * gate)  # 0 for what nothing exceeds: then the limit stays
     return np.r_[0.0, np.minimum(2.0 * gammainccinv(0.5 * n[:-1], beyond), gate), gate]

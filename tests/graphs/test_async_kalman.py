@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, Flight, Series, aperiodic, periodic, simulate, simulate_many
-from flowgraph.blocks.metrics.consistency import chi_square_band, inside
+from flowgraph.blocks.metrics import chi_square_band, inside
 from flowgraph.blocks.models.point import point_model, start_point
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration

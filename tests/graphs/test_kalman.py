@@ -11,7 +11,7 @@ import pytest
 from flowgraph import Case, DataError, Series, arrays, periodic, simulate
 from flowgraph.blocks.kalman.filters import predict_linear
 from flowgraph.blocks.kalman.smoothing import rauch_tung_striebel
-from flowgraph.blocks.metrics.consistency import chi_square_band, error_summary, nis_summary, state_error
+from flowgraph.blocks.metrics import chi_square_band, error_summary, nis_summary, state_error
 from flowgraph.blocks.models.point import point_model, start_point
 from flowgraph.blocks.signals import PointReading
 from flowgraph.graphs import kalman

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from flowgraph import DeclarationError, UnknownNameError
-from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.geometry.rotations import (
+from flowgraph.blocks.geometry import (
+    StateSpace,
+    angle,
+    euclidean,
     from_rotation_vector,
     geodesic_angle,
     multiply,
+    quaternion,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import predict_linear, update_extended, update_linear
-from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman import LinearModel, predict_linear, update_extended, update_linear
 from flowgraph.blocks.signals import Gaussian
-from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
-from flowgraph.blocks.unscented.sigma_points import SigmaPoints, mean_turn
+from flowgraph.blocks.unscented import SigmaPoints, mean_turn, predict_unscented, update_unscented
 from flowgraph.language.block import When
 
 DT = 0.1

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Scalar, Series, Signal, Stream, block, graph, real, simulate
-from flowgraph.blocks.particles.cloud import start_cloud
-from flowgraph.blocks.particles.resampling import SCHEMES, ancestor_index, draw_ancestors, take_ancestors
+from flowgraph.blocks.particles import SCHEMES, ancestor_index, draw_ancestors, start_cloud, take_ancestors
 from flowgraph.blocks.signals import Ancestors
 from flowgraph.errors import UnknownNameError
 from flowgraph.recorder.random import NumpyDraw, seed_words

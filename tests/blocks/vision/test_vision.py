@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from flowgraph import DataError, DeclarationError, Series, UnknownNameError
 from flowgraph.blocks.datasets.course import Motion, see
 from flowgraph.blocks.datasets.parameters import Parameters
-from flowgraph.blocks.geometry.rotations import to_matrix
+from flowgraph.blocks.geometry import to_matrix
 from flowgraph.blocks.models.unscented_ins import update_camera_velocity
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, MotionTruth
+from flowgraph.blocks.vision import TagMap, course_map
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount
 from flowgraph.blocks.vision.mapping import _first_guess, _Problem, build_map
 from flowgraph.blocks.vision.motion import adjoint, camera_velocity, find_delay, velocity_error
 from flowgraph.blocks.vision.pnp import measure, quaternion_of, rotation_of, solve
-from flowgraph.blocks.vision.tags import TagMap, course_map
 
 PINHOLE = Camera(np.array([[364.0, 0.0, 289.0], [0.0, 364.0, 290.0], [0.0, 0.0, 1.0]]))
 COURSE = Parameters.of_the_course()
@@ -262,7 +262,7 @@ def test_a_camera_velocity_corrects_the_velocity(rate):
     rng = np.random.default_rng(0)
     truth = np.concatenate([np.zeros(3), [0.1, -0.2, 0.3], [1.0, -0.5, 0.2], [0.02, 0.0, -0.01], np.zeros(3)])
     w = np.array([0.5, -1.0, 0.8])
-    from flowgraph.blocks.geometry.euler import matrix_from_angles
+    from flowgraph.blocks.geometry import matrix_from_angles
 
     R = np.asarray(matrix_from_angles(truth[3:6], order="zyx", xp=np))
     v = camera_velocity(truth[6:9], R, w, mount=COURSE_MOUNT, xp=np)

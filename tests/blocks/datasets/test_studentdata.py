@@ -15,10 +15,10 @@ from flowgraph.blocks.datasets import course, rob6213, studentdata, umd
 from flowgraph.blocks.datasets.course import simulated_content
 from flowgraph.blocks.datasets.coursework import estimate_covariances, estimate_pose
 from flowgraph.blocks.datasets.parameters import parse_parameters
+from flowgraph.blocks.vision import course_map
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT
-from flowgraph.blocks.vision.tags import course_map
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 DATA = Path(os.environ.get("FLOWGRAPH_DATA", ROOT.parent / "shared" / "datasets"))
 
 TEXT = """AprilTag map

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.outdoor.cloud import (
+from flowgraph.blocks.inertial import GRAVITY, ImuNoise
+from flowgraph.blocks.outdoor import (
     correct_distance,
     correct_field,
     correct_flow,

@@ -7,21 +7,20 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.inertial.alignment import StartSpread
-from flowgraph.blocks.inertial.calibration import subtract_rest_bias
-from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.particles.cloud import (
+from flowgraph.blocks.inertial import GRAVITY, StartSpread, subtract_rest_bias
+from flowgraph.blocks.particles import (
     attitude_likelihood,
     average_attitude,
     average_pose,
+    correct_motion,
     dominant_eigenvector,
     effective_sample_size,
+    predict_motion,
     propagate_attitude,
     reweight,
     start_cloud,
     weights,
 )
-from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.signals import Attitude, Cloud, Imu, LogLikelihood, Pose, Weights
 from flowgraph.recorder.random import NumpyDraw, seed_words
 

@@ -9,7 +9,7 @@ from flowgraph import load_flight
 from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
 from flowgraph.blocks.flights.worlds import SENSORS, TRIP
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.sensors import as_position
 from flowgraph.errors import DeclarationError, UnknownNameError
 

@@ -7,9 +7,9 @@ import pytest
 
 from flowgraph import DataError, Series
 from flowgraph.blocks import consistency as c
-from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.kalman.filters import update_linear
-from flowgraph.blocks.metrics.chi_square import gate_table
+from flowgraph.blocks.geometry import from_rotation_vector, multiply
+from flowgraph.blocks.kalman import update_linear
+from flowgraph.blocks.metrics import gate_table
 from flowgraph.blocks.signals import Gaussian, Innovation, KalmanInnovation, NavigationState, PointBelief
 
 RNG = np.random.default_rng(8)

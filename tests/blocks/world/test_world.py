@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.inertial import GRAVITY
 from flowgraph.blocks.world import (
     Hover,
     KeyPoint,

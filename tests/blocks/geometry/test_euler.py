@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from flowgraph import UnknownNameError
 from flowgraph.blocks import euler
 from flowgraph.blocks import euler_ins as ins
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
-from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented import predict_unscented
 
 SCIPY = {"zyx": ("ZYX", [2, 1, 0]), "zxy": ("ZXY", [2, 0, 1])}
 NOISE = ImuNoise(0.01, 0.1, 1e-3, 1e-2)

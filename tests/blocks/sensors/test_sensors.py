@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from flowgraph import timing_of
 from flowgraph.blocks import sensors as s
+from flowgraph.blocks.geometry import FLATTENING, SEMI_MAJOR_AXIS
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.geometry.geodetic import FLATTENING, SEMI_MAJOR_AXIS
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.world import Hover, RoundTrip, thesis_flight
 from flowgraph.errors import DeclarationError
 

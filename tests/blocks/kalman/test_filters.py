@@ -20,15 +20,16 @@ from flowgraph import (
     real,
     simulate,
 )
-from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.kalman.filters import predict_linear, update_extended, update_linear
-from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.roots import (
+from flowgraph.blocks.geometry import StateSpace, angle, euclidean, from_rotation_vector, multiply, quaternion
+from flowgraph.blocks.kalman import (
+    LinearModel,
     lower_root,
+    predict_linear,
     predict_root,
     semidefinite_root,
+    update_extended,
     update_extended_root,
+    update_linear,
     update_root,
 )
 from flowgraph.blocks.signals import Gaussian, GaussianRoot

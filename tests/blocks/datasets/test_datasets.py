@@ -396,7 +396,7 @@ def test_a_library_of_a_format_is_imported_when_it_is_needed():
 
 
 def test_euroc_leaves_out_what_was_not_measured(tmp_path):
-    from tests.blocks.test_euroc import IMU, SENSOR, START, TUM
+    from tests.blocks.datasets.test_euroc import IMU, SENSOR, START, TUM
 
     (tmp_path / "imu0").mkdir()
     (tmp_path / "imu0" / "sensor.yaml").write_text(SENSOR)

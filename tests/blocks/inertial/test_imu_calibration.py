@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, Series, find_graph, load_flight, simulate
-from flowgraph.blocks.inertial.imu_calibration import CountsCalibration, calibrated, fit_counts, windows_of
+from flowgraph.blocks.inertial import CountsCalibration, calibrated, fit_counts, windows_of
 from flowgraph.blocks.signals import Attitude, ImuCounts, Window
-from tests.blocks.test_datasets import course
+from tests.blocks.datasets.test_datasets import course
 from tests.data import recordings
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, Series
-from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
-from flowgraph.blocks.kalman.filters import predict_linear, update_linear
-from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.smoothing import fixed_lag, rauch_tung_striebel
+from flowgraph.blocks.geometry import StateSpace, angle, euclidean
+from flowgraph.blocks.kalman import LinearModel, fixed_lag, predict_linear, rauch_tung_striebel, update_linear
 from flowgraph.blocks.signals import Gaussian
 
 MODEL = LinearModel([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], np.diag([0.0, 0.5]))

@@ -10,10 +10,17 @@ import pytest
 
 from flowgraph.blocks.datasets import euroc
 from flowgraph.blocks.geometry import rotations as g
-from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
-from flowgraph.blocks.inertial.alignment import StartSpread, level_attitude, start_belief
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
-from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.inertial import (
+    GRAVITY,
+    ImuNoise,
+    StartSpread,
+    aid_attitude,
+    aid_position,
+    level_attitude,
+    predict,
+    start_belief,
+)
+from flowgraph.blocks.metrics import interpolate_pose
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position, SpecificForce
 from tests.bench import direct_eskf
 
@@ -222,7 +229,7 @@ def test_start_belief_spreads_tilt_and_heading_about_world_axes():
 
 def test_a_real_flight_stays_within_its_bounds_and_the_direct_filter_agrees():
     """30 s of a EuRoC flight: the blocks and the hand-written loop give one estimate, near the truth."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[3]
     data = Path(os.environ.get("FLOWGRAPH_DATA", root.parent / "shared" / "datasets"))
     if not (data / "euroc" / "MH_01_easy").is_dir():
         pytest.skip("the EuRoC sequence MH_01_easy is not here; set FLOWGRAPH_DATA to the folder of datasets")
