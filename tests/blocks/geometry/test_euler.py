@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flowgraph import UnknownNameError
-from flowgraph.blocks import euler
-from flowgraph.blocks import euler_ins as ins
+from flowgraph.blocks.geometry import euler
 from flowgraph.blocks.inertial import ImuNoise
+from flowgraph.blocks.models import euler_ins as ins
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented import predict_unscented

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import DataError, Series
-from flowgraph.blocks import consistency as c
+from flowgraph.blocks import metrics as c
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.kalman import update_linear
 from flowgraph.blocks.metrics import gate_table
