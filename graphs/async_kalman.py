@@ -15,25 +15,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    Stream,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.models.point import (
-    WorldAcceleration,
-    between,
-    point_belief,
-    point_model,
-    told_acceleration,
-)  # fmt: skip
+from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
-from flowgraph.blocks.signals import Position, Velocity
+from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 
 
 @graph

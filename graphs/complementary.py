@@ -20,32 +20,15 @@ group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (r
 
 from __future__ import annotations
 
-from flowgraph import (
-    Case,
-    Stream,
-    collect,
-    delay,
-    graph,
-    high_pass,
-    latest,
-    low_pass,
-)  # fmt: skip
+from flowgraph import Case, Stream, collect, delay, graph, high_pass, latest, low_pass
 from flowgraph.blocks.metrics.errors import attitude_errors
-from flowgraph.blocks.orientation.complementary import (
-    WorldForce,
-    carry_to_world,
-    first_attitude,
-    level_near,
-    own_density,
-    reading_deviation,
-    turn_by_gyro,
-    with_parts,
-)  # fmt: skip
+from flowgraph.blocks.orientation.complementary import carry_to_world, level_near, turn_by_gyro
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
-from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
 
 @graph

@@ -19,18 +19,17 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.smoothing import pose_steps
 from flowgraph.blocks.models.pose import (
-    QuaternionBelief,
     between_imu,
     pose_belief,
+    pose_steps,
     predict_pose,
     start_pose,
     update_pose,
-)  # fmt: skip
+)
 from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_capture, on_flight
 from flowgraph.blocks.scoring.tuning import with_imu
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 
 
 @graph

@@ -20,8 +20,6 @@ from flowgraph import Case, DataError, Series, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.imu_calibration import (
     SAMPLES,
     CountsCalibration,
-    ImuCounts,
-    NormalEquations,
     collect_equations,
     solve_equations,
     sum_counts,
@@ -31,7 +29,7 @@ from flowgraph.blocks.inertial.imu_calibration import (
 from flowgraph.blocks.scoring.calibration import calibration_fit
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.settings import Positive, positive
-from flowgraph.blocks.signals import Attitude
+from flowgraph.blocks.signals import Attitude, ImuCounts, NormalEquations
 
 _NOTHING = NormalEquations(
     gyro_square=np.zeros((4, 4)),

@@ -14,7 +14,6 @@ from typing import Any
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     euler_angles,
     navigation_belief,
@@ -24,8 +23,7 @@ from flowgraph.blocks.models.euler_ins import (
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.graphs.tag_pose import poses_of
 
 

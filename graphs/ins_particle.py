@@ -17,20 +17,18 @@ from typing import Any
 from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
-from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.particles.states import (
-    StateCloud,
+from flowgraph.blocks.models.particle_ins import (
     average_state,
     propagate_states,
     resample_states,
     start_states,
     weigh_states,
 )
+from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.tag_pose import poses_of
 
 _ROOM = EulerPose(gyro_factor=3.0, accelerometer_factor=3.0)

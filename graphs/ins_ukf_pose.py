@@ -17,7 +17,6 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
@@ -29,9 +28,8 @@ from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
-from flowgraph.blocks.vision.pnp import PoseMeasurement
 from flowgraph.graphs.tag_pose import poses_of
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -34,10 +33,9 @@ from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.tuning import given
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
-from flowgraph.blocks.vision.motion import CameraMotion
 
 
 @graph

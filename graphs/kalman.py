@@ -17,23 +17,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    Stream,
-    collect,
-    delay,
-    graph,
-)  # fmt: skip
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.models.point import (
-    PointReading,
-    WorldAcceleration,
-    between,
-    point_belief,
-    point_model,
-)  # fmt: skip
+from flowgraph import Case, Stream, collect, delay, graph
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, readings
+from flowgraph.blocks.signals import Gaussian, PointReading, WorldAcceleration
 
 
 @graph

@@ -25,7 +25,6 @@ from flowgraph.blocks.inertial.alignment import static_alignment
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
-    HeadingBelief,
     join_orientation,
     predict_heading,
     start_heading,
@@ -33,7 +32,6 @@ from flowgraph.blocks.orientation.heading import (
 )
 from flowgraph.blocks.orientation.marg import (
     UNIT,
-    LevelBelief,
     RestRule,
     detect_rest,
     hold_velocity,
@@ -43,7 +41,7 @@ from flowgraph.blocks.orientation.marg import (
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import counted_errors
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
-from flowgraph.blocks.signals import Imu, MagneticField
+from flowgraph.blocks.signals import HeadingBelief, Imu, LevelBelief, MagneticField
 
 _REST, _TRUST = RestRule(), FieldTrust()
 

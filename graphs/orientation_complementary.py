@@ -27,34 +27,22 @@ from typing import Annotated
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    DataError,
-    Flight,
-    Stream,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
+from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import level_attitude
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import (
     blend,
     carry_to_world,
-    first_attitude,
     level_near,
-    own_density,
-    reading_deviation,
     remove_thrust,
     turn_by_gyro,
-    with_parts,
 )
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative, one_of
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
 
 _STILL = Gyro(rate=np.zeros(3))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
-from flowgraph.blocks.kalman.filters import Gaussian, update_extended
+from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.outdoor.belief import (
@@ -34,7 +34,7 @@ from flowgraph.blocks.outdoor.belief import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
-from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
 
 @graph

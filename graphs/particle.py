@@ -10,7 +10,7 @@ the filter be compared with the exact answer.
 
 Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the particle filter; N.
 Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stand in
-`blocks/particles/plane.py`.
+`blocks/models/plane.py`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,10 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
-from flowgraph.blocks.particles.plane import (
-    PlaneCloud,
-    PlanePosition,
-    PlaneVelocity,
+from flowgraph.blocks.metrics.errors import plane_errors
+from flowgraph.blocks.models.plane import (
     average_plane,
     move_plane,
-    plane_errors,
     plane_sample_size,
     resample_plane,
     start_plane,
@@ -32,6 +29,7 @@ from flowgraph.blocks.particles.plane import (
 )
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
 
 
 @graph

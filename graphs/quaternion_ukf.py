@@ -22,7 +22,6 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -34,7 +33,7 @@ from flowgraph.blocks.orientation.accelerometer import (
 )
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 

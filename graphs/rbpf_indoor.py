@@ -15,15 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    Series,
-    Stream,
-    delay,
-    graph,
-    latest,
-    merge,
-)
+from flowgraph import Case, Series, Stream, delay, graph, latest, merge
 from flowgraph.blocks.geometry.rotations import level, to_matrix
 from flowgraph.blocks.inertial.alignment import StartSpread
 from flowgraph.blocks.inertial.calibration import subtract_rest_bias

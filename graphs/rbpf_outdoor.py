@@ -18,7 +18,6 @@ from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.outdoor.cloud import (
-    OutdoorCloud,
     as_cloud,
     correct_distance,
     correct_field,
@@ -33,7 +32,7 @@ from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.resampling import draw_ancestors
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
-from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
 
 @graph

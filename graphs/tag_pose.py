@@ -1,8 +1,7 @@
 """The pose of a body from the tags that its camera sees: the stage on the host, before any filter.
 
 Finding a pose in an image takes OpenCV, which no pipeline holds. So this graph is one of its own, run in
-Python,
-and what it gives is a source of the filters: they are lowered, and it is not. Lowering it says so.
+Python, and what it gives is a source of the filters: they are lowered, and it is not. Lowering it says so.
 
 Sources: `blocks/vision/pnp.py`; the map of tags that nobody surveyed, `blocks/vision/mapping.py`.
 """
@@ -18,11 +17,11 @@ from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive, named, positive
 from flowgraph.blocks.scoring.tuning import given
-from flowgraph.blocks.signals import Pose
+from flowgraph.blocks.signals import Pose, PoseMeasurement, Tags
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.mapping import map_of
-from flowgraph.blocks.vision.pnp import PoseMeasurement, as_measurements, find_pose, no_pose
-from flowgraph.blocks.vision.tags import TagMap, Tags
+from flowgraph.blocks.vision.pnp import as_measurements, find_pose, no_pose
+from flowgraph.blocks.vision.tags import TagMap
 
 _AT_ONCE = Scored(settle=0.0)
 

@@ -23,17 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import (
-    Array,
-    Case,
-    Stream,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
+from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.pose import POSE, between_imu
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -46,7 +37,7 @@ from flowgraph.blocks.models.unscented_pose import (
 from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_capture, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import with_imu
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.signals import Gaussian, Imu, Pose
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 

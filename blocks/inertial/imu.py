@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from flowgraph import Array, Flight, block
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     normalize,
@@ -23,12 +23,9 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
     to_matrix,
 )
-from flowgraph.blocks.signals import Belief, Imu
+from flowgraph.blocks.signals import GRAVITY, Belief, Imu
 
-__all__ = ["GRAVITY", "ImuNoise", "predict", "reading_of"]
-
-GRAVITY = (0.0, 0.0, -9.81)
-"""Gravity in the world, m/s^2: z is up."""
+__all__ = ["GRAVITY", "ImuNoise", "predict"]
 
 
 @dataclass(frozen=True)
@@ -168,8 +165,3 @@ def predict(
         accelerometer_bias=belief.accelerometer_bias,
         covariance=0.5 * (P + P.mT),
     )
-
-
-def reading_of(flight: Flight) -> str:
-    """Whether the flight's imu reads an "instant" or, oversampling, the "mean" since its last reading."""
-    return "mean" if flight.info.get("imu_oversample", 1) > 1 else "instant"

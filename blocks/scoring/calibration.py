@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import DataError, Result
-from flowgraph.blocks.inertial.imu_calibration import LEAST, CountsCalibration, Window
+from flowgraph.blocks.inertial.imu_calibration import LEAST, CountsCalibration
+from flowgraph.blocks.signals import Window
 
 __all__ = ["calibration_fit"]
 

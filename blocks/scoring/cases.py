@@ -18,13 +18,14 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from flowgraph import Case, Flight, Result, Series, clocks_of
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, reading_of
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, unbiased_factors
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
+from flowgraph.blocks.signals import GRAVITY
 from flowgraph.language.declare import GraphFunction
 
 __all__ = [
@@ -236,7 +237,7 @@ class PoseNoises(Settings):
     position_noise: Positive | None = None
     attitude_noise: Positive | None = None
 
-    def measured(self, on: OnFlight) -> dict[str, float]:
+    def measured(self, on: OnFlight) -> dict[str, Any]:
         """Both, by name: the settings, or the flight's own, or 4 mm and 0.01 rad."""
         return {
             "position_noise": on.noise("position_noise", self.position_noise, 0.004),

@@ -14,12 +14,12 @@ import numpy as np
 
 from flowgraph import Case, Result, Series
 from flowgraph.blocks.geometry.euler import ORDERS
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
 from flowgraph.blocks.scoring.cases import Factors, OnFlight, PoseAided, PoseFilter, Scored
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.signals import Gaussian
 
 __all__ = [
     "EulerFilter",

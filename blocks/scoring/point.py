@@ -12,14 +12,13 @@ from functools import partial
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Series, arrays
-from flowgraph.blocks.inertial.imu import reading_of
-from flowgraph.blocks.kalman.smoothing import point_steps
 from flowgraph.blocks.metrics.consistency import point_errors
-from flowgraph.blocks.models.point import PointReading, point_model, start_point, told_acceleration
+from flowgraph.blocks.models.point import point_model, point_steps, start_point
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of
-from flowgraph.blocks.signals import Position
+from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
+from flowgraph.blocks.signals import PointReading, Position
 
 __all__ = ["PointFilter", "on_point", "positions", "readings"]
 

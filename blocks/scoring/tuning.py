@@ -16,7 +16,7 @@ from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["WEIGHTLESS", "given", "imu_noise_of", "noise_of", "unbiased_factors", "with_imu"]
+__all__ = ["WEIGHTLESS", "given", "imu_noise_of", "noise_of", "reading_of", "unbiased_factors", "with_imu"]
 
 WEIGHTLESS = (0.0, 0.0, 0.0)
 """The gravity of a world without one, m/s^2."""
@@ -88,6 +88,11 @@ def unbiased_factors(graph: str, flight: Flight) -> tuple[float, float]:
     noise = imu_noise_of(graph, flight)
     factor = 20.0 if noise.gyro_bias or noise.accelerometer_bias else 1.0
     return factor, factor
+
+
+def reading_of(flight: Flight) -> str:
+    """Whether the flight's imu reads an "instant" or, oversampling, the "mean" since its last reading."""
+    return "mean" if flight.info.get("imu_oversample", 1) > 1 else "instant"
 
 
 def with_imu(flight: Flight) -> Flight:
