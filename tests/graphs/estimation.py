@@ -11,7 +11,7 @@ import numpy as np
 from flowgraph import Case, Flight, Graph, Result, lower, simulate
 from flowgraph.blocks.flights import simulated
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.metrics.consistency import nees, state_error
+from flowgraph.blocks.metrics import nees, state_error
 from flowgraph.engines.many import Runs
 
 THESIS = math.sqrt(0.1 / 200.0)

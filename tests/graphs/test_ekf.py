@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, DeclarationError, Flight, Series, load_flight, simulate, simulate_many
-from flowgraph.blocks import extended as x
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, rotate, to_rotation_vector
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.metrics.consistency import chi_square_band, inside, nis_summary
+from flowgraph.blocks.metrics import chi_square_band, inside, nis_summary
+from flowgraph.blocks.models import pose as x
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.graphs import ekf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis

@@ -116,7 +116,7 @@ def test_the_options_change_little(settings):
 
 def test_krafts_set_has_no_centre_and_keeps_the_covariance():
     """Points at sqrt(n), weights 1/(2 n): an identity leaves P; at sqrt(2 n) it would come out doubled."""
-    from flowgraph.blocks.kalman.filters import Gaussian
+    from flowgraph.blocks.signals import Gaussian
     from flowgraph.blocks.unscented.filters import predict_unscented
     from flowgraph.graphs.quaternion_ukf import KRAFT
 

@@ -22,7 +22,7 @@ from flowgraph import (
 from flowgraph.cli import app
 from flowgraph.study import trials
 from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
-from tests.blocks.test_datasets import course
+from tests.blocks.datasets.test_datasets import course
 from tests.recordings import recordings
 
 PERFECT: dict[str, Any] = {
