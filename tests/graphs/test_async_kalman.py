@@ -23,7 +23,7 @@ from flowgraph.blocks.models.point import point_model, start_point
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 from flowgraph.graphs import async_kalman, kalman
-from flowgraph.graphs.async_kalman import positions
+from flowgraph.blocks.scoring.point import positions
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, thesis
 
 RUNS = 50

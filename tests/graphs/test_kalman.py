@@ -15,7 +15,7 @@ from flowgraph.blocks.metrics import chi_square_band, error_summary, nis_summary
 from flowgraph.blocks.models.point import point_model, start_point
 from flowgraph.blocks.signals import PointReading
 from flowgraph.graphs import kalman
-from flowgraph.graphs.kalman import readings
+from flowgraph.blocks.scoring.point import readings
 from flowgraph.study import Study, read_table, run_study
 from tests.graphs.estimation import THESIS, engines_agree, is_lowered_and_drawn, thesis
 
