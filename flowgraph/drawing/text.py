@@ -134,7 +134,6 @@ def to_networkx(graph: Graph) -> networkx.MultiDiGraph:
     Edges: `type`, `clock` (None: held), `output` and `port` (names of the two ends), `optional`, and
     `feedback`: whether it writes what is read a tick later. Without the feedback edges there is no cycle.
     """
-    # A fifth of a second that only this needs.
     import networkx
 
     made = networkx.MultiDiGraph(name=graph.name)
