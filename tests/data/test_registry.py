@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -153,7 +154,12 @@ def test_a_command_that_needs_a_broken_package_says_so(install: Install):
 
 @pytest.mark.parametrize(("group", "kind"), KINDS.items())
 def test_an_unknown_name_lists_what_there_is(group, kind):
-    finders: dict[str, Callable[[str], Any]] = {"graph": find_graph, "kind of flight": load_flight, "bench": find_bench, "engine": find_engine}
+    finders: dict[str, Callable[[str], Any]] = {
+        "graph": find_graph,
+        "kind of flight": load_flight,
+        "bench": find_bench,
+        "engine": find_engine,
+    }
     find = finders[kind]
     with pytest.raises(UnknownNameError, match=f"no {kind} is called 'nothing'") as caught:
         find("nothing")

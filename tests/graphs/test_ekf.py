@@ -14,7 +14,7 @@ from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, 
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.metrics import chi_square_band, inside, nis_summary
 from flowgraph.blocks.models import pose as x
-from flowgraph.blocks.signals import QuaternionBelief, Imu, Pose
+from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 from flowgraph.graphs import ekf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
 
