@@ -20,10 +20,10 @@ from flowgraph import (
 )
 from flowgraph.blocks.metrics import chi_square_band, inside
 from flowgraph.blocks.models.point import point_model, start_point
+from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 from flowgraph.graphs import async_kalman, kalman
-from flowgraph.graphs.async_kalman import positions
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, thesis
 
 RUNS = 50
