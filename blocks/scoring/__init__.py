@@ -1,11 +1,11 @@
 """Scoring: what makes a case of a flight and a filter, and what a run of it is worth.
 
-`settings` lets graphs share settings that are declared once; `cases` has those of filters, and makes the
-case, as `point` does for linear filters and `euler` for those with Euler angles. `tuning` finds the noise
-that a filter is told, in its settings or in the flight; `streams` makes the streams that it asks for out of
-those that a flight has. `scorer` compares a run with the truth: errors, consistency, and the same for the
-smoothed run; `orientation` counts only the times that a recording says count, and `calibration` is of
-windows.
+`cases` makes a case of a flight, with the settings that filters share, each declared once as `settings` lets
+graphs do; `point` does so for linear filters, and `euler` for those with Euler angles. `tuning` finds the
+noise that a filter is told, in its settings or in the flight; `streams` makes the streams that it asks for
+out of those that a flight has. `scorer` compares a run with the truth: errors, consistency, and the same for
+the smoothed run; `orientation` counts only the times that a recording says count, and `calibration` how well
+one explains its windows. `settings`, `point`, `euler` and `calibration` are imported by their own names.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from flowgraph.blocks.scoring.cases import (
     on_capture,
     on_flight,
 )
-from flowgraph.blocks.scoring.orientation import scored_errors
+from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
-from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, named, one_of
 from flowgraph.blocks.scoring.streams import (
     first_attitude,
     own_density,
@@ -35,6 +34,7 @@ from flowgraph.blocks.scoring.streams import (
     with_parts,
 )
 from flowgraph.blocks.scoring.tuning import (
+    WEIGHTLESS,
     given,
     imu_noise_of,
     noise_of,
@@ -44,12 +44,10 @@ from flowgraph.blocks.scoring.tuning import (
 )
 
 __all__ = [
-    "Settings",
-    "NotNegative",
-    "Positive",
-    "count",
-    "named",
-    "one_of",
+    "settings",
+    "point",
+    "euler",
+    "calibration",
     "OnFlight",
     "on_flight",
     "on_capture",
@@ -64,6 +62,7 @@ __all__ = [
     "SmoothedPoseFilter",
     "SMOOTHED",
     "Scorer",
+    "WEIGHTLESS",
     "given",
     "imu_noise_of",
     "noise_of",
@@ -75,5 +74,7 @@ __all__ = [
     "reading_deviation",
     "told_acceleration",
     "with_parts",
+    "Share",
+    "counted_errors",
     "scored_errors",
 ]

@@ -140,27 +140,39 @@ class Spliced:
 
 
 def spliced(function: Callable[..., Any]) -> Spliced:
-    """What a function of keyword-only settings and groups of settings takes, all told."""
+    """What a function of keyword-only settings and groups of settings takes, all told.
+
+    Raises:
+        DeclarationError: where a setting is declared twice.
+    """
     kinds = typing.get_type_hints(function, include_extras=True)
-    defaults: dict[str, Any] = {}
+    found: dict[str, tuple[Any, Any, str]] = {}
     groups: dict[str, type[Settings]] = {}
     for p in inspect.signature(function).parameters.values():
         if p.kind is not p.KEYWORD_ONLY:
             continue
         kind = kinds[p.name]
+        mine = {p.name: (kind, p.default, p.name)}
         if inspect.isclass(kind) and issubclass(kind, Settings):
             groups[p.name] = kind
-            kinds.update(typing.get_type_hints(kind, include_extras=True))
+            inner = typing.get_type_hints(kind, include_extras=True)
             held = kind() if p.default is p.empty else p.default
-            defaults.update((n, getattr(held, n)) for n in kind.names())
-        else:
-            defaults[p.name] = p.default
+            mine = {n: (inner[n], getattr(held, n), p.name) for n in kind.names()}
+        for name in (n for n in mine if n in found):
+            raise DeclarationError(
+                f"setting {name!r} is declared twice",
+                path=f"{function.__module__}.{function.__qualname__}",
+                expected="each setting in one group, or beside the groups",
+                got=f"it is in {found[name][2]} and in {p.name}",
+                fix="leave it out of one, or take one group that derives from both",
+            )
+        found.update(mine)
     return Spliced(
         tuple(
-            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d, annotation=_plain(kinds[n]))
-            for n, d in defaults.items()
+            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_plain(kind))
+            for n, (kind, default, _) in found.items()
         ),
-        {n: tuple(_checks(kinds[n])) for n in defaults},
+        {n: tuple(_checks(kind)) for n, (kind, _, _) in found.items()},
         groups,
         _documented(inspect.getdoc(function) or "", groups.values()),
     )

@@ -7,6 +7,7 @@ turns out and back in its place, `Hover` stays.
 
 from __future__ import annotations
 
+from flowgraph.blocks.world import thesis
 from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
@@ -29,6 +30,7 @@ __all__ = [
     "LIMITS",
     "feasible",
     "thesis_flight",
+    "thesis",
     "RoundTrip",
     "Hover",
     "Figures",
