@@ -37,6 +37,7 @@ from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
+from flowgraph.moved import lead as _lead
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
@@ -46,6 +47,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.progress import ProgressBar
 
 
+_lead()
 _provide(
     {
         "Block.__call__": "flowgraph.language.wiring:wire",

@@ -15,3 +15,31 @@ in operations, memory, time and energy is counted on the same list (`costs`).
 
 No engine is known here: engines play what this room makes.
 """
+
+from __future__ import annotations
+
+from flowgraph.pipeline.pipeline import (
+    Cell,
+    Fault,
+    HostStage,
+    Leaf,
+    Pipeline,
+    Port,
+    RandomSite,
+    Register,
+    Stage,
+    schema,
+)
+
+__all__ = [
+    "Cell",
+    "Fault",
+    "HostStage",
+    "Leaf",
+    "Pipeline",
+    "Port",
+    "RandomSite",
+    "Register",
+    "Stage",
+    "schema",
+]

@@ -1,0 +1,5 @@
+"""`python -m flowgraph` is the command `flowgraph`."""
+
+from flowgraph.cli import main
+
+main()
