@@ -11,10 +11,9 @@ positions and attitudes, differentiated. It has no bias and knows the future a l
 shows what its measurement model is worth, not what a flight would have been. The flight's notes say so.
 
 The camera velocity is late, by about 0.07 s, and its stamps are shifted back. The world of the tags and that
-of
-the motion capture differ by a fixed shift, which no filter could find: `SHIFT` and `TURN` take one into the
-other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw leaves
-the poses as they were recorded.
+of the motion capture differ by a fixed shift, which no filter could find: `SHIFT` and `TURN` take one into
+the other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw
+leaves the poses as they were recorded.
 """
 
 from __future__ import annotations

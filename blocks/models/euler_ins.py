@@ -9,8 +9,7 @@
 
 w_m and a_m are what gyroscope and accelerometer read. G is the matrix of the rate in the body (`euler`), in
 either convention. The noises have spectral densities Q; over dt they leave increments of covariance dt Q, so
-a
-step is written in increments: of angle, d = (w_m - b_g) dt + n_g, and of velocity. The angles go to the
+a step is written in increments: of angle, d = (w_m - b_g) dt + n_g, and of velocity. The angles go to the
 middle of the step first, which makes it second order.
 
 Sources: the course's process model (Z-X-Y) and the report's eqs. 2-7 (Z-Y-X); the biases, which the course's

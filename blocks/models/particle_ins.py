@@ -2,9 +2,8 @@
 
 Each particle is a whole state. It moves with the IMU's reading and noises drawn for it, and a measured pose
 weighs it by how well it explains the pose: the bootstrap filter. Fifteen dimensions are many for particles.
-Two
-things keep a few thousand of them alive: the noise of the process is drawn larger than the IMU's, and after
-each resampling the copies are shaken apart a little (regularisation).
+Two things keep a few thousand of them alive: the noise of the process is drawn larger than the IMU's, and
+after each resampling the copies are shaken apart a little (regularisation).
 
 Sources: N. Gordon, D. Salmond and A. Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
 estimation", IEE Proc. F 140, 1993 (bootstrap filter, roughening, sec. 3); resampling: `resampling`.
