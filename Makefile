@@ -33,6 +33,7 @@ test-slow: $(VENV)/.with-test
 lint: $(VENV)/.with-test
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy $(TYPED)
 
 bench: $(VENV)/.with-bench+xla+test

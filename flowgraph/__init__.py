@@ -2,12 +2,13 @@
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
+from flowgraph.data.batch import Batch
 from flowgraph.data.export import write_tum
 from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
 from flowgraph.data.registry import Case, Report, find_graph, load_flight
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
-from flowgraph.engines.many import Batch, simulate_many
+from flowgraph.engines.many import simulate_many
 from flowgraph.engines.python.run import Run
 from flowgraph.engines.simulate import simulate
 from flowgraph.engines.state import load_state, save_state
@@ -22,6 +23,7 @@ from flowgraph.errors import (
     MissingDependencyError,
     OutputError,
     PipelineError,
+    PluginError,
     TypeMismatchError,
     UnknownNameError,
 )
@@ -38,9 +40,30 @@ from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked,
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
+from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
     from flowgraph.data.progress import ProgressBar
+
+
+_provide(
+    {
+        "Block.__call__": "flowgraph.language.wiring:wire",
+        "Stream.delay": "flowgraph.language.declare:delay",
+        "Stream.drop": "flowgraph.language.operations:drop",
+        "Stream.every": "flowgraph.language.joins:every",
+        "Stream.take_while": "flowgraph.language.operations:take_while",
+        "Stream.tap": "flowgraph.language.operations:tap",
+        "Graph.draw": "flowgraph.drawing.draw:draw",
+        "Graph.text": "flowgraph.drawing.text:draw_text",
+        "Graph.to_networkx": "flowgraph.drawing.text:to_networkx",
+        "Result.plot": "flowgraph.drawing.plot:plot_result",
+        "Pipeline.from_json": "flowgraph.pipeline.description:from_json",
+        "Pipeline.to_json": "flowgraph.pipeline.description:to_json",
+        "Pipeline.listing": "flowgraph.pipeline.listing:listing",
+        "Pipeline.run": "flowgraph.engines.playback:run_pipeline",
+    }
+)
 
 
 def __getattr__(name: str) -> object:
@@ -70,6 +93,7 @@ __all__ = [
     "OutputError",
     "Pipeline",
     "PipelineError",
+    "PluginError",
     "ProgressBar",
     "Report",
     "Result",

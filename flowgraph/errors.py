@@ -111,6 +111,13 @@ class MissingDependencyError(FlowgraphError):
     """An optional package or program is absent; says what to install."""
 
 
+class PluginError(FlowgraphError):
+    """What an installed package offers cannot be imported; names it, its package and why.
+
+    What went wrong there is its `__cause__`.
+    """
+
+
 @contextmanager
 def naming_lines() -> Iterator[None]:
     """What is refused while a declaration runs gets the line of it that asked, the innermost of the user's.

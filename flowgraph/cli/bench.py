@@ -13,6 +13,7 @@ from flowgraph.cli.terminal import (
     err_console,
     first_line,
     make_ready,
+    offered,
     out_console,
     print_json,
     print_whole,
@@ -20,7 +21,7 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
-from flowgraph.data.registry import bench_names, find_bench, parsed_settings, setting_names
+from flowgraph.data.registry import find_bench, parsed_settings, setting_names
 from flowgraph.errors import UnknownNameError
 
 
@@ -40,7 +41,8 @@ def bench(
 ) -> None:
     """Run an experiment over many filters or flights and print its table."""
     if name is None:
-        rows = [{"bench": n, "what": first_line(find_bench(n).__doc__ or "")} for n in bench_names()]
+        found = offered("flowgraph.benches")
+        rows = [{"bench": n, "what": first_line(b.__doc__ or "")} for n, b in found.items()]
         return print_json({"rows": rows}) if as_json else out_console.print(table(rows))
     if out is not None:
         make_ready(out)

@@ -13,11 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, DataOrNone, Name, Seed, Settings, case_of, graph_of
+from flowgraph.cli.options import AsJson, Data, DataOrNone, Engine, Name, Seed, Settings, case_of, graph_of
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
     make_ready,
+    offered,
     out_console,
     print_json,
     reports_errors,
@@ -28,22 +29,24 @@ from flowgraph.cli.terminal import (
 )
 from flowgraph.data.export import write_tum
 from flowgraph.data.progress import ProgressBar
-from flowgraph.data.registry import Case, find_graph, flight_names, graph_names
+from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
-from flowgraph.engines.simulate import ENGINES, simulate
+from flowgraph.engines.simulate import simulate
 from flowgraph.errors import DataError, FlowgraphError, writes
 
 
 @app.command("list")
 @reports_errors
 def list_(as_json: AsJson = False) -> None:
-    """List the graphs, with a line each."""
-    rows = [{"graph": n, "what": first_line(find_graph(n).__doc__ or "")} for n in graph_names()]
+    """List the graphs, with a line each, and name what is installed and cannot be imported."""
+    offers = {group: offered(group) for group in KINDS}
+    rows = [{"graph": n, "what": first_line(g.__doc__ or "")} for n, g in offers["flowgraph.graphs"].items()]
+    data = list(offers["flowgraph.flights"])
     if as_json:
-        return print_json({"rows": rows, "data": flight_names()})
+        return print_json({"rows": rows, "data": data})
     out_console.print(table(rows))
-    out_console.print(f"data: {', '.join(flight_names())}")
+    out_console.print(f"data: {', '.join(data)}")
 
 
 @app.command()
@@ -71,7 +74,7 @@ def show(
 def run(
     graph: Name,
     data: Data,
-    engine: Annotated[str, typer.Option(help=", ".join(ENGINES))] = "python",
+    engine: Engine = "python",
     dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     seed: Seed = 0,
     settings: Settings = None,
@@ -155,6 +158,7 @@ def _recorded(case: Case) -> list[Series]:
 
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
+    # The other commands start without the plots.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
     from flowgraph.drawing.trajectory import plot_space

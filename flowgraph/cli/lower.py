@@ -10,13 +10,12 @@ import typer
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, graph_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
+from flowgraph.engines.registry import writers
 from flowgraph.errors import UnknownNameError
+from flowgraph.language.block import NUMBERS
 from flowgraph.pipeline.lowering import lower as lower_graph
-from flowgraph.pipeline.optimise import COMPILED, DEFAULT, PASSES
+from flowgraph.pipeline.optimise import DEFAULT, PASSES
 from flowgraph.pipeline.optimise import without as passes_without
-
-TARGETS = ("description", "c")
-"""What can be written."""
 
 
 @app.command()
@@ -45,25 +44,27 @@ def lower(
     as_json: AsJson = False,
 ) -> None:
     """Lower a graph to a fixed-size pipeline description, or to C as well."""
-    kinds = ("float64", "float32") if target == "c" else ("float64", "float32", "fixed")
-    for what, given, valid in (("target", target, TARGETS), ("dtype", dtype, kinds)):
+    writing_engines = writers()
+    engine = writing_engines.get(target)
+    kinds = NUMBERS if engine is None else engine.dtypes
+    for what, given, valid in (
+        ("target", target, ("description", *writing_engines)), ("dtype", dtype, kinds),
+    ):  # fmt: skip
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
-    passes = passes_without(*(without or ()), passes=COMPILED if target == "c" else DEFAULT)
+    passes = passes_without(*(without or ()), passes=DEFAULT if engine is None else engine.passes)
     built, inputs = graph_of(graph, data, settings, seed)
     pipeline = lower_graph(built, dtype=dtype)
     pipeline.save(output)
-    if target == "c":
-        from flowgraph.engines.c import write_c, write_events
-
-        for file in write_c(pipeline, output, dtype, passes=passes).values():
+    if engine is not None:
+        for file in engine.write(pipeline, output, dtype, passes).values():
             err_console.print(f"wrote {file}", markup=False)
         if events is not None:
-            ticks = write_events(pipeline, inputs, events)
+            ticks = engine.write_events(pipeline, inputs, events)
             err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:
-        from flowgraph.pipeline.costs import cost_report
+        from flowgraph.pipeline.costs import cost_report  # only a report needs it
 
         costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
         for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):

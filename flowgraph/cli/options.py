@@ -11,6 +11,7 @@ import typer
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.data.series import Flight
+from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
@@ -42,6 +43,7 @@ Settings = Annotated[
 Seed = Annotated[
     int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
 ]
+Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 

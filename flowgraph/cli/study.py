@@ -46,6 +46,7 @@ def batch(
     """
     from dataclasses import replace
 
+    # Here and below: worker pools and tables take a fifth of a second, which `flowgraph list` need not pay.
     from flowgraph.study import Study, run_study
 
     study = Study.load(file)
@@ -70,7 +71,7 @@ def batch(
     finally:
         getattr(watcher, "stop", lambda: None)()
     if as_json:
-        from flowgraph.study.progress import summary
+        from flowgraph.study.progress import summary  # slow to import
 
         print_json(summary(outcome))
     elif not json_lines:
@@ -101,7 +102,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write what a study found as an HTML page and pictures, or compare two studies."""
-    from flowgraph.study.report import write_comparison, write_report
+    from flowgraph.study.report import write_comparison, write_report  # slow to import
 
     if (folder is None) == (compare is None):
         raise DeclarationError(
@@ -129,7 +130,7 @@ def _short(value: Any) -> Any:
 
 def _executor(name: str, scheduler: str | None, workers: int) -> Any:
     """The executor asked for; None leaves the choice to the number of workers."""
-    from flowgraph.study import InProcess, OnDask, ProcessPool
+    from flowgraph.study import InProcess, OnDask, ProcessPool  # slow to import
 
     if name not in EXECUTORS:
         raise UnknownNameError("executor", name, EXECUTORS)
@@ -139,7 +140,7 @@ def _executor(name: str, scheduler: str | None, workers: int) -> Any:
 
 
 def _watcher(study: Any, *, quiet: bool, json_lines: bool) -> Any:
-    from flowgraph.study.progress import JsonLines, Lines, LiveTable, Tally
+    from flowgraph.study.progress import JsonLines, Lines, LiveTable, Tally  # slow to import
 
     if json_lines:
         return JsonLines(study, sys.stdout)
@@ -149,7 +150,7 @@ def _watcher(study: Any, *, quiet: bool, json_lines: bool) -> Any:
 
 
 def _show(outcome: Any, study: Any, quiet: bool) -> None:
-    from flowgraph.study.statistics import summarised
+    from flowgraph.study.statistics import summarised  # slow to import
 
     if not quiet and outcome.rows:
         print_whole(table(summarised(outcome.rows, study.names(), study.metrics, most=4)))

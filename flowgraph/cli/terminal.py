@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flowgraph.data.registry import installed
 from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError, writes
 
 out_console = Console(soft_wrap=True)
@@ -52,6 +53,16 @@ def reports_errors(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
 
     return run
+
+
+def offered(group: str) -> dict[str, Any]:
+    """What installed packages offer in a group, by name; what cannot be imported is named with its reason."""
+    found, failed = installed(group)
+    for error in failed:
+        err_console.print(
+            f"warning: {error.path}: {error.message}: {error.expected}: {error.got}", markup=False
+        )
+    return found
 
 
 def make_ready(folder: Path) -> None:

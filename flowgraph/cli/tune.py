@@ -58,6 +58,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Find noise parameters that suit recordings best, and judge them by recordings held out."""
+    # A fifth of a second, with worker pools, that `list` need not pay.
     from flowgraph.study.tune import Fit, Recording
     from flowgraph.study.tune import tune as search
 

@@ -1,18 +1,15 @@
-"""What goes into a run: events of each source, checked against its declared clock, merged into ticks.
+"""What goes into a run: events of each source, checked against its declared clock.
 
 A source is given as a `Series`, as a pair `(times, values)` of arrays, or as any iterable of
-`(time, value)` pairs, read lazily. All events of one time form one tick. Nothing is repaired in silence:
-stamps out of order, two events of one source at one time, values that are not finite, and stamps that do
-not keep to the declared clock are refused unless the source names a rule.
+`(time, value)` pairs, read lazily. Nothing is repaired in silence: stamps out of order, two events of one
+source at one time, values that are not finite, and stamps that do not keep to the declared clock are refused
+unless the source names a rule.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +19,7 @@ from flowgraph.data.series import Flight, Series
 from flowgraph.errors import ClockError, DataError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.language.graph import NEVER, Graph
-from flowgraph.types import DTYPES, StructType, Type, as_value, check_fits, flatten, leaves_of, unflatten
+from flowgraph.types import StructType, Type, as_value, check_fits, flatten
 
 Inputs = Flight | Mapping[str, Any]
 
@@ -98,41 +95,6 @@ def _broken_rows(series: Series) -> np.ndarray:
             wrong = np.isinf(leaf) if series.gaps else ~np.isfinite(leaf)
             broken |= wrong.any(axis=tuple(range(1, leaf.ndim)))
     return broken
-
-
-@dataclass(frozen=True)
-class Tape:
-    """Ticks of recorded sources: `time[i]` in ns, and `key[i]` with bit k set where source k is present."""
-
-    time: np.ndarray
-    key: np.ndarray
-    series: tuple[Series, ...]
-
-    @classmethod
-    def of(cls, series: tuple[Series, ...]) -> Tape:
-        """The ticks of series that are each in order: their times merged, equal ones made one."""
-        time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [None if len(s) == len(time) else np.searchsorted(time, s.time) for s in series]
-        if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
-            time = np.concatenate([s.time for s in series])
-            time.sort(kind="stable")  # merges runs that are sorted already
-            time = time[np.concatenate([[True], time[1:] != time[:-1]])]
-            rows = [np.searchsorted(time, s.time) for s in series]
-        key = np.zeros(len(time), np.int64)
-        for k, r in enumerate(rows):
-            key[... if r is None else r] |= 1 << k
-        return cls(time, key, series)
-
-    @property
-    def patterns(self) -> tuple[int, ...]:
-        """The keys that occur, in order."""
-        few = len(self.series) <= 16
-        return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
-
-
-def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
-    """`time[rows]`; all of it without rows, and the last where a row is past the end."""
-    return time if rows is None else time.take(rows, mode="clip")
 
 
 def need_inputs(graph: Graph, inputs: object) -> None:
@@ -345,95 +307,3 @@ def _events(
         before, value = check_event(name, event[0], event[1], type_, timing, before)
         _check_after(name, before, resumed)
         yield before, value
-
-
-def tape(
-    prepared: Mapping[str, Series | Iterator[tuple[int, Any]]], graph: Graph, *, like: Tape | None = None
-) -> Tape:
-    """All events as a tape; iterables are read to their end first.
-
-    With `like`, a tape of the same graph, its arrays of ticks are taken where all times are the same.
-    """
-    series = tuple(
-        s if isinstance(s, Series) else read_all(name, s, graph.sources[name].type)
-        for name, s in prepared.items()
-    )
-    if like is not None and all(
-        s.time is other.time or np.array_equal(s.time, other.time)
-        for s, other in zip(series, like.series, strict=True)
-    ):
-        return Tape(like.time, like.key, series)
-    return Tape.of(series)
-
-
-def read_all(name: str, events: Iterable[tuple[int, Any]], type_: Type) -> Series:
-    """A series from an iterable of (time, value)."""
-    return stack(*_columns(events), type_, name)
-
-
-def _columns(events: Iterable[tuple[int, Any]]) -> tuple[list[int], list[Any]]:
-    pairs = list(events)
-    return [t for t, _ in pairs], [v for _, v in pairs]
-
-
-def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series:
-    """A series from times and single values."""
-    leaves = leaves_of(type_)
-    if len(leaves) == 1 and not isinstance(type_, StructType):
-        columns: Iterable[Any] = [values]
-    elif (
-        values
-        and isinstance(type_, StructType)
-        and all(not isinstance(t, StructType) for _, t in type_.fields)
-    ):
-        getter: Callable[[Any, str], Any] = (
-            getattr if type_.cls not in (tuple, dict) else lambda v, n: v[int(n) if type_.cls is tuple else n]
-        )
-        columns = [[getter(v, n) for v in values] for n, _ in type_.fields]
-    else:
-        columns = [list(c) for c in zip(*(flatten(v, type_) for v in values), strict=True)] or [
-            [] for _ in leaves
-        ]
-    made: list[np.ndarray] = [
-        np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
-        for column, (_, leaf) in zip(columns, leaves, strict=True)
-    ]
-    return Series(np.asarray(times, dtype=np.int64), unflatten(type_, iter(made)), type=type_, name=name)
-
-
-def merged(
-    prepared: Mapping[str, Series | Iterator[tuple[int, Any]]],
-) -> tuple[Iterator[tuple[int, int]], list[Callable[[], Any]]]:
-    """Ticks `(time, key)` in order, and for each source a function that gives its next value.
-
-    Recorded series are merged at once with array operations; an iterable is read one event ahead.
-    """
-    if all(isinstance(s, Series) for s in prepared.values()):
-        recorded = [s for s in prepared.values() if isinstance(s, Series)]
-        ticks_ = Tape.of(tuple(recorded))
-        return (
-            zip(ticks_.time.tolist(), ticks_.key.tolist(), strict=True),
-            [iter(s).__next__ for s in recorded],
-        )
-    feeds = [zip(s.time.tolist(), s, strict=True) if isinstance(s, Series) else s for s in prepared.values()]
-    waiting: list[deque[Any]] = [deque() for _ in feeds]  # ticks may be read ahead of the values
-
-    def ticks() -> Iterator[tuple[int, int]]:
-        heads = [next(f, None) for f in feeds]
-        while any(h is not None for h in heads):
-            now = min(h[0] for h in heads if h is not None)
-            key = 0
-            for k, head in enumerate(heads):
-                if head is not None and head[0] == now:
-                    key |= 1 << k
-                    waiting[k].append(head[1])
-            yield now, key
-            heads = [next(feeds[k], None) if key >> k & 1 else h for k, h in enumerate(heads)]
-
-    return ticks(), [queue.popleft for queue in waiting]
-
-
-def batches(ticks: Iterator[tuple[int, int]], size: int) -> Iterator[list[tuple[int, int]]]:
-    """Ticks in lists of at most `size`."""
-    while batch := list(itertools.islice(ticks, size)):
-        yield batch

@@ -3,7 +3,8 @@
 A package offers a graph under the entry point group `flowgraph.graphs` (a `@graph` function with
 `on_flight`), a source of flights under `flowgraph.flights` (a function `load(argument, *, seed, settings)`),
 and an experiment under `flowgraph.benches` (a function of keyword settings that returns a `Report`). Ours are
-found the same way as a user's.
+found the same way as a user's. What cannot be imported is a `PluginError` to those who ask for it, and
+stands in nobody else's way.
 """
 
 from __future__ import annotations
@@ -21,13 +22,12 @@ from typing import Any
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
+from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
 
 if typing.TYPE_CHECKING:
     from importlib.metadata import EntryPoint
-
-    from flowgraph.language.declare import GraphFunction
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,15 @@ class Report:
     notes: tuple[str, ...] = ()
 
 
+# What packages offer, by the group of their entry points.
+KINDS = {
+    "flowgraph.graphs": "graph",
+    "flowgraph.flights": "kind of flight",
+    "flowgraph.benches": "bench",
+    "flowgraph.engines": "engine",
+}
+
+
 @functools.lru_cache(maxsize=8)
 def _entries_along(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     from importlib.metadata import entry_points  # slow to import, and only needed to look names up
@@ -75,28 +84,61 @@ def _entries(group: str) -> tuple[EntryPoint, ...]:
     return _entries_along(group, tuple(sys.path))
 
 
+def _loaded(group: str, entry: EntryPoint) -> Any:
+    """What an entry point names.
+
+    Raises:
+        PluginError: if it cannot be imported, for whatever reason.
+    """
+    try:
+        return entry.load()
+    except (Exception, SystemExit) as error:  # a package of somebody else's: anything may happen there
+        package = entry.dist.name if entry.dist else "its package"
+        raise PluginError(
+            f"this {KINDS[group]} cannot be loaded",
+            path=entry.name,
+            expected=f"{entry.value} of {package}",
+            got=" ".join(f"{type(error).__name__}: {error}".split()),
+            fix=f"mend {package}, or uninstall it",
+        ) from error
+
+
+def installed(group: str) -> tuple[dict[str, Any], list[PluginError]]:
+    """All that packages offer in a group, by name, and an error for each thing that cannot be imported."""
+    found: dict[str, Any] = {}
+    failed: list[PluginError] = []
+    for entry in sorted(_entries(group), key=lambda e: e.name):
+        if entry.name in found:
+            continue  # the first of a name is the one that is found by it
+        try:
+            found[entry.name] = _loaded(group, entry)
+        except PluginError as error:
+            failed.append(error)
+    return found, failed
+
+
+def entry_names(group: str) -> list[str]:
+    """The names of all that is installed under a group."""
+    return sorted(e.name for e in _entries(group))
+
+
 def graph_names() -> list[str]:
     """The names of all installed graphs."""
-    return sorted(e.name for e in _entries("flowgraph.graphs"))
+    return entry_names("flowgraph.graphs")
 
 
 def flight_names() -> list[str]:
     """The kinds of flight that can be loaded."""
-    return sorted(e.name for e in _entries("flowgraph.flights"))
-
-
-def bench_names() -> list[str]:
-    """The names of all installed experiments."""
-    return sorted(e.name for e in _entries("flowgraph.benches"))
+    return entry_names("flowgraph.flights")
 
 
 def find_bench(name: str) -> Callable[..., Report]:
     """The installed experiment of that name.
 
     Raises:
-        UnknownNameError: listing the names that exist.
+        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
     """
-    found: Callable[..., Report] = _find("flowgraph.benches", "bench", name, bench_names())
+    found: Callable[..., Report] = find_entry("flowgraph.benches", name)
     return found
 
 
@@ -104,17 +146,22 @@ def find_graph(name: str) -> GraphFunction:
     """The installed graph of that name.
 
     Raises:
-        UnknownNameError: listing the names that exist.
+        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
     """
-    found: GraphFunction = _find("flowgraph.graphs", "graph", name, graph_names())
+    found: GraphFunction = find_entry("flowgraph.graphs", name)
     return found
 
 
-def _find(group: str, kind: str, name: str, valid: list[str]) -> Any:
+def find_entry(group: str, name: str) -> Any:
+    """What is installed under a name of a group.
+
+    Raises:
+        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
+    """
     for entry in _entries(group):
         if entry.name == name:
-            return entry.load()
-    raise UnknownNameError(kind, name, valid)
+            return _loaded(group, entry)
+    raise UnknownNameError(KINDS[group], name, entry_names(group))
 
 
 def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
@@ -122,16 +169,17 @@ def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None 
 
     Raises:
         UnknownNameError: for a kind that is not installed, or a setting that it does not have.
+        PluginError: for a kind whose package cannot be imported.
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
     """
     kind, _, argument = spec.partition(":")
-    load: Callable[..., Flight] = _find("flowgraph.flights", "kind of flight", kind, flight_names())
+    load: Callable[..., Flight] = find_entry("flowgraph.flights", kind)
     return load(argument, seed=seed, settings=dict(settings or {}))
 
 
 def flight_settings(spec: str) -> list[str]:
     """The settings that the loader of a kind of flight understands."""
-    load = _find("flowgraph.flights", "kind of flight", spec.partition(":")[0], flight_names())
+    load = find_entry("flowgraph.flights", spec.partition(":")[0])
     module = inspect.getmodule(load)
     return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.export import to_xarray
 from flowgraph.data.series import Series
 from flowgraph.errors import UnknownNameError
 from flowgraph.language.graph import Graph
+from flowgraph.verbs import verb
 
 
 def statistics(graph: Graph, state: Mapping[str, Any]) -> dict[str, int]:
@@ -62,14 +64,10 @@ class Result:
 
     def plot(self, file: str | Path | None = None, *, outputs: list[str] | None = None) -> Any:
         """A matplotlib figure with a panel a field; written to `file` if given."""
-        from flowgraph.drawing.plot import plot_result
-
-        return plot_result(self, file, outputs=outputs)
+        return verb("Result.plot")(self, file, outputs=outputs)
 
     def to_xarray(self) -> Any:
         """An `xarray.DataTree` with a dataset a stream; see `flowgraph.data.export`. Needs xarray."""
-        from flowgraph.data.export import to_xarray
-
         return to_xarray(self)
 
     def __repr__(self) -> str:

@@ -1,103 +1,35 @@
-"""Many runs of one graph at once: a leading batch of runs, in chunks of fixed size.
-
-In XLA a chunk of runs goes through one compiled scan under `vmap`, in C each run on one of several threads;
-the other engines run them one by one.
-The size of a chunk is fixed and the last one is filled up, so memory is bounded and the result of a run does
-not depend on how many others are asked for.
-"""
+"""Many runs of one graph: together where the engine takes many at once, else one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.batch import Batch, joined
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.series import Series
-from flowgraph.engines.python.run import Meter
-from flowgraph.engines.state import initial_registers
+from flowgraph.data.tape import Tape, tape
+from flowgraph.engines.contract import ManyRuns, PipelineEngine
+from flowgraph.engines.options import RUNS_AT_ONCE, Meter, PerSeed, RunOptions
+from flowgraph.engines.parts import run_graph
+from flowgraph.engines.playback import check_faults, chosen_passes
+from flowgraph.engines.registry import find_engine
+from flowgraph.engines.subject import LoweredGraph
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.lowering import lower
+from flowgraph.pipeline.optimise import RELYING, without
 from flowgraph.recorder.random import seed_words
-from flowgraph.types import ArrayType, StructType, dtype_name, flatten, leaves_of
+from flowgraph.types import leaves_of
 
-RUNS_AT_ONCE = 64
-
-
-@dataclass(frozen=True)
-class Runs:
-    """One collected stream of many runs.
-
-    Args:
-        name: of the stream.
-        time: (n,) int64 ns, the same in all runs.
-        present: (runs, n): whether the stream was present; all true unless its clock depends on data.
-        leaves: by dotted name, (runs, n, ...), in XLA and C of the `dtype` that was asked for; zero where
-            absent. Also attributes and items.
-    """
-
-    name: str
-    time: np.ndarray
-    present: np.ndarray
-    leaves: Mapping[str, np.ndarray]
-
-    def __getitem__(self, leaf: str) -> np.ndarray:
-        if leaf not in self.leaves:
-            raise UnknownNameError("field", leaf, self.leaves, path=self.name)
-        return self.leaves[leaf]
-
-    def __getattr__(self, leaf: str) -> np.ndarray:
-        if leaf.startswith("_") or "leaves" not in self.__dict__:
-            raise AttributeError(leaf)
-        try:
-            return self[leaf]
-        except UnknownNameError as error:
-            raise AttributeError(str(error)) from None
-
-    def run(self, index: int) -> Series:
-        """One run's stream, as a single run gives it (of the fields that were kept)."""
-        at = self.present[index]
-        fields = {n: a[index][at] for n, a in self.leaves.items()}
-        if list(fields) == ["value"]:
-            return Series(self.time[at], fields["value"], name=self.name)
-        type_ = StructType(self.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
-        return Series(self.time[at], fields, type=type_, name=self.name)
-
-
-@dataclass(frozen=True)
-class Batch:
-    """The outcome of many runs: `batch["pose"].position` is (runs, n, 3).
-
-    Args:
-        graph, engine: names.
-        seeds: of the runs, in the order asked for.
-        series: the collected streams by name.
-        ticks: of one run.
-        wall_s: seconds spent in the engine's loop, without set-up.
-    """
-
-    graph: str
-    engine: str
-    seeds: tuple[int, ...]
-    series: Mapping[str, Runs]
-    ticks: int
-    wall_s: float
-
-    def __getitem__(self, name: str) -> Runs:
-        if name not in self.series:
-            raise UnknownNameError("output", name, self.series, path=self.graph)
-        return self.series[name]
-
-
-PerSeed = Callable[[int], Any]
+ManyInputs = Inputs | PerSeed | Sequence[Inputs]
 
 
 def simulate_many(
     graph: Graph,
-    inputs: Inputs | PerSeed | Sequence[Inputs],
+    inputs: ManyInputs,
     seeds: Sequence[int],
     *,
     engine: str = "xla",
@@ -118,7 +50,8 @@ def simulate_many(
         engine, dtype: as for `simulate`.
         init: other initial values, shared or a function of the seed, or a list, one a run.
         keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out.
-        runs_at_once: size of a chunk of runs in XLA.
+        runs_at_once: size of a chunk of runs in XLA. It is fixed, and the last chunk is filled up, so memory
+            is bounded and the result of a run does not depend on how many others are asked for.
         progress: told the number of finished runs.
         passes: of the optimiser, as for `simulate`.
 
@@ -126,7 +59,35 @@ def simulate_many(
         DeclarationError: without a seed, or where one is none; for a list that is not one a run.
         DataError: where, in XLA, two runs have events at different times.
     """
-    kept = _kept(graph, keep)
+    options = RunOptions(
+        engine=engine, dtype=dtype, init=init, keep=keep, runs_at_once=runs_at_once, progress=progress,
+        passes=passes,
+    )  # fmt: skip
+    return run_many(graph, inputs, seeds, options)
+
+
+def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: RunOptions) -> Batch:
+    """Run a graph once for each seed, as the options ask; see `simulate_many`."""
+    keep = _kept(graph, options.keep)
+    seeds = _checked_seeds(graph, inputs, seeds, options)
+    engine = find_engine(options.engine)
+    engine.check(options)
+    if not engine.takes_many or lower(graph, dtype=options.dtype).host:  # the host has its part in every run
+        return _one_by_one(graph, inputs, seeds, keep, options)
+    assert isinstance(engine, PipelineEngine)
+    engine.need()
+    runs = _together(graph, inputs, seeds, keep, options)
+    passes = chosen_passes(engine, options)
+    if options.init is not None:
+        passes = without(*RELYING, passes=passes)  # they rely on the values at reset
+    if not len(runs.first.time):  # nothing to make ready for
+        return _one_by_one(graph, inputs, seeds, keep, options)
+    found = engine.play_many(runs, passes, options)
+    series = {name: found.series[name] for name in keep}
+    return Batch(graph.name, options.engine, seeds, series, found.ticks, found.wall_s)
+
+
+def _checked_seeds(graph: Graph, inputs: Any, seeds: Any, options: RunOptions) -> tuple[int, ...]:
     try:
         seeds = tuple(seeds)
     except TypeError:
@@ -141,7 +102,7 @@ def simulate_many(
         )
     for seed in seeds:
         seed_words(seed)
-    for name, given in (("inputs", inputs), ("init", init)):
+    for name, given in (("inputs", inputs), ("init", options.init)):
         if isinstance(given, list | tuple) and len(given) != len(seeds):
             raise DeclarationError(
                 f"the list of {name} is not one a run",
@@ -150,27 +111,16 @@ def simulate_many(
                 got=str(len(given)),
                 fix="give one for each seed, or one for all, not in a list",
             )
-    if isinstance(runs_at_once, bool) or not isinstance(runs_at_once, int) or runs_at_once < 1:
+    size = options.runs_at_once
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
         raise DeclarationError(
             "runs go in chunks of a positive size",
             path=f"{graph.name}, runs_at_once",
             expected="a whole number from 1",
-            got=repr(runs_at_once),
+            got=repr(size),
             fix=f"leave it out for {RUNS_AT_ONCE}",
         )
-    if dtype not in ("float64", "float32"):
-        raise UnknownNameError("dtype", dtype, ("float64", "float32"))
-    if engine in ("xla", "c") and lower(graph, dtype=dtype).host:  # the host has its part in every run
-        return one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
-    if engine == "xla":
-        from flowgraph.engines.xla.batch import vectorised
-
-        return vectorised(graph, inputs, tuple(seeds), dtype, init, kept, runs_at_once, progress, passes)
-    if engine == "c":
-        from flowgraph.engines.c.batch import threaded
-
-        return threaded(graph, inputs, tuple(seeds), dtype, init, kept, progress, passes)
-    return one_by_one(graph, inputs, tuple(seeds), engine, dtype, init, kept, progress, passes)
+    return tuple(seeds)
 
 
 def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
@@ -189,65 +139,56 @@ def _kept(graph: Graph, keep: Sequence[str] | None) -> dict[str, list[str]]:
     return found
 
 
-def of_run(given: Any, run: int, seed: int) -> Any:
+def _of_run(given: Any, run: int, seed: int) -> Any:
     """Inputs or initial values of the run of that place and seed."""
     if isinstance(given, list | tuple):
         return given[run]
     return given(seed) if callable(given) else given
 
 
-def is_shared(inputs: Any) -> bool:
-    return not (callable(inputs) or isinstance(inputs, list | tuple))
+def _is_shared(given: Any) -> bool:
+    return not (callable(given) or isinstance(given, list | tuple))
 
 
-def one_by_one(
-    graph: Graph, inputs: Any, seeds: tuple[int, ...], engine: str, dtype: str, init: Any,
-    kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
-) -> Batch:  # fmt: skip
-    from flowgraph.engines.simulate import simulate
-
-    if is_shared(inputs):  # an iterable can be read only once
+def _one_by_one(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], keep: dict[str, list[str]], options: RunOptions
+) -> Batch:
+    if _is_shared(inputs):  # an iterable can be read only once
         inputs = dict(zip(graph.sources, tape(prepare(graph, inputs), graph).series, strict=True))
-    parts: dict[str, list[Series]] = {name: [] for name in kept}
+    parts: dict[str, list[Series]] = {name: [] for name in keep}
     wall, ticks = 0.0, 0
     for n, seed in enumerate(seeds):
-        result = simulate(
-            graph, of_run(inputs, n, seed), engine=engine, dtype=dtype, init=of_run(init, n, seed),
-            seed=seed, passes=passes,
-        )  # fmt: skip
+        single = options.but(seed=seed, init=_of_run(options.init, n, seed), progress=None)
+        result = run_graph(graph, _of_run(inputs, n, seed), single)
         wall, ticks = wall + result.wall_s, result.ticks
-        for name in kept:
+        for name in keep:
             parts[name].append(result[name])
-        if progress is not None:
-            progress.update(n + 1, 0)
-    return Batch(graph.name, engine, seeds, {n: joined(n, p, kept[n]) for n, p in parts.items()}, ticks, wall)
+        if options.progress is not None:
+            options.progress.update(n + 1, 0)
+    series = {name: joined(name, part, keep[name]) for name, part in parts.items()}
+    return Batch(graph.name, options.engine, seeds, series, ticks, wall)
 
 
-def joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
-    """Series of several runs on the union of their times."""
-    time = parts[0].time
-    same = all(np.array_equal(p.time, time) for p in parts)
-    if same:
-        present = np.ones((len(parts), len(time)), bool)
-    else:
-        time = np.unique(np.concatenate([p.time for p in parts]))
-        present = np.stack([np.isin(time, p.time) for p in parts])
-    made = {}
-    for leaf in leaves:
-        arrays = [p.leaves[leaf] for p in parts]
-        shape, kind = (len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype
-        full = np.empty(shape, kind) if same else np.zeros(shape, kind)
-        for row, at, array in zip(full, present, arrays, strict=True):
-            row[... if same else at] = array
-        made[leaf] = full
-    return Runs(name, time, present, made)
+def _together(
+    graph: Graph, inputs: Any, seeds: tuple[int, ...], keep: dict[str, list[str]], options: RunOptions
+) -> ManyRuns:
+    subject = LoweredGraph(graph, dtype=options.dtype)
+    first = subject.tape(_of_run(inputs, 0, seeds[0]))
+    shared = _is_shared(inputs)
 
+    def tape_of(n: int) -> Tape:
+        return first if shared or not n else subject.tape(_of_run(inputs, n, seeds[n]), like=first)
 
-def initial_cells(graph: Graph, init: Any) -> list[np.ndarray]:
-    """The register cells that a run starts from."""
-    slots = initial_registers(graph, init)
-    return [np.asarray(leaf) for index, node in graph.registers for leaf in flatten(slots[index], node.type)]
+    def cells_of(n: int) -> list[np.ndarray]:
+        single = options.but(init=_of_run(options.init, n, seeds[n]))
+        return [np.asarray(cell) for cell in subject.start(single).cells]
 
+    started = cells_of(0) if _is_shared(options.init) else None
 
-def leaf_type(array: np.ndarray) -> Any:
-    return ArrayType(array.shape[1:], dtype_name(array))
+    def finish(cells: list[Any]) -> None:
+        check_faults(subject.pipeline, cells)
+
+    return ManyRuns(
+        graph.name, subject.pipeline, seeds, keep, first, shared, started,
+        tape_of, lambda n: started if started is not None else cells_of(n), finish,
+    )  # fmt: skip

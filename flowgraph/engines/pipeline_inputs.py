@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.data.inputs import prepare
 from flowgraph.data.series import Flight, Series
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.state import check_settable
 from flowgraph.errors import ClockError, DataError, UnknownNameError
 from flowgraph.language.clock import Source, Timing

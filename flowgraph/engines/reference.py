@@ -6,42 +6,25 @@ compiled backend, and never an exception.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from flowgraph.data.tape import Tape
+from flowgraph.engines.contract import Outcome, PipelineEngine, Player, real_leaves
+from flowgraph.engines.options import Meter
+from flowgraph.pipeline.evaluate import TOTAL_NUMPY
+from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
-from flowgraph.recorder.namespaces import NumpyNamespace
 from flowgraph.recorder.ops import OPS, bound_attrs
 from flowgraph.types import DTYPES
 
 
-class _LinearAlgebra:
-    """`numpy.linalg`, with NaN in place of an exception."""
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        function = getattr(np.linalg, name)
-
-        def total(*args: Any, **attrs: Any) -> Any:
-            try:
-                return function(*args, **attrs)
-            except np.linalg.LinAlgError:
-                return np.full_like(args[-1], np.nan)
-
-        return total if name in ("cholesky", "solve") else function
-
-
-class _TotalNumpy(NumpyNamespace):
-    linalg = _LinearAlgebra()
-
-
-TOTAL_NUMPY = _TotalNumpy()
-
-
-class Player:
+class Interpreter:
     """Plays ticks of one pipeline, keeping its registers.
 
     Args:
@@ -71,8 +54,6 @@ class Player:
         if key not in self._programs:
             program = specialise(self.pipeline, key)
             if self._passes:
-                from flowgraph.pipeline.optimise import optimise  # folds constants with this interpreter
-
                 program = optimise(program, self._passes)
             known = {n: _as(a, self.dtype) for n, a in program.constants.items()} | self._blanks(key)
             self._programs[key] = program, [_bind(i, self.dtype) for i in program.instructions], known
@@ -110,3 +91,61 @@ def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:
 def _as(array: Any, real: Any) -> Any:
     found = np.asarray(array)
     return found.astype(real) if found.dtype.kind == "f" else found
+
+
+_METER_TICKS = 2048
+
+
+class _Prepared(Player):
+    def __init__(self, pipeline: Pipeline, dtype: str, passes: tuple[str, ...]) -> None:
+        self._pipeline, self._real, self._passes = pipeline, np.dtype(dtype), passes
+
+    def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
+        ports, real = self._pipeline.outputs, self._real
+        player = Interpreter(
+            self._pipeline,
+            [c.astype(real) if np.asarray(c).dtype.kind == "f" else c for c in cells],
+            real,
+            seed,
+            self._passes,
+        )
+        rows = [_rows(real_leaves(s, real)) for s in tape.series]
+        outputs: list[tuple[list[int], list[tuple[Any, ...]]]] = [([], []) for _ in ports]
+        start = perf_counter()
+        with np.errstate(all="ignore"):
+            for n, (time, key) in enumerate(zip(tape.time.tolist(), tape.key.tolist(), strict=True)):
+                values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
+                for (times, kept), leaves in zip(outputs, player.tick(time, key, values), strict=True):
+                    if leaves is not None:
+                        times.append(time)
+                        kept.append(leaves)
+                if progress is not None and ((n + 1) % _METER_TICKS == 0 or n + 1 == len(tape.time)):
+                    progress.update(n + 1, time)
+        wall = perf_counter() - start
+        stacked = []
+        for port, (times, kept) in zip(ports, outputs, strict=True):
+            columns: Iterable[Any] = zip(*kept, strict=True) if kept else [[] for _ in port.leaves]
+            arrays: list[np.ndarray] = [
+                np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
+                for column, leaf in zip(columns, port.leaves, strict=True)
+            ]
+            stacked.append((np.asarray(times, dtype=np.int64), arrays))
+        return Outcome(player.cells, stacked, wall)
+
+
+def _rows(leaves: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
+    return zip(*leaves, strict=True)
+
+
+class ReferenceEngine(PipelineEngine):
+    """The list as it was lowered, in NumPy; no pass suits it, for it is the definition."""
+
+    name = "reference"
+
+    def prepare(
+        self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
+    ) -> Player:
+        return _Prepared(pipeline, dtype, passes)
+
+
+ENGINE = ReferenceEngine()

@@ -6,14 +6,14 @@ import typing
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from flowgraph.data.batch import Batch
 from flowgraph.data.inputs import Inputs, need_inputs
 from flowgraph.data.result import Result
-from flowgraph.engines.many import Batch, simulate_many
-from flowgraph.engines.python.run import Meter, Run
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.engines.many import run_many
+from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.parts import run_graph
+from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import Graph
-
-ENGINES = ("python", "reference", "xla", "c")
 
 
 @typing.overload
@@ -72,60 +72,26 @@ def simulate(
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
         seeds: run once for each of them, and return a `Batch`; `simulate_many` has more to choose.
         progress: an object that is told how far the run is.
-        passes: of the optimiser, from `flowgraph.pipeline.optimise.PASSES`; None: those that suit the
-        engine. The
-            Python engine has no list to optimise.
+        passes: of the optimiser, from `flowgraph.pipeline.optimise.PASSES`; None: those
+            that suit the engine. The Python engine has no list to optimise.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
         FifoOverflowError: where a queue of a join overflows.
         MissingDependencyError: for "xla" without JAX, for "c" without a C compiler.
     """
-    if engine not in ENGINES:
-        raise UnknownNameError("engine", engine, ENGINES)
-    if dtype not in ("float64", "float32"):
-        raise UnknownNameError("dtype", dtype, ("float64", "float32"))
-    if seeds is not None:
-        if state is not None:
-            raise DeclarationError(
-                "many runs start anew",
-                path="simulate",
-                expected="seeds, or a state to go on from",
-                got="both",
-                fix="leave one of them out",
-            )
-        return simulate_many(
-            graph, inputs, seeds, engine=engine, dtype=dtype, init=init, progress=progress, passes=passes
-        )
-    need_inputs(graph, inputs)
-    if engine == "python":
-        if dtype != "float64":
-            raise DeclarationError(
-                "the Python engine computes in float64",
-                path='engine="python"',
-                expected="float64",
-                got=dtype,
-                fix='use engine="reference" or "xla" for float32',
-            )
-        if passes is not None:
-            raise DeclarationError(
-                "the Python engine runs the blocks themselves",
-                path="passes",
-                expected="no passes, or an engine that plays the instructions",
-                got='engine="python"',
-                fix='use engine="reference" or "xla"',
-            )
-        return Run(graph, inputs, init=init, state=state, seed=seed).to_end(progress).result()
-    from flowgraph.engines.playback import play
-
-    return play(
-        graph,
-        inputs,
-        engine=engine,
-        dtype=dtype,
-        init=init,
-        state=state,
-        seed=seed,
-        progress=progress,
-        passes=passes,
+    options = RunOptions(
+        engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes
     )
+    if seeds is None:
+        need_inputs(graph, inputs)
+        return run_graph(graph, inputs, options)
+    if state is not None:
+        raise DeclarationError(
+            "many runs start anew",
+            path="simulate",
+            expected="seeds, or a state to go on from",
+            got="both",
+            fix="leave one of them out",
+        )
+    return run_many(graph, inputs, seeds, options)

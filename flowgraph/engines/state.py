@@ -10,17 +10,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError, writes
-from flowgraph.language.graph import Graph
+from flowgraph.language.graph import Graph, join_states
 from flowgraph.types import DTYPES, ArrayType, Type, as_value, flatten, leaves_of, unflatten
-
-
-def join_states(graph: Graph) -> set[int]:
-    """The registers that hold the state of a join: what its clock is was proven from where they start."""
-    return {
-        call.state
-        for _, call in graph.calls
-        if call.state is not None and (call.block.clock_rule or call.block.fault)
-    }
 
 
 def check_settable(path: str, roles: Mapping[str, str], *, graph: str) -> None:

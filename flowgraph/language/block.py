@@ -29,6 +29,7 @@ from flowgraph.types import (
     annotation_type,
     without_none,
 )
+from flowgraph.verbs import verb
 
 R = TypeVar("R")
 
@@ -133,9 +134,7 @@ class Block(Generic[R]):
 
     def __call__(self, *streams: Any, **settings: Any) -> Any:
         """Wire this block into the graph under construction: streams to ports, the rest to settings."""
-        from flowgraph.language.wiring import wire
-
-        return wire(self, streams, settings)
+        return verb("Block.__call__")(self, streams, settings)
 
     @property
     def stateful(self) -> bool:

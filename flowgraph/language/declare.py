@@ -15,8 +15,6 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from flowgraph.data.registry import Case
-from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError, UnknownNameError, naming_lines
 from flowgraph.language.block import REQUIRED
 from flowgraph.language.builder import Builder, builder, building
@@ -24,6 +22,10 @@ from flowgraph.language.clock import Source, Timing
 from flowgraph.language.graph import Graph, SourceNode, Wire
 from flowgraph.language.stream import Held, Stream
 from flowgraph.types import Type, annotation_type, bind, check_fits, without_none
+
+if typing.TYPE_CHECKING:
+    from flowgraph.data.registry import Case
+    from flowgraph.data.series import Flight
 
 
 def delay(init: Any, *, name: str | None = None, type: Any = None) -> Held[Any]:

@@ -17,6 +17,7 @@ from flowgraph.language.block import Block
 from flowgraph.language.clock import Clock, Source, atoms
 from flowgraph.language.recording import StepTrace
 from flowgraph.types import Type
+from flowgraph.verbs import verb
 
 if TYPE_CHECKING:
     import networkx
@@ -173,21 +174,15 @@ class Graph:
 
     def draw(self, file: str | None = None, **options: Any) -> Any:
         """Draw the block diagram: to a file (.svg, .png, .pdf, .dot), or as SVG text without one."""
-        from flowgraph.drawing.draw import draw
-
-        return draw(self, file, **options)
+        return verb("Graph.draw")(self, file, **options)
 
     def text(self) -> str:
         """The diagram as plain text."""
-        from flowgraph.drawing.text import draw_text
-
-        return draw_text(self)
+        return str(verb("Graph.text")(self))
 
     def to_networkx(self) -> networkx.MultiDiGraph:
         """The graph as a `networkx.MultiDiGraph`: nodes by path, edges with type, clock and `feedback`."""
-        from flowgraph.drawing.draw import to_networkx
-
-        return to_networkx(self)
+        return verb("Graph.to_networkx")(self)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         bundle = {"text/plain": self.text()}
@@ -263,6 +258,15 @@ def firing_order(nodes: list[Node]) -> tuple[int, ...]:
         if isinstance(node, RegisterNode):
             visit(index)
     return tuple(i for i in done if not isinstance(nodes[i], RegisterNode))
+
+
+def join_states(graph: Graph) -> set[int]:
+    """The registers that hold the state of a join: what its clock is was proven from where they start."""
+    return {
+        call.state
+        for _, call in graph.calls
+        if call.state is not None and (call.block.clock_rule or call.block.fault)
+    }
 
 
 def find_output(graph: Graph, name: str) -> Collected:

@@ -76,12 +76,6 @@ def latest(
 _sample: Block[Any] = Block(lambda value: value, name="sample")
 
 
-@block(name="filter")
-def filter_(x, *, predicate):  # type: ignore[no-untyped-def]
-    """Present, with the value of `x`, where `predicate(x)` is true."""
-    return when(predicate(x), x)
-
-
 def _count_clock(firing: Clock, _: list[Clock], settings: dict[str, Any]) -> Clock:
     return clocks.every(settings["n"], firing, phase=settings["phase"])
 

@@ -21,8 +21,10 @@ from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, Ty
 from flowgraph.language.block import Block, Port, When
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
-from flowgraph.recorder.symbolic import MACHINERY, Symbolic, Trace
+from flowgraph.recorder.refusals import MACHINERY
+from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Trace
 from flowgraph.types import (
     ArrayType,
     StructType,

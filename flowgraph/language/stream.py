@@ -12,11 +12,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from flowgraph.errors import DeclarationError
-from flowgraph.language.block import Block
+from flowgraph.language.block import Block, block, when
 from flowgraph.language.clock import Clock, clock_of
 from flowgraph.language.graph import OutputPort, Wire
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.types import Type, annotation_type
+from flowgraph.verbs import verb
 
 if TYPE_CHECKING:
     from flowgraph.language.builder import Builder
@@ -45,41 +46,29 @@ class Stream(Generic[T]):
 
     def filter(self, predicate: Callable[..., Any], *, name: str | None = None) -> Stream[T]:
         """The values for which the predicate is true; the result has a clock of its own."""
-        from flowgraph.language.joins import filter_
-
-        return typing.cast("Stream[T]", filter_(self, predicate=predicate, name=name))
+        return typing.cast("Stream[T]", _filter(self, predicate=predicate, name=name))
 
     def every(self, n: int, *, phase: int = 0) -> Stream[T]:
         """Each n-th value, starting with value number `phase`."""
-        from flowgraph.language.joins import every
-
-        return typing.cast("Stream[T]", every(n, self, phase=phase))
+        return typing.cast("Stream[T]", verb("Stream.every")(n, self, phase=phase))
 
     def drop(self, n: int, *, name: str | None = None) -> Stream[T]:
         """All values but the first `n`."""
-        from flowgraph.language.operations import drop
-
-        return drop(n, self, name=name)
+        return typing.cast("Stream[T]", verb("Stream.drop")(n, self, name=name))
 
     def take_while(self, predicate: Callable[..., Any], *, name: str | None = None) -> Stream[T]:
         """The values before the first for which the predicate is false."""
-        from flowgraph.language.operations import take_while
-
-        return take_while(self, predicate, name=name)
+        return typing.cast("Stream[T]", verb("Stream.take_while")(self, predicate, name=name))
 
     def tap(self, function: Callable[[Any], object], *, name: str | None = None) -> Stream[T]:
         """This stream, with `function(value)` called on the host for each value."""
-        from flowgraph.language.operations import tap
-
-        return tap(self, function, name=name)
+        return typing.cast("Stream[T]", verb("Stream.tap")(self, function, name=name))
 
     def delay(self, init: Any, *, name: str | None = None) -> Held[T]:
         """The value of an earlier tick, held: what was last written before this tick."""
-        from flowgraph.language.declare import delay
-
-        register = delay(init, name=name, type=self.type)
+        register = verb("Stream.delay")(init, name=name, type=self.type)
         register.feed(self)
-        return register
+        return typing.cast("Held[T]", register)
 
     def __or__(self, other: object) -> Clock:
         return self.clock | clock_of(other)
@@ -179,6 +168,12 @@ class Held(Generic[T]):
 
 
 _SAMPLE: Block[Any] = Block(lambda value: value, name="sample")
+
+
+@block(name="filter")
+def _filter(x, *, predicate):  # type: ignore[no-untyped-def]
+    """Present, with the value of `x`, where `predicate(x)` is true."""
+    return when(predicate(x), x)
 
 
 def _refuse_as_value(thing: Stream[Any] | Held[Any]) -> typing.NoReturn:

@@ -19,6 +19,7 @@ import numpy as np
 from flowgraph.errors import PipelineError
 from flowgraph.language.block import Limit
 from flowgraph.language.clock import Timing
+from flowgraph.pipeline.evaluate import evaluate
 from flowgraph.pipeline.pipeline import (
     FORMAT,
     VERSION,
@@ -36,8 +37,8 @@ from flowgraph.pipeline.pipeline import (
     spec_of,
     type_of_leaves,
 )
-from flowgraph.recorder.ops import OPS, Spec, bound_attrs
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.ops import OPS, Spec
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, leaves_of
 
 _TRIED = 2**24
@@ -261,7 +262,7 @@ def _check_version(data: Any, path: str) -> None:
 
 
 def _check_schema(data: Any, path: str) -> None:
-    import jsonschema
+    import jsonschema  # slow to import, and only needed to read a description
 
     first = next(iter(jsonschema.Draft202012Validator(schema()).iter_errors(data)), None)
     if first is not None:
@@ -380,14 +381,11 @@ def _check_instruction(i: Instruction, specs: Mapping[int, Spec], where: str) ->
 
 def _try(i: Instruction, given: list[Spec], where: str) -> None:
     """Run an instruction once, on ones or on unit matrices: attributes that no shape rule reads show here."""
-    from flowgraph.engines.reference import TOTAL_NUMPY
-
     args: list[Any] = [np.broadcast_to(np.ones((), DTYPES[s.dtype]), s.shape) for s in given]
     if i.op in ("cholesky", "solve"):
         args[0] = np.broadcast_to(np.eye(given[0].shape[-1]), given[0].shape)
     try:
-        with np.errstate(all="ignore"):
-            made = np.asarray(OPS[i.op].run(TOTAL_NUMPY, *args, **bound_attrs(i.op, i.attrs, np.float64)))
+        made = np.asarray(evaluate(i, *args))
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
         _refuse("an instruction cannot be run", where, f"{i.op} with attributes that it knows", error)
     if Spec(made.shape, kind_of(made)) != i.spec:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 def listing(pipeline: Pipeline) -> str:

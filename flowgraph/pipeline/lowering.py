@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.state import join_states
 from flowgraph.errors import LoweringError
 from flowgraph.language.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source, Timing
-from flowgraph.language.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire
+from flowgraph.language.graph import NEVER, CallNode, Graph, RegisterNode, SourceNode, Wire, join_states
 from flowgraph.language.recording import StepTrace
 from flowgraph.pipeline.cut import cut
-from flowgraph.pipeline.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register, Stage
-from flowgraph.recorder.ops import OPS, Spec
+from flowgraph.pipeline.pipeline import Cell, Fault, Leaf, Pipeline, Port, RandomSite, Register
+from flowgraph.pipeline.stage_list import StageList, fixed
+from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site
-from flowgraph.recorder.symbolic import Instruction, Trace
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Trace
 from flowgraph.types import DTYPES, Type, axis_names, flatten, leaves_of
 
 
@@ -52,16 +52,10 @@ def lower(graph: Graph, *, dtype: str = "float64") -> Pipeline:
     return found
 
 
-class _Lowering:
+class _Lowering(StageList):
     def __init__(self, graph: Graph) -> None:
+        super().__init__(graph.name)
         self.graph = graph
-        self.count = 0
-        self.constants: dict[int, np.ndarray] = {}
-        self.interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
-        self.specs: dict[int, Spec] = {}
-        self.stages: list[Stage] = []
-        self.pending: list[Instruction] = []
-        self.place = graph.name
         self.time = self.value(Spec((), "int64"))
         self.seed = self.value(Spec((2,), "uint32"))
         self.sites: dict[Site, int] = {}
@@ -125,52 +119,6 @@ class _Lowering:
                 for limit in call.block.limits(call.settings)
             ),
         )
-
-    # -- values --------------------------------------------------------------------------------------
-
-    def value(self, spec: Spec) -> int:
-        self.count += 1
-        self.specs[self.count - 1] = spec
-        return self.count - 1
-
-    def values(self, type_: Type) -> list[int]:
-        return [self.value(Spec(_fixed(t.shape), t.dtype)) for _, t in leaves_of(type_)]
-
-    def constant(self, value: Any) -> int:
-        array = np.asarray(value)
-        key = (array.tobytes(), array.shape, array.dtype.str)
-        if key not in self.interned:
-            dtype = (
-                "real" if array.dtype.kind == "f" else "bool" if array.dtype.kind == "b" else array.dtype.name
-            )
-            self.interned[key] = self.value(Spec(array.shape, dtype))
-            self.constants[self.interned[key]] = array
-        return self.interned[key]
-
-    def emit(self, op: str, *args: int, line: str | None = None, **attrs: Any) -> int:
-        spec = OPS[op].rule(*(self.specs[a] for a in args), **attrs)
-        out = self.value(spec)
-        self.pending.append(Instruction(op, args, attrs, out, spec, line or self.place))
-        return out
-
-    def select(self, condition: int, yes: int, no: int) -> int:
-        return yes if yes == no else self.emit("where", condition, yes, no)
-
-    def close(
-        self,
-        path: str,
-        block: str,
-        enable: int,
-        reads: Sequence[str],
-        writes: Sequence[str],
-        axis: str | None = None,
-    ) -> None:
-        """End a stage with what has been emitted since the last."""
-        if self.pending or writes:
-            self.stages.append(
-                Stage(path, block, enable, tuple(reads), tuple(writes), tuple(self.pending), axis)
-            )
-        self.pending = []
 
     # -- presence ------------------------------------------------------------------------------------
 
@@ -242,7 +190,7 @@ class _Lowering:
                     name,
                     read,
                     write,
-                    _fixed(t.shape),
+                    fixed(t.shape),
                     t.dtype,
                     np.asarray(reset, DTYPES[t.dtype]),
                     t.unit,
@@ -332,12 +280,6 @@ class _Lowering:
         self.sites[site] = renamed[drawn.number]
         self.close(f"random({site.name})", "random", firing, (), ())
 
-    def copy(self, trace: Trace, renamed: dict[int, int]) -> None:
-        """Append a trace's instructions, under this pipeline's numbers."""
-        renamed.update({n: self.constant(a) for n, a in trace.constants.items()})
-        for i in trace.instructions:
-            renamed[i.out] = self.emit(i.op, *(renamed[a] for a in i.args), line=i.line, **i.attrs)
-
     def argument(self, argument: Any) -> list[int]:
         if argument.wire is not None:
             return self.leaves[argument.wire]
@@ -389,7 +331,7 @@ class _Lowering:
         timing: Timing | None = None,
     ) -> Port:
         leaves = [
-            Leaf(leaf, n, _fixed(t.shape), t.dtype, t.unit, t.frame, axis_names(t))
+            Leaf(leaf, n, fixed(t.shape), t.dtype, t.unit, t.frame, axis_names(t))
             for (leaf, t), n in zip(leaves_of(type_), numbers, strict=True)
         ]
         return Port(name, str(type_), clock, present, tuple(leaves), timing)
@@ -399,7 +341,3 @@ def _axis(types: Sequence[Type]) -> str | None:
     """The first named axis of these types."""
     names = (name for type_ in types for _, leaf in leaves_of(type_) for name in axis_names(leaf))
     return next((n for n in names if n is not None), None)
-
-
-def _fixed(shape: tuple[int | str, ...]) -> tuple[int, ...]:
-    return tuple(int(n) for n in shape)

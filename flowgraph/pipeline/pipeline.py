@@ -22,8 +22,9 @@ from flowgraph.errors import LoweringError, PipelineError, UnknownNameError, wri
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
+from flowgraph.verbs import verb
 
 if TYPE_CHECKING:
     from flowgraph.data.result import Result
@@ -199,9 +200,8 @@ class Pipeline:
             **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress`, `passes` as in
                 `simulate`.
         """
-        from flowgraph.engines.playback import run_pipeline
-
-        return run_pipeline(self, inputs, **options)
+        result: Result = verb("Pipeline.run")(self, inputs, **options)
+        return result
 
     def totals(self) -> dict[str, int]:
         """Scalar operations of a tick in which everything fires, bytes of memory, and the longest chain."""
@@ -252,9 +252,8 @@ class Pipeline:
 
     def to_json(self) -> dict[str, Any]:
         """The whole description as plain JSON values."""
-        from flowgraph.pipeline.description import to_json
-
-        return to_json(self)
+        data: dict[str, Any] = verb("Pipeline.to_json")(self)
+        return data
 
     @classmethod
     def from_json(cls, data: Any, *, path: str = "pipeline") -> Pipeline:
@@ -263,9 +262,8 @@ class Pipeline:
         Raises:
             PipelineError: saying where it is malformed.
         """
-        from flowgraph.pipeline.description import from_json
-
-        return from_json(data, path=path)
+        made: Pipeline = verb("Pipeline.from_json")(data, path=path)
+        return made
 
     def save(self, folder: str | Path) -> Path:
         """Write `pipeline.json` and a listing `pipeline.txt` into a folder, made if missing; returns it.
@@ -315,9 +313,7 @@ class Pipeline:
 
     def listing(self) -> str:
         """The pipeline as text for a person: registers, then stages with one instruction a line."""
-        from flowgraph.pipeline.listing import listing
-
-        return listing(self)
+        return str(verb("Pipeline.listing")(self))
 
     def __repr__(self) -> str:
         t = self.totals()

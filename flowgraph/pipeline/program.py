@@ -14,7 +14,7 @@ import numpy as np
 
 from flowgraph.pipeline.pipeline import Pipeline, work
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 @dataclass(frozen=True)

@@ -1,145 +1,23 @@
-"""The symbolic array: runs through a block's step once and writes down what it does.
+"""The symbolic array: runs through a block's step once, and has what it does written down.
 
-A `Symbolic` has a shape and a dtype but no values. Every operation of the array API on it appends one
-typed instruction in single-assignment form to its `Trace`, with the source line that asked for it.
-Whatever a fixed-size pipeline cannot hold (a Python branch on a value, an in-place write, a shape that
-depends on data, an operation outside the list) is refused there, by line.
+A `Symbolic` has a shape and a dtype but no values. Every operation of the array API on it goes to the `Trace`
+that it belongs to, which writes an instruction. Whatever a fixed-size pipeline cannot hold (a Python branch
+on a value, an in-place write, a shape that depends on data) is refused here, by line.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from flowgraph.errors import LoweringError
-from flowgraph.recorder.ops import OPS, ShapeError, Spec, promote
-from flowgraph.types import DTYPES, dtype_name
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.refusals import refuse
+from flowgraph.types import DTYPES
 
-
-@dataclass(frozen=True)
-class Instruction:
-    """`out = op(*args, **attrs)`: `args` are value numbers; `line` is module:line of the block's source."""
-
-    op: str
-    args: tuple[int, ...]
-    attrs: dict[str, Any]
-    out: int
-    spec: Spec
-    line: str
-
-
-class Trace:
-    """Instructions in the order recorded, and the constants they use."""
-
-    def __init__(self) -> None:
-        self.instructions: list[Instruction] = []
-        self.constants: dict[int, np.ndarray] = {}
-        self._interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
-        self._count = 0
-
-    def new(self) -> int:
-        """A fresh value number."""
-        self._count += 1
-        return self._count - 1
-
-    def input(self, spec: Spec) -> Symbolic:
-        """A value that comes from outside."""
-        return Symbolic(self, self.new(), spec)
-
-    def constant(self, value: Any) -> Symbolic:
-        """A value known now; equal constants share one number."""
-        array = np.asarray(value)
-        dtype = dtype_name(array)
-        array = array.astype(DTYPES[dtype])
-        key = (array.tobytes(), array.shape, dtype)
-        number = self._interned.get(key)
-        if number is None:
-            number = self._interned[key] = self.new()
-            self.constants[number] = array
-        return Symbolic(self, number, Spec(array.shape, dtype))
-
-    def apply(self, op: str, *args: Any, **attrs: Any) -> Symbolic:
-        """Record one instruction, bringing its operands to a common kind of number first."""
-        rule = OPS[op]
-        operands = self._operands(rule.operands, op, args)
-        try:
-            spec = rule.rule(*(a.spec for a in operands), **attrs)
-        except ShapeError as error:
-            raise LoweringError(
-                f"{op}: {error}",
-                path=caller(),
-                expected="shapes that fit",
-                got=str([a.shape for a in operands]),
-                fix="reshape or transpose one side",
-            ) from None
-        out = Symbolic(self, self.new(), spec)
-        numbers = tuple(a.number for a in operands)
-        self.instructions.append(Instruction(op, numbers, attrs, out.number, spec, caller()))
-        return out
-
-    def _operands(self, kind: str, op: str, args: Sequence[Any]) -> list[Symbolic]:
-        peers = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Symbolic)]
-        lifted = []
-        for arg in args:
-            if isinstance(arg, Symbolic):
-                if arg.trace is not self:
-                    refuse(
-                        "this mixes values of two blocks",
-                        "only values of this step",
-                        "a value kept from elsewhere",
-                        "pass it through a port",
-                    )
-                lifted.append(arg)
-            elif isinstance(arg, bool | int | float) and not isinstance(arg, np.generic) and peers:
-                dtypes = [p.dtype_name for p in peers] + (["real"] if isinstance(arg, float) else [])
-                weak = promote(*dtypes)
-                if weak == "bool" and not isinstance(arg, bool):
-                    weak = "int64"  # True + 1 is a number
-                lifted.append(
-                    self.constant(
-                        np.asarray(arg, DTYPES["bool" if isinstance(arg, bool) and weak == "bool" else weak])
-                    )
-                )
-            else:
-                lifted.append(self.constant(arg))
-        if op == "where":
-            common = promote(lifted[1].dtype_name, lifted[2].dtype_name)
-            return [lifted[0].cast("bool"), lifted[1].cast(common), lifted[2].cast(common)]
-        if kind == "same":
-            common = promote(*(a.dtype_name for a in lifted))
-            return [a.cast(common) for a in lifted]
-        if kind in ("real", "bool"):
-            return [a.cast(kind) for a in lifted]
-        if kind == "int" and any(a.dtype_name == "real" for a in lifted):
-            refuse(f"{op} of real numbers", "integers", "real", "convert with xp.astype first")
-        return lifted
-
-
-def caller() -> str:
-    """module:line of the nearest frame outside the recording machinery."""
-    frame = sys._getframe(1)
-    while frame.f_back and _is_machinery(frame.f_globals.get("__name__", "?")):
-        frame = frame.f_back
-    return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
-
-
-MACHINERY = (__name__, f"{__name__}_namespace", "flowgraph.recorder.ops")
-"""Modules whose frames are not the user's code."""
-
-
-def _is_machinery(module: str) -> bool:
-    return module in MACHINERY or module.partition(".")[0] == "numpy"
-
-
-def refuse(what: str, expected: str, got: str, fix: str, *, in_every_engine: bool = False) -> NoReturn:
-    """Raise the error that names the block's source line."""
-    error = LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
-    error.in_every_engine = in_every_engine
-    raise error
+if TYPE_CHECKING:
+    from flowgraph.recorder.trace import Trace
 
 
 class Symbolic:
@@ -182,9 +60,7 @@ class Symbolic:
         return self.trace.apply("astype", self, dtype=dtype)
 
     def __array_namespace__(self, *, api_version: str | None = None) -> Any:
-        from flowgraph.recorder.symbolic_namespace import namespace
-
-        return namespace
+        return self.trace.namespace
 
     def __getitem__(self, index: Any) -> Symbolic:
         entries = list(index) if isinstance(index, tuple) else [index]

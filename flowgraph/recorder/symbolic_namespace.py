@@ -7,15 +7,19 @@ constants stay constants. What a pipeline has no instruction for is not there, a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS
-from flowgraph.recorder.symbolic import Symbolic, Trace, caller, refuse
+from flowgraph.recorder.refusals import caller, refuse
+from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.types import dtype_name
+
+if TYPE_CHECKING:
+    from flowgraph.recorder.trace import Trace
 
 
 def _trace_of(args: Sequence[Any]) -> Trace | None:

@@ -15,13 +15,15 @@ from typing import Any
 
 from flowgraph.data.registry import find_graph, load_flight
 from flowgraph.data.series import Flight
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DeclarationError
 from flowgraph.pipeline.lowering import lower
 from flowgraph.study import keys
 from flowgraph.study.executors import Executor, Finished, InProcess, ProcessPool
 from flowgraph.study.spec import Study, Value, text
 from flowgraph.study.store import Row, Store, import_pyarrow
-from flowgraph.study.tasks import MANY, Done, RunSpec, Task, flight_part, lost, prepared, run_task, said
+from flowgraph.study.tasks import Done, RunSpec, Task, flight_part, lost, prepared, run_task, said
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
     watcher = watcher or Watcher()
     flights = _Flights(many=len(study.each_seed) > 1)
     total = len(study.data) * sum(1 for g in study.graphs for _ in study.combinations(g))
+    together = find_engine(study.engine).takes_many
     runs: list[RunSpec] = []
     programs: list[str] = []
     for graph in study.graphs:
@@ -94,7 +97,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
                     "graph": [graph, described, code],
                     "data": identity,
                     "parameters": {n: [type(v).__name__, text(v)] for n, v in parameters.items()},
-                    "engine": [study.engine, study.dtype, study.chunk if study.engine in MANY else 1],
+                    "engine": [study.engine, study.dtype, study.chunk if together else 1],
                     "metrics": study.metrics,
                 }
                 for seed in study.each_seed:
@@ -149,10 +152,12 @@ def tasks_of(study: Study, planned: Plan, wanted: Iterable[str]) -> list[Task]:
     """Tasks for the wanted keys, in the order of the plan; chunks keep the places that they have in it."""
     missing = set(wanted)
     metrics = None if study.metrics is None else tuple(study.metrics)
+    together = find_engine(study.engine).takes_many
+    options = RunOptions(engine=study.engine, dtype=study.dtype, runs_at_once=study.chunk)
     chunks: dict[Any, list[RunSpec]] = {}
     counts: dict[Any, int] = {}
     for place, (run, program) in enumerate(zip(planned.runs, planned.programs, strict=True)):
-        if study.engine in MANY:
+        if together:
             group = (run.graph, run.data, program)
             counts[group] = counts.get(group, -1) + 1
             chunk: Any = (group, counts[group] // study.chunk)
@@ -160,10 +165,7 @@ def tasks_of(study: Study, planned: Plan, wanted: Iterable[str]) -> list[Task]:
             chunk = place
         if run.key in missing:
             chunks.setdefault(chunk, []).append(run)
-    return [
-        Task(f"{k}", tuple(runs), study.engine, study.dtype, study.chunk, metrics, study.keep)
-        for k, runs in enumerate(chunks.values())
-    ]
+    return [Task(f"{k}", tuple(runs), options, metrics, study.keep) for k, runs in enumerate(chunks.values())]
 
 
 def run_study(

@@ -263,7 +263,7 @@ class OnDask(_Closing):
     ) -> None:
         _need_workers(workers)
         try:
-            import dask
+            import dask  # optional, with what follows
             import distributed as found
         except ImportError as error:
             raise MissingDependencyError(

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.state import join_states
-from flowgraph.language.graph import CallNode, Graph, RegisterNode
+from flowgraph.language.graph import CallNode, Graph, RegisterNode, join_states
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Cell, Pipeline, Register
 from flowgraph.types import ArrayType, flatten

@@ -144,7 +144,7 @@ def _pictures(
 
 
 def _png(draw: Draw) -> bytes:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # a second that only pictures need
 
     figure = Figure(figsize=(9.0, 4.5), layout="constrained")
     draw(figure)

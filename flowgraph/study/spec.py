@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
+from flowgraph.engines.options import DTYPES
+from flowgraph.engines.registry import engine_names, find_engine
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
 Value = bool | int | float | str
@@ -79,10 +81,12 @@ class Study:
         put("data", _names("data", self.data))
         put("seeds", _seeds(self.seeds))
         put("metrics", None if self.metrics is None else _names("metrics", self.metrics))
-        _one_of("engine", self.engine, _engines())
-        _one_of("dtype", self.dtype, ("float64", "float32"))
-        if self.engine == "python" and self.dtype != "float64":
-            raise _wrong("dtype", "float64, for the Python engine has no other", self.dtype)
+        _one_of("engine", self.engine, engine_names())
+        _one_of("dtype", self.dtype, DTYPES)
+        offered = find_engine(self.engine).dtypes
+        if self.dtype not in offered:
+            wanted = f"{' or '.join(offered)}, for the {self.engine.capitalize()} engine has no other"
+            raise _wrong("dtype", wanted, self.dtype)
         if type(self.chunk) is not int or not 1 <= self.chunk <= 2**16:
             raise _wrong("chunk", "a whole number from 1 to 65536", self.chunk)
         if type(self.keep) is not bool:
@@ -197,12 +201,6 @@ def text(value: Value) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value)
-
-
-def _engines() -> tuple[str, ...]:
-    from flowgraph.engines.simulate import ENGINES
-
-    return ENGINES
 
 
 _EXAMPLES = {
@@ -365,7 +363,7 @@ def _unit(method: str, count: int, size: int, seed: int) -> np.ndarray:
     """Points (count, size) in the unit cube; those of a Sobol sequence start alike for any count."""
     if method == "random":
         return np.random.default_rng(seed).random((count, size))
-    from scipy.stats import qmc
+    from scipy.stats import qmc  # a second that only these draws need
 
     bits = max(1, math.ceil(math.log2(count)))
     drawn = qmc.Sobol(size, scramble=True, rng=np.random.default_rng(seed)).random_base2(bits)

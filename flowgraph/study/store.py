@@ -38,7 +38,7 @@ def import_pyarrow() -> Any:
         MissingDependencyError: with what to install.
     """
     try:
-        import pyarrow
+        import pyarrow  # optional, with what follows
         import pyarrow.parquet
     except ImportError as error:
         raise MissingDependencyError(

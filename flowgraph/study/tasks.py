@@ -17,11 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.batch import Batch
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
-from flowgraph.engines.many import Batch, simulate_many
-from flowgraph.engines.simulate import simulate
+from flowgraph.engines.many import run_many
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.parts import run_graph
+from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError, FlowgraphError
 from flowgraph.language.graph import Graph
 from flowgraph.language.recording import remembering
@@ -30,9 +33,6 @@ from flowgraph.study.lifting import Lowered, lifted, start_of
 from flowgraph.study.spec import Value, text
 from flowgraph.study.store import pack_trajectory
 from flowgraph.types import unflatten
-
-MANY = ("xla", "c")
-"""Engines that take many runs in one call."""
 
 _FLIGHTS_KEPT = 2
 _PROGRAMS_KEPT = 4
@@ -58,14 +58,13 @@ class Task:
     Args:
         name: of the task.
         runs: in order; more than one only where the engine takes many.
-        engine, dtype, chunk, metrics, keep: of the study.
+        options: of each run, but for its seed.
+        metrics, keep: of the study.
     """
 
     name: str
     runs: tuple[RunSpec, ...]
-    engine: str
-    dtype: str
-    chunk: int
+    options: RunOptions
     metrics: tuple[str, ...] | None
     keep: bool
 
@@ -141,7 +140,7 @@ def run_task(task: Task) -> list[Done]:
         try:
             lane = _ready(run)
             # lowered here, where its error is that of one run; the host has its part in every run
-            if task.engine in MANY and not _lowered.lower(lane.case.graph).host:
+            if find_engine(task.options.engine).takes_many and not _lowered.lower(lane.case.graph).host:
                 lanes.append(lane)
             else:
                 found[run.key] = _alone(task, lane)
@@ -167,9 +166,7 @@ def _ready(run: RunSpec) -> _Lane:
 
 def _alone(task: Task, lane: _Lane) -> Done:
     start = perf_counter()
-    result = simulate(
-        lane.case.graph, lane.case.inputs, engine=task.engine, dtype=task.dtype, seed=lane.run.seed
-    )
+    result = run_graph(lane.case.graph, lane.case.inputs, task.options.but(seed=lane.run.seed))
     lane.times["run_s"] = perf_counter() - start
     return _scored(task, lane, result)
 
@@ -195,10 +192,7 @@ def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...
     try:
         start = perf_counter()
         cases, seeds = [lane.case for lane in lanes], [lane.run.seed for lane in lanes]
-        results = simulate_together(
-            cases, seeds, program=program, engine=task.engine, dtype=task.dtype, chunk=task.chunk,
-            keep=keep,
-        )  # fmt: skip
+        results = simulate_together(cases, seeds, program, task.options.but(keep=keep))
         share = (perf_counter() - start) / len(lanes)
     except Exception as error:
         if len(lanes) == 1:
@@ -215,30 +209,15 @@ def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...
 
 
 def simulate_together(
-    cases: Sequence[Case],
-    seeds: Sequence[int],
-    *,
-    program: Any,
-    engine: str,
-    dtype: str,
-    chunk: int,
-    keep: Sequence[str] | None = None,
+    cases: Sequence[Case], seeds: Sequence[int], program: Any, options: RunOptions
 ) -> list[Result]:
-    """Cases of one program and one set of ticks (see `grouped`) in one vectorised call.
+    """Cases of one program and one set of ticks (see `grouped`) in one call.
 
-    With `keep` only the streams of these names come back.
+    Only the streams of `options.keep` come back.
     """
     graph = _program(cases[0].graph.name, program, cases[0].graph)
-    batch = simulate_many(
-        graph,
-        [_streams(case, graph) for case in cases],
-        seeds,
-        engine=engine,
-        dtype=dtype,
-        init=[start_of(case.graph) for case in cases],
-        keep=keep,
-        runs_at_once=chunk,
-    )
+    streams = [_streams(case, graph) for case in cases]
+    batch = run_many(graph, streams, seeds, options.but(init=[start_of(case.graph) for case in cases]))
     return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
 
 

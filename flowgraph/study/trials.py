@@ -25,12 +25,14 @@ import numpy as np
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
-from flowgraph.engines.simulate import simulate
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.parts import run_graph
+from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError
 from flowgraph.language.recording import remembering
 from flowgraph.study.keys import digest
 from flowgraph.study.spec import Value
-from flowgraph.study.tasks import MANY, grouped, prepared, simulate_together
+from flowgraph.study.tasks import grouped, prepared, simulate_together
 
 ASTRAY = 1e6
 """What a recording counts on which the filter fails: more than any that works."""
@@ -100,11 +102,12 @@ class Trials:
     def _results(self, cases: Sequence[Case], places: Sequence[int]) -> list[Result | Exception]:
         """A result a case; of one that raises, what it raises."""
         found: list[Result | Exception] = []
-        if self.engine not in MANY:
+        options = RunOptions(engine=self.engine)
+        if not find_engine(self.engine).takes_many:
             for case, place in zip(cases, places, strict=True):
                 seed = self.recordings[place].seed
                 try:
-                    found.append(simulate(case.graph, case.inputs, engine=self.engine, seed=seed))
+                    found.append(run_graph(case.graph, case.inputs, options.but(seed=seed)))
                 except Exception as error:
                     found.append(error)
             return found
@@ -113,21 +116,21 @@ class Trials:
             seeds = [self.recordings[places[k]].seed for k in members]
             several = [cases[k] for k in members]
             chunk = min(64, 2 ** math.ceil(math.log2(len(members))))
-            made.update(zip(members, self._together(several, seeds, program, chunk), strict=True))
+            together = options.but(runs_at_once=chunk)
+            made.update(zip(members, self._together(several, seeds, program, together), strict=True))
         return [made[k] for k in range(len(cases))]
 
     def _together(
-        self, cases: Sequence[Case], seeds: Sequence[int], program: Any, chunk: int
+        self, cases: Sequence[Case], seeds: Sequence[int], program: Any, options: RunOptions
     ) -> Sequence[Result | Exception]:
         """Cases of one program; where one raises, each alone, so that it fails for itself."""
         try:
-            return simulate_together(
-                cases, seeds, program=program, engine=self.engine, dtype="float64", chunk=chunk
-            )
+            return simulate_together(cases, seeds, program, options)
         except Exception as error:
             if len(cases) == 1:
                 return [error]
-        return [self._together([c], [s], program, 1)[0] for c, s in zip(cases, seeds, strict=True)]
+        single = options.but(runs_at_once=1)
+        return [self._together([c], [s], program, single)[0] for c, s in zip(cases, seeds, strict=True)]
 
     def measured(self, points: Sequence[Mapping[str, float]], places: Sequence[int]) -> np.ndarray:
         """The measure (points, recordings) on the recordings at some places."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.registry import find_graph, parsed_settings
-from flowgraph.engines.simulate import ENGINES
+from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.study.spec import Value, text
 from flowgraph.study.tasks import flight_part
@@ -131,7 +131,7 @@ def tune(
     """
     method = method or ("L-BFGS-B" if measure == "likelihood" else "Nelder-Mead")
     for kind, given, valid in (
-        ("measure", measure, MEASURES), ("method", method, METHODS), ("engine", engine, ENGINES),
+        ("measure", measure, MEASURES), ("method", method, METHODS), ("engine", engine, engine_names()),
     ):  # fmt: skip
         if given not in valid:
             raise UnknownNameError(kind, given, valid, path="tune")
@@ -210,7 +210,7 @@ def _search(
         steps = np.array([(a - b).sum() for a, b in zip(ends[::2], ends[1::2], strict=True)])
         return float(found[0]), (found[1::2] - found[2::2]) / steps
 
-    from scipy import optimize
+    from scipy import optimize  # half a second that only a search needs
 
     minimize: Callable[..., Any] = optimize.minimize
     limits: dict[str, Any]

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, lower, real, simulate
-from flowgraph.data.inputs import Inputs, prepare, tape
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.series import Series
-from flowgraph.engines.c.engine import Compiled, State
-from flowgraph.engines.playback import real_leaves
-from flowgraph.pipeline.optimise import DEFAULT, for_engine
+from flowgraph.data.tape import tape
+from flowgraph.engines.c.library import Compiled, State
+from flowgraph.engines.contract import real_leaves
+from flowgraph.pipeline.optimise import COMPILED, DEFAULT, check_passes
 from flowgraph.recorder.random import ROUNDS, Site, seed_words, segments
 from tests.bench import direct_eskf, direct_rbpf, inertial, particles
 from tests.bench.rows import Row, interleaved, missing, seconds
@@ -65,7 +66,9 @@ def loop(
     """
     pipeline, kind = lower(built, dtype=dtype), np.dtype(dtype)
     events = tape(prepare(built, inputs), built)
-    library = Compiled(pipeline, kind, events.patterns, passes=for_engine("c", passes))
+    library = Compiled(
+        pipeline, kind, events.patterns, passes=check_passes(COMPILED if passes is None else passes)
+    )
     rows = library.rows([real_leaves(s, kind) for s in events.series])
     cells = [c.reset for r in pipeline.registers for c in r.cells]
     rooms = [library.room(k, n) for k, (n, _) in enumerate(library.most(events.key))]

@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -112,7 +113,9 @@ def test_other_errors_pass_where_files_are_written():
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
-@pytest.mark.parametrize("arguments", [("list",), ("list", "--json"), ("show", "ins_eskf"), ("--help",)])
+@pytest.mark.parametrize(
+    "arguments", [("list",), ("list", "--json"), ("show", "ins_eskf"), ("--help",), ("--version",)]
+)
 def test_a_full_standard_output_is_a_message(arguments):
     program = "import sys; from flowgraph.cli import main; sys.argv[0] = 'flowgraph'; main()"
     with open("/dev/full", "w") as full:
@@ -128,6 +131,12 @@ def test_a_full_standard_output_is_a_message(arguments):
     assert "error: OSError" in done.stderr
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+def test_the_version_is_that_of_the_distribution():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    done = invoke("--version")
+    assert (done.exit_code, done.stdout) == (0, f"flowgraph {project['version']}\n")
 
 
 # -- wrong use -------------------------------------------------------------------------------------------

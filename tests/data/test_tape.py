@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowgraph import Series
-from flowgraph.data.inputs import Tape
+from flowgraph.data.tape import Tape
 
 stamps = st.lists(st.integers(-50, 50), unique=True).map(sorted)
 

@@ -86,7 +86,7 @@ def test_the_instructions_listed_are_those_there_are() -> None:
 
 
 def test_every_field_of_the_description_is_explained() -> None:
-    schema = json.loads((ROOT / "flowgraph" / "pipeline.schema.json").read_text())
+    schema = json.loads((ROOT / "flowgraph" / "pipeline" / "pipeline.schema.json").read_text())
     names: set[str] = set()
 
     def visit(node: Any) -> None:

@@ -26,8 +26,9 @@ from flowgraph import (
 )
 from flowgraph.recorder.namespaces import NUMPY as PLAIN
 from flowgraph.recorder.ops import OPS, Spec, bound_attrs, broadcast, promote
-from flowgraph.recorder.symbolic import Symbolic, Trace
+from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Trace
 from flowgraph.types import DTYPES, dtype_name
 
 RANDOM = np.random.default_rng(7)

@@ -21,11 +21,11 @@ from flowgraph import (
     latest,
     load_flight,
     lower,
-    registry,
     simulate,
     simulate_many,
 )
 from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.data import registry
 from flowgraph.study import Study, execution, keys, run_study
 
 pytest.importorskip("pyarrow")

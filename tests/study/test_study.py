@@ -169,7 +169,7 @@ def test_vectorised_runs_are_those_of_one_at_a_time(tmp_path):
 
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
     pytest.importorskip("jax")
-    from flowgraph import xla
+    from flowgraph.engines.xla import scan as xla
 
     tasks._programs.clear()
     compiled: list[Any] = []

@@ -23,7 +23,7 @@ from flowgraph.cli import app
 from flowgraph.study import trials
 from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
 from tests.blocks.datasets.test_datasets import course
-from tests.data import recordings
+from tests.recordings import recordings
 
 PERFECT: dict[str, Any] = {
     "gyro.walk": 0.0, "accelerometer.walk": 0.0, "gyro.bias": 0.0, "accelerometer.bias": 0.0,
@@ -243,7 +243,7 @@ def test_what_fails_at_every_point_is_said_and_not_searched(monkeypatch, engine)
             "needs a C compiler", path="c", expected="cc", got="none", fix="install one"
         )
 
-    for name in ("simulate", "simulate_together"):
+    for name in ("run_graph", "simulate_together"):
         monkeypatch.setattr(trials, name, missing)
     with pytest.raises(MissingDependencyError, match="C compiler"):
         tune("ekf", NOISES[:1], [Recording("sim")], settings={"imu.rate": 50}, engine=engine, most=2)

@@ -1,4 +1,9 @@
-"""C99 from a pipeline: generated, compiled, and called in-process."""
+"""C99 from a pipeline: generated, compiled, and called in-process, or written out as a product of its own.
+
+`source` puts a file together out of expressions, statements and loops, whose order and memory `schedule` and
+`nodes` know; `harness` writes it with a header, a replay program and a Makefile. `compile` keeps what the
+compiler made, `library` calls it, `batch` on as many threads as there are processors; `engine` is its face.
+"""
 
 from __future__ import annotations
 

@@ -9,57 +9,42 @@ afterwards. Only what is kept of the outputs leaves the filter.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape, prepare, tape
+from flowgraph.data.batch import Runs, joined, leaf_type
 from flowgraph.data.series import Series
-from flowgraph.engines.c.engine import Compiled, Room, State, Structs, compiled, shrunk
-from flowgraph.engines.many import Batch, Runs, initial_cells, is_shared, joined, leaf_type, of_run
-from flowgraph.engines.playback import check_faults, real_leaves
-from flowgraph.engines.python.run import Meter
-from flowgraph.language.graph import Graph
-from flowgraph.pipeline.lowering import lower
-from flowgraph.pipeline.optimise import RELYING, for_engine, without
+from flowgraph.data.tape import Tape
+from flowgraph.engines.c.library import Compiled, Room, State, Structs, compiled, shrunk
+from flowgraph.engines.contract import ManyOutcome, ManyRuns, real_leaves
+from flowgraph.engines.options import RunOptions
 from flowgraph.recorder.random import seed_words
 from flowgraph.types import StructType
 
 
-def threaded(
-    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
-    kept: dict[str, list[str]], progress: Meter | None, passes: Collection[str] | None,
-) -> Batch:  # fmt: skip
-    """Runs in C, as many at once as there are processors: a call into C lets other threads go on."""
-    pipeline, real = lower(graph, dtype=dtype), np.dtype(dtype)
-    chosen = for_engine("c", passes)
-    if init is not None:
-        chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
-    shared = is_shared(inputs)
-    first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
-    library = compiled(pipeline, real, first.patterns, chosen)
-    rows = _rows(library, first, real) if shared else None
-    cells = initial_cells(graph, init) if is_shared(init) else None
-    ports = enumerate(pipeline.outputs)
-    outputs = [_Output(library, k, first, kept.get(p.name), len(seeds)) for k, p in ports]
+def threaded(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
+    """Play the runs, as many at once as there are processors: a call into C lets other threads go on."""
+    pipeline, real, seeds = runs.pipeline, np.dtype(options.dtype), runs.seeds
+    first = runs.first
+    library = compiled(pipeline, real, first.patterns, passes)
+    rows = _rows(library, first) if runs.shared else None
+    outputs = [
+        _Output(library, k, first, runs.keep.get(p.name), len(seeds)) for k, p in enumerate(pipeline.outputs)
+    ]
 
     def run(n: int) -> int:
-        events, c = first, library
-        if not shared and n:
-            events = tape(prepare(graph, of_run(inputs, n, seeds[n])), graph, like=first)
-            if events.time is not first.time:
-                c = compiled(pipeline, real, events.patterns, chosen)
-        start = cells if cells is not None else initial_cells(graph, of_run(init, n, seeds[n]))
-        state = State(c, start, seed_words(seeds[n]))
-        given = rows if rows is not None else _rows(c, events, real)
+        events, c = runs.tape(n), library
+        if events.time is not first.time:
+            c = compiled(pipeline, real, events.patterns, passes)
+        state = State(c, runs.cells(n), seed_words(seeds[n]))
+        given = rows if rows is not None else _rows(c, events)
         rooms = [output.room(n, c, events) for output in outputs]
         counts, made = c.advance(state, events.time, events.key, given, rooms)
         if pipeline.faults:
-            check_faults(pipeline, state.after())
+            runs.finish(state.after())
         for output, room, count in zip(outputs, rooms, counts, strict=False):
             output.came(n, events, room, count, made)
         return len(events.time)
@@ -69,15 +54,14 @@ def threaded(
     with ThreadPoolExecutor(min(len(seeds), os.cpu_count() or 1)) as pool:
         for n, played in enumerate(pool.map(run, range(len(seeds)))):
             ticks = played
-            if progress is not None:
-                progress.update(n + 1, 0)
+            if options.progress is not None:
+                options.progress.update(n + 1, 0)
     wall = perf_counter() - start
-    series = {o.name: o.runs() for o in outputs if o.kept}
-    return Batch(graph.name, "c", seeds, {name: series[name] for name in kept}, ticks, wall)
+    return ManyOutcome({o.name: o.runs() for o in outputs if o.kept}, ticks, wall)
 
 
-def _rows(library: Compiled, events: Tape, real: Any) -> Structs:
-    return library.rows([real_leaves(s, real) for s in events.series])
+def _rows(library: Compiled, events: Tape) -> Structs:
+    return library.rows([real_leaves(s, library.real) for s in events.series])
 
 
 class _Output:

@@ -1,248 +1,75 @@
-"""The C engine: a pipeline compiled by the system's compiler and called in this process.
-
-Events are arrays of the structs that the generated header declares, and of the outputs the leaves that are
-asked for are written to arrays that the caller provides, so nothing is converted a tick. A call plays a
-stretch of ticks and lets other threads run meanwhile: many runs go on as many threads.
-"""
+"""The C engine behind the contract of engines: the pipeline as C99, compiled and called in this process."""
 
 from __future__ import annotations
 
-import ctypes
-import math
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, build
-from flowgraph.engines.c.loop import loop_text
-from flowgraph.engines.c.source import MOST_PATTERNS, generate
-from flowgraph.pipeline.optimise import optimise
-from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
-from flowgraph.pipeline.program import specialise
-
-_CHUNK_BYTES = 16 * 2**20
-_MOST_TICKS = 65536
-Structs = list[np.ndarray]
-Room = list[np.ndarray | None]
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Outputs of a stretch of ticks: for each port which of them it is present in, and its leaves there."""
-
-    ticks: int
-    outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.tape import Tape
+from flowgraph.engines.c.batch import threaded
+from flowgraph.engines.c.compile import compiler
+from flowgraph.engines.c.harness import write_c, write_events
+from flowgraph.engines.c.library import Compiled, compiled
+from flowgraph.engines.contract import ManyOutcome, ManyRuns, Outcome, PipelineEngine, Player, real_leaves
+from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.stretches import joined
+from flowgraph.pipeline.optimise import COMPILED
+from flowgraph.pipeline.pipeline import Pipeline
 
 
-class State:
-    """What one run remembers between ticks, as C lays it out.
+class _Loaded(Player):
+    def __init__(self, library: Compiled) -> None:
+        self._library = library
 
-    Args:
-        library: of the run.
-        cells: register cells before the first tick.
-        seed: (2,) uint32.
-    """
-
-    def __init__(self, library: Compiled, cells: Sequence[Any], seed: np.ndarray) -> None:
-        self._memory = np.zeros(library.size + 64, np.uint8)
-        start = -self._memory.ctypes.data % 64
-        self.address = self._memory.ctypes.data + start
-        self._struct = library.cells
-        self._held = [c for r in library.pipeline.registers for c in r.cells]
-        self._seen = self._memory[start : start + self._struct.itemsize].view(self._struct)
-        for name, cell, value in zip(self._struct.names or (), self._held, cells, strict=False):
-            if math.prod(cell.shape):
-                self._seen[name] = np.asarray(value).reshape(self._seen[name].shape)
-        self._seen["fg_seed"] = seed
-
-    def after(self) -> list[np.ndarray]:
-        """Copies of the register cells as they are now."""
-        return [
-            np.array(self._seen[name][0]).reshape(cell.shape)
-            if math.prod(cell.shape)
-            else np.zeros(cell.shape, self._seen.dtype[name].base)
-            for name, cell in zip(self._struct.names or (), self._held, strict=False)
-        ]
+    def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
+        library = self._library
+        rows = library.rows([real_leaves(s, library.real) for s in tape.series])
+        parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in library.pipeline.outputs]
+        done = 0
+        start = perf_counter()
+        for part, after in library.play(cells, seed, tape.time, tape.key, rows):
+            cells = after
+            times = tape.time[done : done + part.ticks]
+            for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
+                kept.append((times[mask], leaves))
+            done += part.ticks
+            if progress is not None:
+                progress.update(done, int(times[-1]))
+        wall = perf_counter() - start
+        return Outcome(cells, joined(library.pipeline, parts, tape), wall)
 
 
-class Compiled:
-    """A pipeline in C, for one kind of real.
+class CEngine(PipelineEngine):
+    """Generated C99, compiled by the system's C compiler; many runs go as many threads."""
 
-    Args:
-        pipeline: what to play.
-        real: float64 or float32.
-        keys: the patterns of present inputs that come.
-        flags: of the compiler.
-        passes: of the optimiser.
+    name = "c"
+    passes = COMPILED
+    takes_many = True
+    writes = True
 
-    Raises:
-        MissingDependencyError: without a compiler.
-    """
+    def need(self) -> None:
+        compiler()
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        real: Any,
-        keys: Sequence[int],
-        flags: tuple[str, ...] = FLAGS,
-        passes: tuple[str, ...] = (),
-    ) -> None:
-        self.pipeline, self.real = pipeline, np.dtype(real)
-        every = 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS
-        self.source = generate(
-            pipeline,
-            self.real.name,
-            patterns=None if every else keys,
-            program=lambda p, key: optimise(specialise(p, key), passes),
-        )
-        m = self.source.names.module
-        files = {
-            f"{m}.h": self.source.header,
-            f"{m}.c": self.source.source,
-            "loop.c": loop_text(pipeline, self.source),
-        }
-        self._library = ctypes.CDLL(str(build(files, flags)))
-        self._play = self._library.flowgraph_play
-        self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
-        self._play.restype = None
-        self._library.flowgraph_size.restype = ctypes.c_size_t
-        self.size = int(self._library.flowgraph_size())
-        names = self.source.names
-        self._inputs = [
-            self._struct(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)
-        ]
-        self._outputs = [
-            self._struct(p.leaves, n) for p, n in zip(pipeline.outputs, names.output_leaves, strict=True)
-        ]
-        cells = [c for r in pipeline.registers for c in r.cells]
-        flat = [n for r in names.registers for n in r]
-        self.cells = self._struct(cells, [*flat, "seed"], seed=True)
-        per_tick = sum(s.itemsize for s in self._outputs) + 8
-        self.chunk = int(max(1, min(_MOST_TICKS, _CHUNK_BYTES // per_tick)))
+    def prepare(
+        self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
+    ) -> Player:
+        return _Loaded(compiled(pipeline, np.dtype(dtype), patterns, passes))
 
-    def _struct(
-        self, leaves: Sequence[Leaf | Cell], names: Sequence[str], *, seed: bool = False
-    ) -> np.dtype[Any]:
-        """The struct that C lays out, as NumPy sees it."""
-        fields: list[Any] = [
-            (n, self._kind(leaf.dtype), max(math.prod(leaf.shape), 1))
-            if leaf.shape
-            else (n, self._kind(leaf.dtype))
-            for n, leaf in zip(names, leaves, strict=False)
-        ]
-        if seed:
-            fields.append(("fg_seed", np.uint32, 2))
-        return np.dtype(fields or [("nothing", np.bool_)], align=True)
+    def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
+        return threaded(runs, passes, options)
 
-    def _kind(self, dtype: str) -> np.dtype[Any]:
-        return self.real if dtype == "real" else np.dtype(dtype)
+    def write(
+        self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
+    ) -> Mapping[str, Path]:
+        return write_c(pipeline, folder, dtype, passes=passes)
 
-    def rows(self, inputs: Sequence[Sequence[np.ndarray]]) -> Structs:
-        """For each input port its events, leaves (n, ...) each, as structs."""
-        made = []
-        for port, struct, leaves in zip(self.pipeline.inputs, self._inputs, inputs, strict=True):
-            rows = np.zeros(len(leaves[0]) if leaves else 0, struct)
-            for name, leaf, array in zip(struct.names or (), port.leaves, leaves, strict=False):
-                rows[name] = array.reshape(rows[name].shape) if math.prod(leaf.shape) else 0
-            made.append(rows)
-        return made
-
-    def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
-        """For each output in how many ticks of these patterns it can be present, and whether it then is."""
-        counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
-        found = []
-        for port in range(len(self.pipeline.outputs)):
-            bits = [(n, *(p >> port & 1 for p in self.source.presence_of(k))) for k, n in counts.items()]
-            found.append((sum(n for n, _, may in bits if may), all(m == must for _, must, m in bits)))
-        return found
-
-    def present(self, key: np.ndarray, port: int) -> np.ndarray:
-        """(T,) bool: where an output is whose presence follows from the patterns alone."""
-        there = {int(k): bool(self.source.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
-        if len(set(there.values())) == 1:
-            return np.full(len(key), next(iter(there.values())))
-        return np.isin(key, [k for k, holds in there.items() if holds])
-
-    def room(self, port: int, *size: int, kept: Collection[str] | None = None) -> Room:
-        """Arrays (*size, ...) for the leaves of an output; None for one that is not among `kept`."""
-        return [
-            np.empty((*size, *leaf.shape), self._kind(leaf.dtype))
-            if kept is None or leaf.name in kept
-            else None
-            for leaf in self.pipeline.outputs[port].leaves
-        ]
-
-    def advance(
-        self, state: State, time: np.ndarray, key: np.ndarray, rows: Structs, rooms: Sequence[Room]
-    ) -> tuple[list[int], np.ndarray]:
-        """Play ticks in one call; the outputs are written to `rooms`, which must have the rows for them.
-
-        Returns:
-            How many rows each output has now, and (T,) uint64 with bit k set where output k was present.
-        """
-        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
-        made, counts = np.empty(len(time), np.uint64), np.zeros(max(len(rooms), 1), np.int64)
-        scratch = [np.empty(1, s) for s in self._outputs]
-        leaves = [None if leaf is None else leaf.ctypes.data for room in rooms for leaf in room]
-        self._play(
-            state.address,
-            len(time),
-            time.ctypes.data,
-            key.ctypes.data,
-            _pointers([r.ctypes.data for r in rows]),
-            _pointers([s.ctypes.data for s in scratch]),
-            _pointers(leaves),
-            made.ctypes.data,
-            counts.ctypes.data,
-        )
-        return counts.tolist(), made
-
-    def play(
-        self,
-        cells: Sequence[Any],
-        seed: np.ndarray,
-        time: np.ndarray,
-        key: np.ndarray,
-        rows: Structs,
-    ) -> Iterator[tuple[Piece, list[np.ndarray]]]:
-        """Play ticks; yields stretches of outputs, with the register cells after each.
-
-        Args:
-            cells: register cells before the first tick.
-            seed: (2,) uint32.
-            time, key: (T,) int64.
-            rows: events of each port, from `rows`.
-        """
-        state = State(self, cells, seed)
-        rows = list(rows)
-        for first in range(0, len(time), self.chunk):
-            here = key[first : first + self.chunk]
-            rooms = [self.room(k, n) for k, (n, _) in enumerate(self.most(here))]
-            counts, made = self.advance(state, time[first : first + self.chunk], here, rows, rooms)
-            rows = [r[int((here >> k & 1).sum()) :] for k, r in enumerate(rows)]
-            outputs = []
-            for k, (room, n) in enumerate(zip(rooms, counts, strict=False)):
-                mask = (made >> np.uint64(k) & np.uint64(1)).astype(bool)
-                outputs.append((mask, [shrunk(leaf, n) for leaf in room if leaf is not None]))
-            yield Piece(len(here), outputs), state.after()
+    def write_events(self, pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: Path) -> int:
+        return write_events(pipeline, inputs, file)
 
 
-def shrunk(leaf: np.ndarray, n: int) -> np.ndarray:
-    """The first n rows, without the memory of the others."""
-    return leaf if len(leaf) == n else leaf[:n].copy()
-
-
-def _pointers(places: Sequence[int | None]) -> Any:
-    return (ctypes.c_void_p * max(len(places), 1))(*places)
-
-
-def compiled(pipeline: Pipeline, real: Any, keys: Sequence[int], passes: tuple[str, ...] = ()) -> Compiled:
-    """The pipeline in C, optimised by `passes`; it lives as long as the pipeline does."""
-    every = 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS
-    which = (np.dtype(real).name, None if every else tuple(keys), passes)
-    kept: dict[Any, Compiled] = pipeline.__dict__.setdefault("_libraries", {})
-    if which not in kept:
-        kept[which] = Compiled(pipeline, real, keys, passes=passes)
-    return kept[which]
+ENGINE = CEngine()

@@ -17,7 +17,7 @@ from flowgraph.engines.c.shapes import JOINS, Shapes, host_kind, within, without
 from flowgraph.engines.c.values import Value, lanes, space_of, unrolled
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import ELEMENTWISE, OPS, Spec, broadcast
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 MOST_PRODUCTS = 600
 """A product of matrices with more scalar products than this is a loop."""

@@ -20,7 +20,7 @@ from flowgraph.engines.c.source import Source, generate
 from flowgraph.engines.c.syntax import comment, string
 from flowgraph.engines.pipeline_inputs import events_of
 from flowgraph.errors import OutputError, writes
-from flowgraph.pipeline.optimise import for_engine, optimise
+from flowgraph.pipeline.optimise import COMPILED, check_passes, optimise
 from flowgraph.pipeline.pipeline import Leaf, Pipeline, Port
 from flowgraph.pipeline.program import specialise
 
@@ -47,7 +47,7 @@ def write_c(
         LoweringError: for what C has no rule for.
         OutputError: where the folder holds another filter's files, or cannot be written.
     """
-    chosen = for_engine("c", passes)
+    chosen = check_passes(COMPILED if passes is None else passes)
     made = source or generate(pipeline, dtype, program=lambda p, key: optimise(specialise(p, key), chosen))
     m = made.names.module
     texts = {

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
+from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.nodes import Macro, View
 from flowgraph.engines.c.syntax import ctype
 
-if TYPE_CHECKING:
-    from flowgraph.engines.c.statements import Writer
 
-
-def write_macro(w: Writer, m: Macro) -> None:
+def write_macro(w: Lines, m: Macro) -> None:
     """Write a macro's loops."""
     _MACROS[m.kind](w, m)
 
 
-def element(w: Writer, view: View, index: Sequence[str]) -> str:
+def element(w: Lines, view: View, index: Sequence[str]) -> str:
     """An element of a view; an axis of size one, and leading axes that are not there, are left out."""
     index = index[len(index) - len(view.shape) :]
     terms = [
@@ -33,7 +30,7 @@ def element(w: Writer, view: View, index: Sequence[str]) -> str:
 class _Loops:
     """Opens loops over axes and closes them again."""
 
-    def __init__(self, w: Writer, sizes: Sequence[int], letter: str = "b") -> None:
+    def __init__(self, w: Lines, sizes: Sequence[int], letter: str = "b") -> None:
         self.w, self.sizes, self.letter = w, sizes, letter
 
     def __enter__(self) -> list[str]:
@@ -51,7 +48,7 @@ class _Loops:
             self.w.line("}")
 
 
-def _pointer(w: Writer, view: View, batch: Sequence[str]) -> str:
+def _pointer(w: Lines, view: View, batch: Sequence[str]) -> str:
     """The address of a view's first element in a batch."""
     view = View(view.buffer, view.shape[:-2], view.offset, view.strides[:-2])
     return "&" + element(w, view, list(batch))
@@ -63,7 +60,7 @@ def _index(strides: Sequence[int], names: Sequence[str]) -> str:
     return " + ".join(terms) or "0"
 
 
-def _call(w: Writer, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
+def _call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
     """Call the function for these sizes and strides, which a file has once, for each of the batch."""
     views = [*m.inputs, m.output]
     key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
@@ -72,7 +69,7 @@ def _call(w: Writer, kind: str, m: Macro, make: Callable[..., str], *more: objec
         w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
 
 
-def _matmul(w: Writer, m: Macro) -> None:
+def _matmul(w: Lines, m: Macro) -> None:
     type_ = ctype(m.output.buffer.dtype, w.write.real)
 
     def text(name: str, a: View, b: View, out: View) -> str:
@@ -104,7 +101,7 @@ static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b
     _call(w, "matmul", m, text, type_)
 
 
-def _cholesky(w: Writer, m: Macro) -> None:
+def _cholesky(w: Lines, m: Macro) -> None:
     real, helper = w.write.real, w.write.helper("fg_cholesky")
 
     def text(name: str, a: View, out: View) -> str:
@@ -124,7 +121,7 @@ static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
     _call(w, "cholesky", m, text)
 
 
-def _solve(w: Writer, m: Macro) -> None:
+def _solve(w: Lines, m: Macro) -> None:
     real, helper = w.write.real, w.write.helper("fg_solve")
 
     def text(name: str, a: View, b: View, out: View) -> str:
@@ -147,7 +144,7 @@ static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, 
     _call(w, "solve", m, text)
 
 
-def _reduce(w: Writer, m: Macro) -> None:
+def _reduce(w: Lines, m: Macro) -> None:
     (x,), out, axes = m.inputs, m.output, m.extra["axes"]
     kind, dtype = m.extra["joins"], out.buffer.dtype
     kept = [k for k in range(len(x.shape)) if k not in axes]
@@ -177,7 +174,7 @@ def _reduce(w: Writer, m: Macro) -> None:
         w.line("}")
 
 
-def _lines(w: Writer, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[str], str], str]]:
+def _lines(w: Lines, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[str], str], str]]:
     """Loops over all axes but one, and how an element along that one is written."""
     shape = m.inputs[0].shape
     others = [n for k, n in enumerate(shape) if k != axis]
@@ -189,7 +186,7 @@ def _lines(w: Writer, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list
     return _Loops(w, others, "r"), at
 
 
-def _cumulative(w: Writer, m: Macro) -> None:
+def _cumulative(w: Lines, m: Macro) -> None:
     axis, dtype = m.extra["axis"], m.output.buffer.dtype
     loops, at = _lines(w, m, axis)
     c = ctype(dtype, w.write.real)
@@ -209,7 +206,7 @@ def _cumulative(w: Writer, m: Macro) -> None:
         w.line("}")
 
 
-def _place(w: Writer, m: Macro) -> None:
+def _place(w: Lines, m: Macro) -> None:
     axis = m.extra["axis"]
     x = m.inputs[0]
     sign = ">" if m.kind == "argmax" else "<"
@@ -229,7 +226,7 @@ def _place(w: Writer, m: Macro) -> None:
         w.line("}")
 
 
-def _sort(w: Writer, m: Macro) -> None:
+def _sort(w: Lines, m: Macro) -> None:
     """In order by insertion for short lines, by heap for long ones; ties by place, NaN last."""
     axis = m.extra["axis"]
     x = m.inputs[0]
@@ -279,7 +276,7 @@ def _sort(w: Writer, m: Macro) -> None:
         w.line("}")
 
 
-def _random(w: Writer, m: Macro) -> None:
+def _random(w: Lines, m: Macro) -> None:
     name = w.write.helper(f"fg_{m.extra['draws']}")
     blocks = m.output.buffer.size // 4
     seed = w.at(m.inputs[0].buffer, "0")
@@ -287,7 +284,7 @@ def _random(w: Writer, m: Macro) -> None:
            f"{w.at(m.inputs[0].buffer, '1')});")  # fmt: skip
 
 
-_MACROS: dict[str, Callable[[Writer, Macro], None]] = {
+_MACROS: dict[str, Callable[[Lines, Macro], None]] = {
     "matmul": _matmul,
     "cholesky": _cholesky,
     "solve": _solve,

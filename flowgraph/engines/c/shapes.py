@@ -14,6 +14,7 @@ import numpy as np
 
 from flowgraph.engines.c.nodes import Node, Tape, View
 from flowgraph.engines.c.values import Value, Values, lanes, row_major, space_of, unrolled
+from flowgraph.pipeline.pipeline import kind_of
 from flowgraph.recorder.ops import Spec
 
 
@@ -154,8 +155,6 @@ class Shapes:
 
     def constant(self, array: Any) -> Value:
         """An array known now."""
-        from flowgraph.pipeline.pipeline import kind_of
-
         found = np.asarray(array)
         view = self.form.constant(found, kind_of(found))
         return Value(Spec(found.shape, kind_of(found)), view=view)

@@ -15,6 +15,7 @@ import numpy as np
 
 from flowgraph.engines.c.expand import Expander
 from flowgraph.engines.c.expressions import Expressions
+from flowgraph.engines.c.header import header, react_signature
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.names import Names, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
@@ -101,8 +102,6 @@ class _File:
         self.presence: dict[int | None, tuple[int, int]] = {}
 
     def source(self) -> Source:
-        from flowgraph.engines.c.header import header
-
         m = self.names.module
         reactions = [self.reaction(key) for key in ([None] if self.patterns is None else self.patterns)]
         reset = self._reset()
@@ -342,8 +341,6 @@ class _File:
         return "\n".join(lines)
 
     def _dispatch(self) -> str:
-        from flowgraph.engines.c.header import react_signature
-
         lines = [react_signature(self.pipeline, self.names, None), "{"]
         outputs = ", ".join(self.names.outputs)
         if self.patterns is None:

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 
 from flowgraph.engines.c.expressions import Expressions
+from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.macros import write_macro
 from flowgraph.engines.c.nodes import Buffer, Macro, Node, Space, Store
 from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
@@ -16,7 +17,7 @@ from flowgraph.recorder.ops import FUNCTIONS
 _SHORT = 50  # characters of an expression that is written where it is used
 
 
-class Writer:
+class Writer(Lines):
     """Writes one reaction.
 
     Args:
@@ -26,9 +27,8 @@ class Writer:
     """
 
     def __init__(self, plan: Schedule, expressions: Expressions, names: Callable[[Buffer], str]) -> None:
-        self.plan, self.write, self.names = plan, expressions, names
-        self.lines: list[str] = []
-        self.depth = 1
+        super().__init__(expressions, names)
+        self.plan = plan
         self.uniform: dict[Node, str] = {}
         self.local: dict[Node, str] = {}
         self.place, self.flat = "", False
@@ -60,17 +60,10 @@ class Writer:
             self.line(f"{self.at(store.buffer, str(store.offset))} = {self.ref(store.node)};")
         return self.lines
 
-    def line(self, text: str) -> None:
-        self.lines.append("    " * self.depth + text)
-
     def _note(self, text: str) -> None:
         if text != self.place:
             self.place = text
             self.line(f"/* {comment(text)} */")
-
-    def at(self, buffer: Buffer, index: str) -> str:
-        """A place in a buffer."""
-        return self.names(buffer) if buffer.bare else f"{self.names(buffer)}[{index}]"
 
     # -- straight code -------------------------------------------------------------------------------
 

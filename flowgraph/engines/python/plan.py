@@ -19,7 +19,7 @@ import numpy as np
 from flowgraph.errors import TypeMismatchError
 from flowgraph.language.block import When
 from flowgraph.language.clock import AllOf, AnyOf, Clock, Condition, Counted, Not, Source
-from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
+from flowgraph.language.graph import NEVER, Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.language.recording import StepTrace
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.types import Signal, as_value
@@ -250,8 +250,6 @@ def _careful(graph: Graph, call: CallNode) -> Callable[..., Any]:
 
 def bindings(graph: Graph) -> dict[str, Any]:
     """The names that every reaction of a graph uses and no run changes: steps, settings, namespace."""
-    from flowgraph.language.graph import NEVER
-
     names: dict[str, Any] = {
         "xp": NUMPY,
         "NEVER": NEVER,

@@ -10,24 +10,18 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from time import perf_counter
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
-from flowgraph.data.inputs import Inputs, batches, check_event, merged, prepare, stack
+from flowgraph.data.inputs import Inputs, check_event, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
+from flowgraph.data.tape import batches, merged, stack
+from flowgraph.engines.options import Meter
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
-
-
-class Meter(Protocol):
-    """Something that is told how far a run has come."""
-
-    def update(self, ticks: int, time: int) -> None:
-        """`ticks` done so far, and the time of the last in ns."""
-
 
 _BATCH = 2048
 

@@ -6,65 +6,45 @@ kept is computed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from flowgraph.data.inputs import Tape, prepare, tape
-from flowgraph.engines.many import Batch, Runs, initial_cells, is_shared, of_run, one_by_one
-from flowgraph.engines.playback import check_faults, dense, real_leaves
-from flowgraph.engines.python.run import Meter
+from flowgraph.data.batch import Runs
+from flowgraph.data.tape import Tape
+from flowgraph.engines.contract import ManyOutcome, ManyRuns, dense, real_leaves
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick
 from flowgraph.errors import DataError
-from flowgraph.language.graph import Graph
-from flowgraph.pipeline.lowering import lower
-from flowgraph.pipeline.optimise import RELYING, for_engine, without
 from flowgraph.pipeline.pipeline import Pipeline, Port
 from flowgraph.recorder.random import seed_words
-
-if TYPE_CHECKING:
-    from flowgraph.engines.xla.scan import Chunk
 
 _TICKS_AT_ONCE = 512
 _CHUNK_BYTES = 64 * 2**20
 
 
-def vectorised(
-    graph: Graph, inputs: Any, seeds: tuple[int, ...], dtype: str, init: Any,
-    kept: dict[str, list[str]], runs_at_once: int, progress: Meter | None, passes: Collection[str] | None,
-) -> Batch:  # fmt: skip
-    from flowgraph.engines.xla.scan import Scan, bytes_per_tick, import_jax
-
-    import_jax()
-    real = np.dtype(dtype)
-    whole = lower(graph, dtype=dtype)
-    pipeline = _pruned(whole, kept)
-    shared = is_shared(inputs)
-    first = tape(prepare(graph, of_run(inputs, 0, seeds[0])), graph)
-    if not len(first.time):  # nothing to compile for
-        nothing = one_by_one(graph, inputs, seeds, "reference", dtype, init, kept, progress, None)
-        return replace(nothing, engine="xla")
-    keys = tuple(int(k) for k in np.unique(first.key))
-    per_tick = runs_at_once * bytes_per_tick(pipeline)
+def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
+    """Play the runs, `options.runs_at_once` in a call."""
+    size, real = options.runs_at_once, np.dtype(options.dtype)
+    pipeline, first, seeds = _pruned(runs.pipeline, runs.keep), runs.first, runs.seeds
+    keys = first.patterns
+    per_tick = size * bytes_per_tick(pipeline)
     ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
-    chosen = for_engine("xla", passes)
-    if init is not None:
-        chosen = without(*RELYING, passes=chosen)  # they rely on the values at reset
-    which = (keys, real.name, ticks, runs_at_once, shared, repr(kept), tuple(chosen))
-    compiled: dict[Any, Scan] = whole.__dict__.setdefault("_batched", {})  # they live as long as it does
+    which = (keys, real.name, ticks, size, runs.shared, repr(runs.keep), passes)
+    # they live as long as the pipeline does
+    compiled: dict[Any, Scan] = runs.pipeline.__dict__.setdefault("_batched", {})
     if which not in compiled:
-        compiled[which] = Scan(pipeline, keys, real, ticks, runs=runs_at_once, shared=shared, passes=chosen)
+        compiled[which] = Scan(pipeline, keys, real, ticks, runs=size, shared=runs.shared, passes=passes)
     scan = compiled[which]
     dense_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []
     wall = 0.0
-    for n, members in enumerate(_chunks(len(seeds), runs_at_once)):
-        columns = (
-            dense_first if shared else _columns(_tapes(graph, inputs, seeds, members, first), False, real)
-        )
-        last = cells = _cells_of(graph, init, seeds, members)
+    for n, members in enumerate(_chunks(len(seeds), size)):
+        columns = dense_first if runs.shared else _columns(_tapes(runs, members), False, real)
+        last = cells = _cells_of(runs, members)
         words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
@@ -74,19 +54,19 @@ def vectorised(
             last = after
         wall += perf_counter() - start
         chunks.append(parts)
-        done = min((n + 1) * runs_at_once, len(seeds))
-        for row in range(done - n * runs_at_once):
-            check_faults(pipeline, [cell[row] for cell in last])
-        if progress is not None:
-            progress.update(done, 0)
+        done = min((n + 1) * size, len(seeds))
+        for row in range(done - n * size):
+            runs.finish([cell[row] for cell in last])
+        if options.progress is not None:
+            options.progress.update(done, 0)
     series = {
         port.name: _collected(port, k, first.time, chunks, len(seeds))
         for k, port in enumerate(pipeline.outputs)
     }
-    return Batch(graph.name, "xla", seeds, series, len(first.time), wall)
+    return ManyOutcome(series, len(first.time), wall)
 
 
-def _pruned(pipeline: Pipeline, kept: dict[str, list[str]]) -> Pipeline:
+def _pruned(pipeline: Pipeline, kept: Mapping[str, list[str]]) -> Pipeline:
     ports = tuple(
         replace(port, leaves=tuple(leaf for leaf in port.leaves if leaf.name in kept[port.name]))
         for port in pipeline.outputs
@@ -102,32 +82,31 @@ def _chunks(count: int, size: int) -> Iterator[tuple[int, ...]]:
         yield part + (part[-1],) * (size - len(part))
 
 
-def _tapes(
-    graph: Graph, inputs: Any, seeds: tuple[int, ...], members: tuple[int, ...], first: Tape
-) -> list[Tape]:
+def _tapes(runs: ManyRuns, members: tuple[int, ...]) -> list[Tape]:
     made: dict[int, Tape] = {}
     for run in members:
         if run not in made:
-            made[run] = tape(prepare(graph, of_run(inputs, run, seeds[run])), graph)
-            _same_ticks(graph, first, made[run], seeds[run])
+            made[run] = runs.tape(run)
+            _same_ticks(runs, made[run], runs.seeds[run])
     return [made[run] for run in members]
 
 
-def _same_ticks(graph: Graph, first: Tape, other: Tape, seed: int) -> None:
+def _same_ticks(runs: ManyRuns, other: Tape, seed: int) -> None:
+    first = runs.first
     if np.array_equal(first.time, other.time) and np.array_equal(first.key, other.key):
         return
     raise DataError(
         "runs in one batch must have their events at the same times",
-        path=f"{graph.name}, seed {seed}",
+        path=f"{runs.name}, seed {seed}",
         expected=f"the {len(first.time)} ticks of the first run",
         got=f"{len(other.time)} ticks, or others",
         fix='run them one by one: engine="python", or a simulate(...) each',
     )
 
 
-def _cells_of(graph: Graph, init: Any, seeds: tuple[int, ...], members: tuple[int, ...]) -> list[np.ndarray]:
+def _cells_of(runs: ManyRuns, members: tuple[int, ...]) -> list[np.ndarray]:
     """Register cells with a leading axis of runs."""
-    made = {run: initial_cells(graph, of_run(init, run, seeds[run])) for run in set(members)}
+    made = {run: runs.cells(run) for run in set(members)}
     return [np.stack(column) for column in zip(*(made[run] for run in members), strict=True)]
 
 

@@ -35,7 +35,7 @@ def import_jax() -> Any:
         MissingDependencyError: with what to install.
     """
     try:
-        import jax
+        import jax  # optional
     except ImportError as error:
         raise MissingDependencyError(
             "the XLA engine needs JAX",

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from flowgraph.pipeline.optimise.elements import MOVES
 from flowgraph.recorder.ops import ELEMENTWISE, Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 KINDS = (
     "multiply",

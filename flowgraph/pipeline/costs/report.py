@@ -16,6 +16,7 @@ from typing import Any
 from flowgraph.errors import DeclarationError
 from flowgraph.pipeline.costs.energy import SOURCE, access_pj, arithmetic_pj
 from flowgraph.pipeline.costs.operations import KINDS, operations
+from flowgraph.pipeline.costs.show import as_html, as_text
 from flowgraph.pipeline.costs.storage import (
     REAL_BITS,
     SMALL,
@@ -158,13 +159,11 @@ class CostReport:
         return next(s.rows for s in self.sections if s.title == title)
 
     def text(self) -> str:
-        from flowgraph.pipeline.costs.show import as_text
-
+        """The tables as plain text."""
         return as_text(self)
 
     def html(self) -> str:
-        from flowgraph.pipeline.costs.show import as_html
-
+        """The tables as a page of its own."""
         return as_html(self)
 
 

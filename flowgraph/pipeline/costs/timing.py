@@ -16,7 +16,7 @@ from flowgraph.pipeline.costs.energy import expanded
 from flowgraph.pipeline.costs.operations import depth, operations
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ __all__ = [
     "RELYING",
     "Plan",
     "check_passes",
-    "for_engine",
     "optimise",
     "plan",
     "usable",
@@ -122,16 +121,6 @@ def check_passes(passes: Collection[str]) -> tuple[str, ...]:
         if name not in PASSES:
             raise UnknownNameError("pass", name, list(PASSES), path="passes")
     return tuple(n for n in PASSES if n in passes)
-
-
-def for_engine(engine: str, passes: Collection[str] | None = None) -> tuple[str, ...]:
-    """The passes that were asked for, or those that suit an engine: none for the reference, the definition.
-
-    Raises:
-        UnknownNameError: for a pass that is not there.
-    """
-    suited = {"reference": (), "xla": ARRAYS, "c": COMPILED}.get(engine, DEFAULT)
-    return check_passes(suited if passes is None else passes)
 
 
 def without(*names: str, passes: Collection[str] = DEFAULT) -> tuple[str, ...]:

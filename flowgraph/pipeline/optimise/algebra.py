@@ -16,7 +16,7 @@ import numpy as np
 from flowgraph.pipeline.optimise.draft import LARGEST_CONSTANT, Draft
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 def simplify(program: Program) -> Program:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flowgraph.pipeline.optimise.draft import Draft
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 def block(draft: Draft, value: int, rows: tuple[int, int], columns: tuple[int, int], by: Instruction) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from flowgraph.pipeline.pipeline import kind_of
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import OPS, Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES
 
 LARGEST_CONSTANT = 4096

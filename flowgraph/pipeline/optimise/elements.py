@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.recorder.ops import ELEMENTWISE, OPS, Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 Table = np.ndarray
 """Of objects: an entry for each element of an array, without its axis of lanes."""

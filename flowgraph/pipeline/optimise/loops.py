@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from flowgraph.pipeline.optimise.draft import Draft, ends
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import ELEMENTWISE
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 
 @dataclass(frozen=True)

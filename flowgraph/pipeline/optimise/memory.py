@@ -19,7 +19,7 @@ import numpy as np
 from flowgraph.pipeline.optimise.draft import ends
 from flowgraph.pipeline.optimise.loops import Loop, loops
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES
 
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
-
-from flowgraph.engines.reference import TOTAL_NUMPY
+from flowgraph.pipeline.evaluate import evaluate
 from flowgraph.pipeline.optimise.draft import LARGEST_CONSTANT, Draft, ends
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.ops import OPS, bound_attrs
 
 _COMMUTATIVE = """
 add multiply maximum minimum equal not_equal logical_and logical_or logical_xor bitwise_and bitwise_or
@@ -27,12 +24,7 @@ def fold(program: Program) -> Program:
         args = draft.args(i)
         small = math.prod(i.spec.shape) <= LARGEST_CONSTANT
         if small and all(a in draft.constants for a in args):
-            with np.errstate(all="ignore"):
-                value = OPS[i.op].run(
-                    TOTAL_NUMPY,
-                    *(draft.constants[a] for a in args),
-                    **bound_attrs(i.op, i.attrs, np.dtype("float64")),
-                )
+            value = evaluate(i, *(draft.constants[a] for a in args))
             draft.replace(i.out, draft.constant(value, i.spec.dtype))
         else:
             draft.keep(i)

@@ -17,7 +17,7 @@ from flowgraph.pipeline.optimise.draft import Draft
 from flowgraph.pipeline.optimise.elements import Table
 from flowgraph.pipeline.optimise.facts import Facts, facts_of
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 SMALL = 64
 """Multiplications of a product that is not looked at: any backend takes it as it is."""

@@ -19,7 +19,7 @@ from flowgraph.pipeline.optimise.draft import Draft
 from flowgraph.pipeline.optimise.elements import Table
 from flowgraph.pipeline.optimise.facts import ONE, ZERO, Facts, facts_of
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 _SIZES = (2, 3, 4, 5, 6)
 _WORTH = 0.75  # of the multiplications may remain, at most

@@ -12,7 +12,7 @@ from flowgraph.pipeline.optimise.blocks2d import block
 from flowgraph.pipeline.optimise.draft import Draft
 from flowgraph.pipeline.optimise.facts import facts_of
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 _BANDS = 5
 

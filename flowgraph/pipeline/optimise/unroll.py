@@ -15,7 +15,7 @@ from flowgraph.pipeline.optimise.draft import Draft, ends
 from flowgraph.pipeline.optimise.elements import Elements, Table
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.symbolic import Instruction
+from flowgraph.recorder.trace import Instruction
 
 LARGEST_ARRAY = 36
 """Elements (beside those along the axis of particles) of an array above which it stays one: 6 by 6."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.reference import TOTAL_NUMPY
+from flowgraph.pipeline.evaluate import evaluate
 from flowgraph.pipeline.program import Program
-from flowgraph.recorder.ops import OPS, Spec, bound_attrs
-from flowgraph.recorder.symbolic import Trace
+from flowgraph.recorder.ops import OPS, Spec
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.trace import Trace
 
 
 def record(
@@ -56,8 +56,7 @@ def play(program: Program, *values: Any) -> list[np.ndarray]:
     with np.errstate(all="ignore"):
         for i in program.instructions:
             assert i.spec == OPS[i.op].rule(*(program.specs[a] for a in i.args), **i.attrs)
-            attrs = bound_attrs(i.op, i.attrs, np.dtype("float64"))
-            env[i.out] = OPS[i.op].run(TOTAL_NUMPY, *(env[a] for a in i.args), **attrs)
+            env[i.out] = evaluate(i, *(env[a] for a in i.args))
             assert np.shape(env[i.out]) == i.spec.shape
     return [env[n] for n in (*program.outputs[0][1], *program.writes)]
 

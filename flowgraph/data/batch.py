@@ -1,0 +1,102 @@
+"""The outcome of many runs of one graph: each collected stream with a leading axis of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.series import Series
+from flowgraph.errors import UnknownNameError
+from flowgraph.types import ArrayType, StructType, dtype_name
+
+
+@dataclass(frozen=True)
+class Runs:
+    """One collected stream of many runs.
+
+    Args:
+        name: of the stream.
+        time: (n,) int64 ns, the same in all runs.
+        present: (runs, n): whether the stream was present; all true unless its clock depends on data.
+        leaves: by dotted name, (runs, n, ...), in XLA and C of the `dtype` that was asked for; zero where
+            absent. Also attributes and items.
+    """
+
+    name: str
+    time: np.ndarray
+    present: np.ndarray
+    leaves: Mapping[str, np.ndarray]
+
+    def __getitem__(self, leaf: str) -> np.ndarray:
+        if leaf not in self.leaves:
+            raise UnknownNameError("field", leaf, self.leaves, path=self.name)
+        return self.leaves[leaf]
+
+    def __getattr__(self, leaf: str) -> np.ndarray:
+        if leaf.startswith("_") or "leaves" not in self.__dict__:
+            raise AttributeError(leaf)
+        try:
+            return self[leaf]
+        except UnknownNameError as error:
+            raise AttributeError(str(error)) from None
+
+    def run(self, index: int) -> Series:
+        """One run's stream, as a single run gives it (of the fields that were kept)."""
+        at = self.present[index]
+        fields = {n: a[index][at] for n, a in self.leaves.items()}
+        if list(fields) == ["value"]:
+            return Series(self.time[at], fields["value"], name=self.name)
+        type_ = StructType(self.name, tuple((n, leaf_type(a)) for n, a in fields.items()), dict)
+        return Series(self.time[at], fields, type=type_, name=self.name)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The outcome of many runs: `batch["pose"].position` is (runs, n, 3).
+
+    Args:
+        graph, engine: names.
+        seeds: of the runs, in the order asked for.
+        series: the collected streams by name.
+        ticks: of one run.
+        wall_s: seconds spent in the engine's loop, without set-up.
+    """
+
+    graph: str
+    engine: str
+    seeds: tuple[int, ...]
+    series: Mapping[str, Runs]
+    ticks: int
+    wall_s: float
+
+    def __getitem__(self, name: str) -> Runs:
+        if name not in self.series:
+            raise UnknownNameError("output", name, self.series, path=self.graph)
+        return self.series[name]
+
+
+def joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:
+    """Series of several runs on the union of their times."""
+    time = parts[0].time
+    same = all(np.array_equal(p.time, time) for p in parts)
+    if same:
+        present = np.ones((len(parts), len(time)), bool)
+    else:
+        time = np.unique(np.concatenate([p.time for p in parts]))
+        present = np.stack([np.isin(time, p.time) for p in parts])
+    made = {}
+    for leaf in leaves:
+        arrays = [p.leaves[leaf] for p in parts]
+        shape, kind = (len(parts), len(time), *arrays[0].shape[1:]), arrays[0].dtype
+        full = np.empty(shape, kind) if same else np.zeros(shape, kind)
+        for row, at, array in zip(full, present, arrays, strict=True):
+            row[... if same else at] = array
+        made[leaf] = full
+    return Runs(name, time, present, made)
+
+
+def leaf_type(array: np.ndarray) -> Any:
+    return ArrayType(array.shape[1:], dtype_name(array))

@@ -1,0 +1,198 @@
+"""The contract of an engine: what runs a graph, behind one face.
+
+Most engines play a pipeline. Such a `PipelineEngine` *prepares* a pipeline for the patterns of present inputs
+that will come, and what it prepared *plays* a tape of ticks from register cells and a seed. One that takes
+many runs at once plays those in one call; the others are called run by run. An engine of the other kind, a
+`BlockEngine`, runs the blocks of a graph themselves, as Python's does: it is given the graph, sees no
+pipeline, and so has no passes to choose from and cannot play a pipeline that was read from a file.
+
+A package offers an engine under the entry-point group `flowgraph.engines`, an object of one of these two
+classes; ours are found the same way. Everything else, from checking events to the types of the outputs, is
+done for it.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.batch import Runs
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.result import Result
+from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape
+from flowgraph.engines.options import DTYPES, Meter, RunOptions
+from flowgraph.errors import DeclarationError
+from flowgraph.language.graph import Graph
+from flowgraph.pipeline.pipeline import Pipeline
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of a pipeline gave.
+
+    Args:
+        cells: the register cells after the last tick, in order.
+        outputs: for each output port its times (n,) int64 ns, and its leaves (n, ...).
+        wall_s: seconds spent in the engine's loop, without set-up.
+    """
+
+    cells: list[Any]
+    outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class ManyRuns:
+    """Runs of one pipeline that go together: with other seeds, and maybe other events and initial values.
+
+    Args:
+        name: of the graph, for messages.
+        pipeline: what to play.
+        seeds: one a run.
+        keep: by output, the names of the leaves that are wanted; an output that is not there is not wanted.
+        first: the ticks of the first run.
+        shared: whether all runs have the events of the first.
+        started: the register cells from which all runs start; None where each has its own.
+        tape: the ticks of the n-th run, checked.
+        cells: the register cells from which the n-th run starts.
+        finish: to be called with the cells of a run that has ended, for the errors that lie in them.
+    """
+
+    name: str
+    pipeline: Pipeline
+    seeds: tuple[int, ...]
+    keep: Mapping[str, list[str]]
+    first: Tape
+    shared: bool
+    started: list[np.ndarray] | None
+    tape: Callable[[int], Tape]
+    cells: Callable[[int], list[np.ndarray]]
+    finish: Callable[[list[Any]], None]
+
+
+@dataclass(frozen=True)
+class ManyOutcome:
+    """What many runs gave: the streams that were wanted, by name, the ticks of one run, and the time."""
+
+    series: Mapping[str, Runs]
+    ticks: int
+    wall_s: float
+
+
+class Engine(abc.ABC):
+    """What runs a graph.
+
+    Attributes:
+        name: by which users ask for it.
+        dtypes: the kinds of number that it offers.
+        takes_many: whether many runs go together in one call.
+    """
+
+    name: str
+    dtypes: tuple[str, ...] = DTYPES
+    takes_many: bool = False
+
+    def need(self) -> None:  # noqa: B027  most need nothing
+        """Refuse where something is not installed that this engine needs.
+
+        Raises:
+            MissingDependencyError: saying what to install.
+        """
+
+    def check(self, options: RunOptions) -> None:
+        """Refuse options that this engine does not have.
+
+        Raises:
+            DeclarationError: naming the option.
+        """
+        if options.dtype not in self.dtypes:
+            raise DeclarationError(
+                f"the {self.name} engine computes in {' and '.join(self.dtypes)}",
+                path=f"engine={self.name!r}",
+                expected=" or ".join(self.dtypes),
+                got=options.dtype,
+                fix="leave dtype out, or choose another engine",
+            )
+
+
+class BlockEngine(Engine):
+    """An engine that runs the blocks of a graph themselves."""
+
+    @abc.abstractmethod
+    def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
+        """Run a graph over its inputs to their end."""
+
+
+class Player(abc.ABC):
+    """A pipeline made ready by an engine."""
+
+    @abc.abstractmethod
+    def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
+        """Play all ticks.
+
+        Args:
+            tape: ticks, and the events of each input.
+            cells: register cells before the first tick, in order.
+            seed: (2,) uint32.
+            progress: told now and then how many ticks are done, and the time of the last.
+        """
+
+
+class PipelineEngine(Engine):
+    """An engine that plays a pipeline's instructions.
+
+    Attributes:
+        passes: of the optimiser, those that suit it.
+        writes: whether it can write the pipeline as source text (`write`, `write_events`).
+    """
+
+    passes: tuple[str, ...] = ()
+    writes: bool = False
+
+    @abc.abstractmethod
+    def prepare(
+        self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
+    ) -> Player:
+        """Make a pipeline ready; what takes long should be kept with the pipeline for the next run.
+
+        Args:
+            pipeline: what to play.
+            patterns: of present inputs, those that occur, in order: bit k is input k.
+            ticks: how many there will be.
+            dtype: what `real` is.
+            passes: of the optimiser, in order.
+        """
+
+    def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
+        """Play many runs in one call; only asked of an engine that `takes_many`."""
+        raise NotImplementedError(f"engine {self.name!r} says that it takes many runs, and has no play_many")
+
+    def write(
+        self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
+    ) -> Mapping[str, Path]:
+        """Write the pipeline as source text into a folder; only asked of an engine that `writes`."""
+        raise NotImplementedError(f"engine {self.name!r} says that it writes, and has no write")
+
+    def write_events(self, pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: Path) -> int:
+        """Write recorded events as what was written reads them; returns the number of ticks."""
+        raise NotImplementedError(f"engine {self.name!r} says that it writes, and has no write_events")
+
+
+def real_leaves(series: Series, real: Any) -> list[np.ndarray]:
+    """The leaves of a series, with its real numbers in the dtype of a run."""
+    return [a.astype(real, copy=False) if a.dtype.kind == "f" else a for a in series.leaves.values()]
+
+
+def dense(leaf: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """One row a tick: `leaf` where `at` is true, zero elsewhere."""
+    if len(leaf) == len(at):
+        return leaf
+    full = np.zeros((len(at), *leaf.shape[1:]), leaf.dtype)
+    full[at] = leaf
+    return full

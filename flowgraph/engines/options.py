@@ -1,0 +1,65 @@
+"""What is asked of a run, as one frozen object that is checked once and travels whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from flowgraph.errors import UnknownNameError
+from flowgraph.pipeline.optimise import check_passes
+from flowgraph.recorder.random import seed_words
+
+DTYPES = ("float64", "float32")
+RUNS_AT_ONCE = 64
+
+PerSeed = Callable[[int], Any]
+
+
+class Meter(Protocol):
+    """Something that is told how far a run has come."""
+
+    def update(self, ticks: int, time: int) -> None:
+        """`ticks` done so far, and the time of the last in ns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What is asked of a run. The engine is a name; `registry.find_engine` knows what it stands for.
+
+    Args:
+        engine: its name.
+        dtype: what `real` is, "float64" or "float32".
+        init: other initial values, by register path; for many runs also a function of the seed or a list.
+        state: a `run.state` or `result.state` to go on from.
+        seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
+        progress: told how far a run has come; of many runs, the number of those that have ended.
+        passes: of the optimiser; None: those that suit the engine.
+        keep: of many runs, what to keep of the outputs; None: everything.
+        runs_at_once: of many runs, how many go in one call where the engine does them in chunks.
+
+    Raises:
+        UnknownNameError: for another dtype or pass.
+        DeclarationError: for a seed that is none.
+    """
+
+    engine: str = "python"
+    dtype: str = "float64"
+    init: Mapping[str, Any] | PerSeed | Sequence[Mapping[str, Any]] | None = None
+    state: Mapping[str, Any] | None = None
+    seed: int = 0
+    progress: Meter | None = None
+    passes: Collection[str] | None = None
+    keep: Sequence[str] | None = None
+    runs_at_once: int = RUNS_AT_ONCE
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DTYPES:
+            raise UnknownNameError("dtype", self.dtype, DTYPES)
+        if self.passes is not None:
+            check_passes(self.passes)
+        seed_words(self.seed)
+
+    def but(self, **changes: Any) -> RunOptions:
+        """The same with some changed."""
+        return replace(self, **changes)

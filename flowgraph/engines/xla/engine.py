@@ -1,0 +1,79 @@
+"""The XLA engine behind the contract of engines; JAX is imported when it is first used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.tape import Tape
+from flowgraph.engines.contract import (
+    ManyOutcome,
+    ManyRuns,
+    Outcome,
+    PipelineEngine,
+    Player,
+    dense,
+    real_leaves,
+)
+from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.stretches import joined
+from flowgraph.engines.xla.batch import vectorised
+from flowgraph.engines.xla.scan import Scan, chunk_size, import_jax
+from flowgraph.pipeline.optimise import ARRAYS
+from flowgraph.pipeline.pipeline import Pipeline
+
+
+class _Compiled(Player):
+    def __init__(self, scan: Scan) -> None:
+        self._scan = scan
+
+    def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
+        columns = []
+        for k, series in enumerate(tape.series):
+            leaves = real_leaves(series, self._scan.dtype)
+            everywhere = len(series) == len(tape.time)
+            columns.append(leaves if everywhere else [dense(x, tape.key & (1 << k) != 0) for x in leaves])
+        self._scan.compile(cells, seed, columns)
+        parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in self._scan.pipeline.outputs]
+        done = 0
+        start = perf_counter()
+        for part, after in self._scan(cells, seed, tape.time, tape.key, columns):
+            cells = after
+            times = tape.time[done : done + part.ticks]
+            for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
+                kept.append((times, leaves) if mask.all() else (times[mask], [leaf[mask] for leaf in leaves]))
+            done += part.ticks
+            if progress is not None:
+                progress.update(done, int(times[-1]))
+        wall = perf_counter() - start
+        return Outcome(cells, joined(self._scan.pipeline, parts, tape), wall)
+
+
+class XlaEngine(PipelineEngine):
+    """The instructions in one compiled scan over the ticks, and under `vmap` over runs; needs JAX."""
+
+    name = "xla"
+    passes = ARRAYS
+    takes_many = True
+
+    def need(self) -> None:
+        import_jax()
+
+    def prepare(
+        self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
+    ) -> Player:
+        chunk = chunk_size(pipeline, ticks)
+        which = (tuple(patterns), dtype, chunk, passes)
+        kept: dict[Any, Scan] = pipeline.__dict__.setdefault("_scans", {})  # as long as the pipeline lives
+        if which not in kept:
+            kept[which] = Scan(pipeline, tuple(patterns), np.dtype(dtype), chunk, passes=passes)
+        return _Compiled(kept[which])
+
+    def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
+        return vectorised(runs, passes, options)
+
+
+ENGINE = XlaEngine()

@@ -1,0 +1,33 @@
+"""Refusing a step by its line: the error names the place in the user's code that asked for what cannot be."""
+
+from __future__ import annotations
+
+import sys
+from typing import NoReturn
+
+from flowgraph.errors import LoweringError
+
+
+def caller() -> str:
+    """module:line of the nearest frame outside the recording machinery."""
+    frame = sys._getframe(1)
+    while frame.f_back and _is_machinery(frame.f_globals.get("__name__", "?")):
+        frame = frame.f_back
+    return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
+
+
+MACHINERY = tuple(
+    f"{__package__}.{name}" for name in ("ops", "refusals", "symbolic", "symbolic_namespace", "trace")
+)
+"""Modules whose frames are not the user's code."""
+
+
+def _is_machinery(module: str) -> bool:
+    return module in MACHINERY or module.partition(".")[0] == "numpy"
+
+
+def refuse(what: str, expected: str, got: str, fix: str, *, in_every_engine: bool = False) -> NoReturn:
+    """Raise the error that names the block's source line."""
+    error = LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
+    error.in_every_engine = in_every_engine
+    raise error
