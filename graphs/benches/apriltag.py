@@ -122,7 +122,7 @@ def _posed(
 
 
 def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: Any) -> None:
-    from flowgraph.drawing.trajectory import plot_ins, plot_space
+    from flowgraph.drawing.trajectory import plot_ins, plot_space  # slow, and only a picture needs it
 
     belief, observed = result["belief"], flight.streams["pose"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +85,7 @@ def registered(**how: object) -> GraphFunction:
 
 def test_the_case_has_what_was_needed_and_what_is_scored():
     case = registered().case(a_flight(), gain=3.0)
+    assert isinstance(case.inputs, Mapping)
     assert list(case.inputs) == ["imu"]
     assert case.estimate == "twice"
     assert case.graph.settings["gain"] == 3.0
@@ -121,6 +123,7 @@ def test_a_setting_that_is_not_there_is_refused_in_code_and_in_words():
 
 def test_a_flight_is_completed_before_streams_are_looked_for():
     case = registered(told=lambda flight: a_flight()).case(Flight("empty", {}))
+    assert isinstance(case.inputs, Mapping)
     assert len(case.inputs["imu"]) == 4
 
 
