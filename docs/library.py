@@ -21,9 +21,10 @@ from flowgraph.types import StructType, Type, leaves_of, struct_type
 
 
 def modules() -> list[ModuleType]:
-    """The modules of the block library."""
-    found = pkgutil.walk_packages(flowgraph.blocks.__path__, "flowgraph.blocks.")
-    return [importlib.import_module(info.name) for info in found]
+    """The modules of the block library, room by room from the bottom up."""
+    rooms = [importlib.import_module(f"flowgraph.blocks.{room}") for room in flowgraph.blocks.__all__]
+    names = [info.name for room in rooms for info in pkgutil.iter_modules(room.__path__, f"{room.__name__}.")]
+    return [importlib.import_module(name) for name in names]
 
 
 def public(kind: type) -> Iterator[tuple[ModuleType, str, Any]]:
@@ -36,11 +37,14 @@ def public(kind: type) -> Iterator[tuple[ModuleType, str, Any]]:
 
 
 def blocks() -> str:
-    """A section a module, with each of its blocks."""
+    """A section a room that has blocks, and one a module, with each of its blocks."""
     text: list[str] = []
     last = None
     for module, name, block in public(Block):
         if module is not last:
+            room = importlib.import_module(module.__name__.rpartition(".")[0])
+            title = f"### {room.__name__}"
+            text += [] if title in text else [title, *paragraphs(room)]
             text += [f"### {module.__name__}", *paragraphs(module)]
             last = module
         text += [f"#### {name}", *block_lines(block), fenced(block.step)]

@@ -13,35 +13,15 @@ holds dt.
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from flowgraph import (
-    Case,
-    Flight,
-    Series,
-    Stream,
-    clocks_of,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.kalman.smoothing import point_steps
-from flowgraph.blocks.metrics.consistency import point_errors
-from flowgraph.blocks.models.point import (
-    WorldAcceleration,
-    between,
-    point_belief,
-    point_model,
-    start_point,
-    told_acceleration,
-)  # fmt: skip
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
-from flowgraph.blocks.signals import Position, Velocity
+from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.models.point import between, point_belief, point_model
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
+from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 
 
 @graph
@@ -84,45 +64,12 @@ def async_kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@async_kalman.on_flight
-def for_flight(
-    flight: Flight,
-    *,
-    position_noise: float | None = None,
-    accelerometer_noise: float | None = None,
-    gate: float | None = None,
-    smooth: str = "none",
-    lag: float | None = None,
-    settle: float = 1.0,
-) -> Case:
+@on_flight(async_kalman, "imu", "vicon")
+def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 
     Args:
         flight: with the streams `imu` and `vicon` (Pose), at any times.
-        position_noise, accelerometer_noise, gate, smooth, lag, settle: as for `kalman`.
     """
-    own = {"position_noise": position_noise, "accelerometer_noise": accelerometer_noise}
-    check_settings("async_kalman", {**own, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
-    inputs = {"position": positions(flight), "acceleration": told_acceleration(flight)}
-    density = given(accelerometer_noise, imu_noise_of("async_kalman", flight).accelerometer)
-    built = async_kalman.build(
-        **clocks_of(inputs),
-        start=start_point(inputs["position"]["position"][0]),
-        noise=density,
-        position_noise=noise_of("async_kalman", flight, "position_noise", position_noise),
-        control=reading_of(flight),
-        gate=gate,
-    )
-    steps = partial(point_steps, model=point_model(density))
-    score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
-    return Case(built, inputs, score)
-
-
-def positions(flight: Flight) -> Series:
-    """The positions of the flight's motion capture.
-
-    Raises:
-        DataError: without one.
-    """
-    vicon = flight.need("async_kalman", "imu", "vicon")["vicon"]
-    return Series(vicon.time, Position(position=vicon["position"]), name="position")
+    inputs = {"position": positions(on.inputs["vicon"]), "acceleration": told_acceleration(on.flight)}
+    return on_point(on, filter, inputs)

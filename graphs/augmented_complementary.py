@@ -21,15 +21,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.orientation.complementary import check_alpha, correct_by_pose, dead_reckon
+from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_reckon
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import imu_noise_of, noise_of
+from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
+from flowgraph.blocks.scoring.orientation import Share
+from flowgraph.blocks.scoring.tuning import imu_noise_of
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
-from flowgraph.language.checks import need_numbers
 
 
 @graph
@@ -61,17 +61,16 @@ def augmented_complementary(
     return {"pose": pose}
 
 
-@augmented_complementary.on_flight
+@on_flight(augmented_complementary, "imu", "vicon")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    alpha: float = 0.4,
-    velocity_alpha: float = 0.6,
-    attitude_alpha: float = 0.85,
+    alpha: Share = 0.4,
+    velocity_alpha: Share = 0.6,
+    attitude_alpha: Share = 0.85,
     covariance: bool = False,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    settle: float = 1.0,
+    pose: PoseNoises,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the first measured pose, at rest.
 
@@ -81,24 +80,17 @@ def for_flight(
         covariance: whether to give one too, and score it.
         position_noise, attitude_noise: standard deviations in m and rad, for the covariance; the flight's own
             if left out.
-        settle: seconds at the start that the errors leave out.
     """
-    check_alpha("augmented_complementary", alpha, velocity_alpha, attitude_alpha)
-    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
-    need_numbers("augmented_complementary", positive=noises, not_negative={"settle": settle})
-    inputs = flight.need("augmented_complementary", "imu", "vicon")
-    first, noise = inputs["vicon"][0], None
+    first, noise = on.inputs["vicon"][0], None
     if covariance:
-        place, turn = (noise_of("augmented_complementary", flight, n, s) for n, s in noises.items())
-        imu = imu_noise_of("augmented_complementary", flight)
-        noise = PoseNoise(imu, place, turn, start=(place, 0.7, turn))
-    built = augmented_complementary.build(
-        **clocks_of(inputs),
+        place = on.noise("position_noise", pose.position_noise)
+        turn = on.noise("attitude_noise", pose.attitude_noise)
+        noise = PoseNoise(imu_noise_of(on.name, on.flight), place, turn, start=(place, 0.7, turn))
+    return on.case(
+        scored.score(on, pose_errors, estimate="belief" if covariance else "pose"),
         start=PoseEstimate(position=first.position, velocity=np.zeros(3), attitude=first.attitude),
         alpha=alpha,
         velocity_alpha=velocity_alpha,
         attitude_alpha=attitude_alpha,
         covariance=noise,
     )
-    estimate = "belief" if covariance else "pose"
-    return Case(built, inputs, scorer(flight, pose_errors, estimate=estimate, settle=settle), estimate)

@@ -20,34 +20,15 @@ group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (r
 
 from __future__ import annotations
 
-from flowgraph import (
-    Case,
-    Flight,
-    Stream,
-    clocks_of,
-    collect,
-    delay,
-    graph,
-    high_pass,
-    latest,
-    low_pass,
-)  # fmt: skip
+from flowgraph import Case, Stream, collect, delay, graph, high_pass, latest, low_pass
 from flowgraph.blocks.metrics.errors import attitude_errors
-from flowgraph.blocks.orientation.complementary import (
-    WorldForce,
-    carry_to_world,
-    check_alpha,
-    first_attitude,
-    level_near,
-    own_density,
-    reading_deviation,
-    turn_by_gyro,
-    with_parts,
-)  # fmt: skip
+from flowgraph.blocks.orientation.complementary import carry_to_world, level_near, turn_by_gyro
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce
-from flowgraph.language.checks import need_numbers
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.orientation import Share
+from flowgraph.blocks.scoring.settings import NotNegative
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
 
 @graph
@@ -89,15 +70,15 @@ def complementary(
     return {"attitude": attitude, "gyroscope": turned}
 
 
-@complementary.on_flight
+@on_flight(complementary, "gyro", "accelerometer", told=with_parts, fix="choose a flight with an imu")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    alpha: float = 0.98,
+    alpha: Share = 0.98,
     covariance: bool = False,
-    gyro_noise: float | None = None,
-    accelerometer_noise: float | None = None,
-    settle: float = 1.0,
+    gyro_noise: NotNegative | None = None,
+    accelerometer_noise: NotNegative | None = None,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight with a gyroscope and an accelerometer, at the truth's first attitude.
 
@@ -108,24 +89,15 @@ def for_flight(
         covariance: whether to give one too, and score it.
         gyro_noise, accelerometer_noise: densities in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), for the covariance;
             the flight's own if left out.
-        settle: seconds at the start that the errors leave out.
     """
-    check_alpha("complementary", alpha)
-    noises = {"gyro_noise": gyro_noise, "accelerometer_noise": accelerometer_noise}
-    need_numbers("complementary", not_negative={**noises, "settle": settle})
-    flight = with_parts(flight)
-    inputs = flight.need("complementary", "gyro", "accelerometer", fix="choose a flight with an imu")
-    push = inputs["accelerometer"]
-    noise = None
+    flight, (gyro, push), noise = on.flight, on.inputs.values(), None
     if covariance:
         force = reading_deviation(flight, "accelerometer", push, accelerometer_noise)
         start = 1e-3 if flight.truth is not None else 0.3
         noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start)
-    built = complementary.build(
-        **clocks_of(inputs),
-        start=first_attitude(flight, inputs["gyro"], push["force"][0]),
+    return on.case(
+        scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
+        start=first_attitude(flight, gyro, push["force"][0]),
         alpha=alpha,
         covariance=noise,
     )
-    estimate = "belief" if covariance else "attitude"
-    return Case(built, inputs, scorer(flight, attitude_errors, estimate=estimate, settle=settle), estimate)

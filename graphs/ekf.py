@@ -17,28 +17,19 @@ with a minus sign, and a correction starts from the prediction. The equations st
 
 from __future__ import annotations
 
-from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
+from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.smoothing import pose_steps
-from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import (
-    QuaternionBelief,
     between_imu,
     pose_belief,
+    pose_steps,
     predict_pose,
     start_pose,
     update_pose,
-)  # fmt: skip
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import (
-    check_settings,
-    gravity_of,
-    noise_of,
-    reading_of,
-    unbiased_noise_of,
-    with_imu,
 )
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.tuning import with_imu
+from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 
 
 @graph
@@ -77,19 +68,8 @@ def ekf(
     return {"belief": pose_belief(posterior), "prior": prior, "posterior": posterior, "control": drive}
 
 
-@ekf.on_flight
-def for_flight(
-    flight: Flight,
-    *,
-    gyro_factor: float | None = None,
-    accelerometer_factor: float | None = None,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    gate: float | None = None,
-    smooth: str = "none",
-    lag: float | None = None,
-    settle: float = 1.0,
-) -> Case:
+@on_flight(ekf, "imu", "vicon", told=with_imu)
+def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the capture's first pose and at rest.
 
     Args:
@@ -97,28 +77,5 @@ def for_flight(
             `gyro` and `coordinate_acceleration`, with the same times.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
-        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
-        smooth: "rts" also scores the smoothed run.
-        lag: s; also scores the run smoothed with a fixed lag.
-        settle: seconds at the start that the errors leave out.
     """
-    factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
-    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
-    check_settings("ekf", {**factors, **noises, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
-    flight = with_imu(flight)
-    inputs = flight.need("ekf", "imu", "vicon")
-    first = inputs["vicon"][0]
-    built = ekf.build(
-        **clocks_of(inputs),
-        start=start_pose(first.position, first.attitude),
-        noise=unbiased_noise_of("ekf", flight, gyro_factor, accelerometer_factor),
-        position_noise=noise_of("ekf", flight, "position_noise", position_noise, 0.004),
-        attitude_noise=noise_of("ekf", flight, "attitude_noise", attitude_noise, 0.01),
-        lever=tuple(flight.info.get("vicon_lever", (0.0, 0.0, 0.0))),
-        reading=reading_of(flight),
-        gate=gate,
-        gravity=gravity_of(flight),
-    )
-    score = scorer(flight, pose_errors, settle=settle, steps=pose_steps, smooth=smooth, lag=lag)
-    return Case(built, inputs, score)
+    return on_capture(on, filter, start=start_pose, steps=pose_steps)

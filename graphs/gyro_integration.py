@@ -10,12 +10,13 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 
 from __future__ import annotations
 
-from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph
+from flowgraph import Case, Stream, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.settings import NotNegative
 from flowgraph.blocks.signals import Attitude, Gyro, Imu
-from flowgraph.language.checks import need_numbers
 
 
 @graph
@@ -31,21 +32,14 @@ def gyro_integration(imu: Stream[Imu], *, start: Attitude):
     return {"attitude": attitude}
 
 
-@gyro_integration.on_flight
-def for_flight(flight: Flight, *, still: float | None = None, settle: float = 1.0) -> Case:
+@on_flight(gyro_integration, "imu")
+def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored) -> Case:
     """Start it on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
     Args:
         flight: with the stream `imu`.
         still: seconds at the start in which the body rests; told by the flight or its readings if left out.
-        settle: seconds at the start that the errors leave out.
     """
-    need_numbers("gyro_integration", not_negative={"still": still, "settle": settle})
-    inputs = flight.need("gyro_integration", "imu")
-    start = Attitude(attitude=orientation_start(flight, inputs["imu"], still).attitude)
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else orientation_errors(result["attitude"], truth, settle=settle)
-
-    return Case(gyro_integration.build(**clocks_of(inputs), start=start), inputs, score, "attitude")
+    begin = orientation_start(on.flight, on.inputs["imu"], still)
+    score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
+    return on.case(score, start=Attitude(attitude=begin.attitude))

@@ -11,23 +11,25 @@ A window of several samples, because the stamps of both sides jitter. The equati
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Annotated
+
 import numpy as np
 
-from flowgraph import Case, DataError, Flight, Result, Series, Stream, clocks_of, delay, graph, latest
+from flowgraph import Case, DataError, Series, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.imu_calibration import (
-    LEAST,
     SAMPLES,
     CountsCalibration,
-    ImuCounts,
-    NormalEquations,
     collect_equations,
     solve_equations,
     sum_counts,
     window_means,
     windows_of,
 )
-from flowgraph.blocks.signals import Attitude
-from flowgraph.language.checks import need_numbers
+from flowgraph.blocks.scoring.calibration import calibration_fit
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.settings import Positive, positive
+from flowgraph.blocks.signals import Attitude, ImuCounts, NormalEquations
 
 _NOTHING = NormalEquations(
     gyro_square=np.zeros((4, 4)),
@@ -61,16 +63,16 @@ def imu_calibration(
     return {"gyro": gyro, "force": force, "equations": equations, "window": window}
 
 
-@imu_calibration.on_flight
+@on_flight(imu_calibration, "counts")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    samples: int = SAMPLES,
-    gate_rate: float = 0.2,
-    gate_force: float = 1.0,
+    samples: Annotated[int, positive] = SAMPLES,
+    gate_rate: Positive = 0.2,
+    gate_force: Positive = 1.0,
     gated: bool = True,
 ) -> Case:
-    """Calibrate the flight's unit by its truth.
+    """Calibrate the flight's unit by its truth; the score is `calibration_fit`.
 
     Args:
         flight: with the stream `counts` (ImuCounts), a truth with `attitude`, and in info perhaps
@@ -79,16 +81,10 @@ def for_flight(
         gate_rate, gate_force: rad/s and m/s^2, the most by which a window may differ from that calibration.
         gated: whether windows are judged at all.
 
-    The score is over the windows that counted: `rate_r2` and `force_r2`, the part of the variance that is
-    explained, on average over the axes; `rate_rms_rad_s` and `force_rms_m_s2`, of what is left.
-
     Raises:
         DataError: where the flight lacks counts or a truth. DeclarationError: for a setting out of range.
     """
-    need_numbers(
-        "imu_calibration", positive={"samples": samples, "gate_rate": gate_rate, "gate_force": gate_force}
-    )
-    inputs = flight.need("imu_calibration", "counts")
+    flight, counts, gates = on.flight, on.inputs["counts"], (gate_rate, gate_force)
     if flight.truth is None:
         raise DataError(
             "this flight lacks what imu_calibration needs",
@@ -98,41 +94,15 @@ def for_flight(
             fix="choose a recording with a motion capture",
         )
     seen = flight.truth[np.isfinite(flight.truth["attitude"]).all(axis=1)]
-    inputs["vicon"] = Series(seen.time, Attitude(attitude=seen["attitude"]), name="vicon")
+    vicon = Series(seen.time, Attitude(attitude=seen["attitude"]), name="vicon")
     prior = flight.info.get("calibration") if gated else None
-    built = imu_calibration.build(
-        **clocks_of(inputs),
+    both = np.concatenate([counts["gyro"], counts["force"]], axis=1)
+    windows = windows_of(counts.time, both, seen.time, seen["attitude"], samples=samples)
+    return on.case(
+        partial(calibration_fit, windows=windows, prior=prior, gates=gates, path=flight.name),
+        inputs={"counts": counts, "vicon": vicon},
+        estimate="window",
         samples=samples,
         prior=prior,
-        gate=(gate_rate, gate_force) if prior is not None else None,
+        gate=gates if prior is not None else None,
     )
-    readings = np.concatenate([inputs["counts"]["gyro"], inputs["counts"]["force"]], axis=1)
-    windows = windows_of(inputs["counts"].time, readings, seen.time, seen["attitude"], samples=samples)
-
-    def score(result: Result) -> dict[str, float]:
-        found: dict[str, float] = {}
-        if not len(result["gyro"]) or not len(result["force"]):
-            raise DataError(
-                "too few windows count for a calibration",
-                path=flight.name,
-                expected=f"at least {LEAST} of rate and of force",
-                got=f"{len(windows.counts)} windows",
-                fix="choose a longer recording, or larger gates",
-            )
-        for k, (name, y, gate) in enumerate(
-            (("rate", windows.rate, gate_rate), ("force", windows.force, gate_force))
-        ):
-            x = windows.counts[:, 3 * k : 3 * k + 3]
-            kept = np.ones(len(x), dtype=bool)
-            if prior is not None:
-                scale = np.array(prior.gyro if k == 0 else prior.force)
-                constant = np.array(prior.gyro_constant if k == 0 else prior.force_constant)
-                kept = np.linalg.norm(y - x @ scale.T - constant, axis=1) <= gate
-            beta = result["gyro" if k == 0 else "force"]["value"][-1]
-            off = (y - x @ beta[:3] - beta[3])[kept]
-            found[f"{name}_r2"] = float(np.mean(1.0 - off.var(axis=0) / y[kept].var(axis=0)))
-            found["rate_rms_rad_s" if k == 0 else "force_rms_m_s2"] = float(np.sqrt(np.mean(off**2)))
-        used = result["equations"]["used"][-1]
-        return {**found, "rate_windows": float(used[0]), "force_windows": float(used[1])}
-
-    return Case(built, inputs, score, estimate="window")

@@ -14,23 +14,24 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowgraph import Case, Flight, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
-from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.particles.resampling import MOST_PARTICLES
-from flowgraph.blocks.particles.states import (
-    StateCloud,
+from flowgraph.blocks.models.particle_ins import (
     average_state,
     propagate_states,
     resample_states,
     start_states,
     weigh_states,
 )
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
-from flowgraph.graphs.euler_flight import need_settings, pose_case
-from flowgraph.language.checks import need_count, need_numbers
+from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
+from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
+from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
+from flowgraph.graphs.tag_pose import poses_of
+
+_ROOM = EulerPose(gyro_factor=3.0, accelerometer_factor=3.0)
 
 
 @graph
@@ -79,64 +80,35 @@ def ins_particle(
     }
 
 
-@ins_particle.on_flight
+@on_flight(ins_particle, "imu")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    particles: int = 1000,
-    seed: int = 0,
-    order: str = "zxy",
-    tags: str = "all",
-    gyro_factor: float = 3.0,
-    accelerometer_factor: float = 3.0,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    inflate: float = 2.0,
-    resample_below: float = 0.5,
-    spread: float = 0.1,
-    scheme: str = "systematic",
-    settle: float = 1.0,
+    cloud: Particles,
+    filter: EulerPose = _ROOM,
+    inflate: Positive = 2.0,
+    spread: NotNegative = 0.1,
 ) -> Case:
     """Start the particles around the first measured pose of a flight, at rest and without biases.
 
     Args:
         flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and `vicon`.
         particles: how many; the course asks for 5,000.
-        seed: of the start's draws; that of the run is given to `simulate`.
-        order: zxy (the course's) or zyx (the report's).
-        tags: all, even or odd: the ids that PnP uses.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU: particles need room.
-        position_noise, attitude_noise: as in `ins_ukf_pose`.
         inflate: on all standard deviations of the measured pose.
-        resample_below: resample when the effective sample size is below this part of the particles.
         spread: by what part of the cloud's deviations the copies are shaken apart.
-        scheme: systematic, stratified, residual or multinomial.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    shared: dict[str, Any] = {
-        "gyro_factor": gyro_factor,
-        "accelerometer_factor": accelerometer_factor,
-        "position_noise": position_noise,
-        "attitude_noise": attitude_noise,
-        "inflate": inflate,
-    }
-    need_settings("ins_particle", order, settle, **shared)
-    need_numbers("ins_particle", not_negative={"resample_below": resample_below, "spread": spread})
-    need_count("ins_particle", "particles", particles, least=1, most=MOST_PARTICLES)
-    return pose_case(
-        ins_particle,
-        flight,
-        order=order,
-        tags=tags,
-        settle=settle,
-        start=lambda first: start_states(particles, first, seed=seed),
+    return on_measured_pose(
+        on,
+        filter,
+        poses_of(on.name, on.flight, tags=filter.tags),
+        inflate=inflate,
+        start=lambda first: start_states(cloud.particles, first, seed=cloud.seed),
         factor=inflate**2,
-        resample_below=resample_below,
         spread=spread,
-        scheme=scheme,
-        **shared,
+        **cloud.resampling(),
     )

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Stream, collect, delay, graph, latest
+from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
@@ -27,10 +26,11 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import carried, far_points
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
+from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
-from flowgraph.blocks.vision.pnp import PoseMeasurement
-from flowgraph.graphs.euler_flight import on_pose_flight
+from flowgraph.graphs.tag_pose import poses_of
 
 
 @graph
@@ -68,4 +68,16 @@ def ins_ukf_pose(
     }
 
 
-for_flight = on_pose_flight(ins_ukf_pose)
+@on_flight(ins_ukf_pose, "imu")
+def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
+    """Start the filter at the first measured pose of a flight, at rest and without biases.
+
+    Args:
+        flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and
+            `vicon`.
+
+    Raises:
+        DataError: where the flight lacks a stream.
+        DeclarationError, UnknownNameError: for a setting that is out of range.
+    """
+    return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags), gate=filter.gate)

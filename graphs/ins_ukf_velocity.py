@@ -13,11 +13,12 @@ Source: the report's second filter. Equations: `blocks/models/euler_ins.py` and
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
-from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
+from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -28,13 +29,13 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
+from flowgraph.blocks.scoring.settings import Positive, named
+from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
-from flowgraph.blocks.vision.motion import CameraMotion
-from flowgraph.data.inputs import clocks_of
-from flowgraph.errors import UnknownNameError
-from flowgraph.graphs.euler_flight import need_settings, noise_of, scored
 
 
 @graph
@@ -75,18 +76,17 @@ def ins_ukf_velocity(
     }
 
 
-@ins_ukf_velocity.on_flight
+@on_flight(ins_ukf_velocity, "imu", "motion")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    rate: str = "gyro",
-    order: str = "zyx",
-    gyro_factor: float = 1.0,
-    accelerometer_factor: float = 1.0,
-    velocity_noise: float = 0.1,
-    rate_noise: float | None = None,
-    gate: float | None = None,
-    settle: float = 1.0,
+    rate: Annotated[str, named("source of the rate", RATES)] = "gyro",
+    order: EulerOrder = "zyx",
+    factors: ScaledFactors,
+    velocity_noise: Positive = 0.1,
+    rate_noise: Positive | None = None,
+    gated: Gated,
+    scored: Scored,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
@@ -94,42 +94,31 @@ def for_flight(
         flight: with the streams `imu` and `motion`, a truth, and the `mount` of the camera in its info.
         rate: gyro (the report's eq. 10) or camera (eq. 9).
         order: zxy (the course's) or zyx (the report's).
-        gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
-        gate: a measurement with a larger normalised innovation squared changes nothing.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight lacks a stream or the truth.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    need_settings(
-        "ins_ukf_velocity", order, settle, gyro_factor=gyro_factor, accelerometer_factor=accelerometer_factor,
-        velocity_noise=velocity_noise, rate_noise=rate_noise, gate=gate,
-    )  # fmt: skip
-    if rate not in RATES:
-        raise UnknownNameError("source of the rate", rate, RATES, path="ins_ukf_velocity.rate")
-    inputs = flight.need("ins_ukf_velocity", "imu", "motion")
-    if flight.truth is None:
+    if on.flight.truth is None:
         raise DataError(
             "this flight does not tell where ins_ukf_velocity starts",
-            path=flight.name,
+            path=on.flight.name,
             expected="a truth",
             got="none",
             fix="build the graph with a start of your own: start_gaussian(position, attitude, order=...)",
         )
-    first = np.array([min(int(s.time[0]) for s in inputs.values())])
-    position, attitude = interpolate_pose(flight.truth, first)
-    built = ins_ukf_velocity.build(
-        **clocks_of(inputs),
+    first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
+    position, attitude = interpolate_pose(on.flight.truth, first)
+    return on.case(
+        euler_score(on, scored, order),
         start=start_gaussian(position[0], attitude[0], order=order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)),
-        noise=noise_of(flight, gyro_factor, accelerometer_factor),
-        mount=flight.info["mount"],
+        noise=factors.imu_noise(on),
+        mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
-        rate_noise={"gyro": 0.02, "camera": 0.2}[rate] if rate_noise is None else rate_noise,
+        rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         order=order,
-        gate=gate,
+        gate=gated.gate,
     )
-    return Case(built, inputs, scored(flight, order, settle))

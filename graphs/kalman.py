@@ -15,36 +15,14 @@ for S), and the control matrix holds dt. Where the positions have a clock of the
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from flowgraph import (
-    Case,
-    DataError,
-    Flight,
-    Series,
-    Stream,
-    arrays,
-    clocks_of,
-    collect,
-    delay,
-    graph,
-)  # fmt: skip
-from flowgraph.blocks.kalman.filters import Gaussian, predict_linear, update_linear
-from flowgraph.blocks.kalman.smoothing import point_steps
-from flowgraph.blocks.metrics.consistency import point_errors
-from flowgraph.blocks.models.point import (
-    PointReading,
-    WorldAcceleration,
-    between,
-    point_belief,
-    point_model,
-    start_point,
-    told_acceleration,
-)  # fmt: skip
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import check_settings, given, imu_noise_of, noise_of, reading_of
+from flowgraph import Case, Stream, collect, delay, graph
+from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.models.point import between, point_belief, point_model
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.point import PointFilter, on_point, readings
+from flowgraph.blocks.signals import Gaussian, PointReading, WorldAcceleration
 
 
 @graph
@@ -79,17 +57,8 @@ def kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@kalman.on_flight
-def for_flight(
-    flight: Flight,
-    *,
-    position_noise: float | None = None,
-    accelerometer_noise: float | None = None,
-    gate: float | None = None,
-    smooth: str = "none",
-    lag: float | None = None,
-    settle: float = 1.0,
-) -> Case:
+@on_flight(kalman, "imu", "vicon")
+def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 
     The positions must come at times of the IMU. Told the exact attitude and bias, the filter is the bound
@@ -97,48 +66,5 @@ def for_flight(
 
     Args:
         flight: with the streams `imu` and `vicon` (Pose).
-        position_noise: standard deviation, m; the flight's own if left out.
-        accelerometer_noise: density, m/s^2/sqrt(Hz); the flight's own if left out.
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
-        smooth: "rts" also scores the smoothed run.
-        lag: s; also scores the run smoothed with a fixed lag.
-        settle: seconds at the start that the errors leave out.
     """
-    own = {"position_noise": position_noise, "accelerometer_noise": accelerometer_noise}
-    check_settings("kalman", {**own, "gate": gate}, settle=settle, smooth=smooth, lag=lag)
-    reading = readings(flight)
-    density = given(accelerometer_noise, imu_noise_of("kalman", flight).accelerometer)
-    built = kalman.build(
-        **clocks_of({"reading": reading}),
-        start=start_point(flight.streams["vicon"]["position"][0]),
-        noise=density,
-        position_noise=noise_of("kalman", flight, "position_noise", position_noise),
-        control=reading_of(flight),
-        gate=gate,
-    )
-    steps = partial(point_steps, model=point_model(density))
-    score = scorer(flight, point_errors, settle=settle, steps=steps, smooth=smooth, lag=lag)
-    return Case(built, {"reading": reading}, score)
-
-
-def readings(flight: Flight) -> Series:
-    """The flight's accelerations, each with the position of its time, NaN where there was none.
-
-    Raises:
-        DataError: without an IMU, motion capture or truth, or where a position comes between two IMU
-            readings.
-    """
-    vicon = flight.need("kalman", "imu", "vicon")["vicon"]
-    control = told_acceleration(flight)
-    if not np.isin(vicon.time, control.time).all():
-        raise DataError(
-            "the positions do not come with the controls",
-            path=flight.name,
-            expected="a stream vicon, at times of the stream imu",
-            got="positions between two readings of the imu",
-            fix="use async_kalman, which takes each when it comes",
-        )
-    position = np.full((len(control), 3), np.nan)
-    position[np.searchsorted(control.time, vicon.time)] = vicon["position"]
-    values = PointReading(acceleration=control["acceleration"], position=position)
-    return arrays(control.time, values, not_finite="keep", name="reading")
+    return on_point(on, filter, {"reading": readings(on.flight)})

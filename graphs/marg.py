@@ -20,12 +20,11 @@ import math
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Stream, clocks_of, delay, graph, latest
+from flowgraph import Case, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import static_alignment
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
-    HeadingBelief,
     join_orientation,
     predict_heading,
     start_heading,
@@ -33,16 +32,16 @@ from flowgraph.blocks.orientation.heading import (
 )
 from flowgraph.blocks.orientation.marg import (
     UNIT,
-    LevelBelief,
     RestRule,
     detect_rest,
     hold_velocity,
     predict_level,
     start_level,
 )
-from flowgraph.blocks.scoring.orientation import scored_errors
-from flowgraph.blocks.signals import Imu, MagneticField
-from flowgraph.language.checks import need_numbers
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.orientation import counted_errors
+from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.signals import HeadingBelief, Imu, LevelBelief, MagneticField
 
 _REST, _TRUST = RestRule(), FieldTrust()
 
@@ -82,17 +81,17 @@ def marg(
     return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}
 
 
-@marg.on_flight
+@on_flight(marg, "imu", "magnetometer")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    speed: float = 0.6,
-    speed_memory: float = 0.3,
-    drift: float = 5e-3,
-    scale: float = 0.01,
-    heading_density: float = 0.2,
-    align: float = 2.0,
-    settle: float = 1.0,
+    speed: Positive = 0.6,
+    speed_memory: Positive = 0.3,
+    drift: NotNegative = 5e-3,
+    scale: NotNegative = 0.01,
+    heading_density: Positive = 0.2,
+    align: Positive = 2.0,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight with an IMU and a magnetometer, aligned by its first readings.
 
@@ -111,28 +110,15 @@ def for_flight(
     Raises:
         DataError: where the flight lacks a stream. DeclarationError: for a setting that is out of range.
     """
-    need_numbers(
-        "marg",
-        positive={
-            "speed": speed,
-            "speed_memory": speed_memory,
-            "heading_density": heading_density,
-            "align": align,
-        },
-        not_negative={"drift": drift, "scale": scale, "settle": settle},
-    )
-    inputs = flight.need("marg", "imu", "magnetometer")
-    imu, field = inputs["imu"], inputs["magnetometer"]
-    earth = flight.info.get("magnetic_field", (0.0, 1.0, -1.0))
+    imu, field = on.inputs.values()
+    earth = on.flight.info.get("magnetic_field", (0.0, 1.0, -1.0))
     north = math.atan2(earth[1], earth[0])
     found = static_alignment(imu, field, seconds=align, north=north)
-    start, heading = start_level(found), start_heading(found, field["field"][0])
-    noise = flight.info.get("imu_noise", UNIT)
-    built = marg.build(
-        **clocks_of(inputs),
-        start=start,
-        heading=heading,
-        noise=noise,
+    return on.case(
+        scored.score(on, counted_errors(on.flight), innovations=False),
+        start=start_level(found),
+        heading=start_heading(found, field["field"][0]),
+        noise=on.flight.info.get("imu_noise", UNIT),
         speed=speed,
         speed_memory=speed_memory,
         drift=drift,
@@ -140,8 +126,3 @@ def for_flight(
         trust=FieldTrust(density=heading_density),
         north=north,
     )
-
-    def score(result: Result) -> dict[str, float]:
-        return scored_errors(result["belief"], flight, settle=settle)
-
-    return Case(built, inputs, score)

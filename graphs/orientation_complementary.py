@@ -23,40 +23,27 @@ Trans. Automatic Control 53(5), 2008, sec. III.
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    DataError,
-    Flight,
-    Stream,
-    clocks_of,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
+from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import level_attitude
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import (
     blend,
     carry_to_world,
-    check_alpha,
-    first_attitude,
     level_near,
-    own_density,
-    reading_deviation,
     remove_thrust,
     turn_by_gyro,
-    with_parts,
 )
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import check_choice, noise_of
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.orientation import Share
+from flowgraph.blocks.scoring.settings import NotNegative, one_of
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
-from flowgraph.language.checks import need_numbers
 
 _STILL = Gyro(rate=np.zeros(3))
 _HOVER = Thrust(thrust=np.float64(-GRAVITY[2]))
@@ -99,17 +86,21 @@ def orientation_complementary(
     return {"attitude": attitude, "seen": seen}
 
 
-@orientation_complementary.on_flight
+_STREAMS = ("gyro", "coordinate_acceleration", "thrust")
+_FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
+
+
+@on_flight(orientation_complementary, *_STREAMS, told=with_parts, fix=_FIX)
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    alpha: float = 0.98,
-    heading: str = "shortest_arc",
+    alpha: Share = 0.98,
+    heading: Annotated[str, one_of("shortest_arc", "gyroscope")] = "shortest_arc",
     covariance: bool = False,
-    gyro_noise: float | None = None,
-    acceleration_noise: float | None = None,
-    thrust_noise: float | None = None,
-    settle: float = 1.0,
+    gyro_noise: NotNegative | None = None,
+    acceleration_noise: NotNegative | None = None,
+    thrust_noise: NotNegative | None = None,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight with thrust and coordinate acceleration, at the truth's first attitude.
 
@@ -125,23 +116,31 @@ def for_flight(
             the flight's own if left out.
         thrust_noise: m/s^2, the standard deviation of a thrust, which should be as frequent as the
             acceleration: one that is held errs alike from one reading to the next.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where a stream is missing, or the vehicle is not carried by its thrust.
     """
-    check_alpha("orientation_complementary", alpha)
-    check_choice("orientation_complementary", "heading", heading, ("shortest_arc", "gyroscope"))
-    noises = {
-        "gyro_noise": gyro_noise,
-        "acceleration_noise": acceleration_noise,
-        "thrust_noise": thrust_noise,
-    }
-    need_numbers("orientation_complementary", not_negative={**noises, "settle": settle})
-    flight = with_parts(flight)
-    names = ("gyro", "coordinate_acceleration", "thrust")
-    fix = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(names)}"
-    inputs = flight.need("orientation_complementary", *names, fix=fix)
+    flight, (gyro, acceleration, thrust), noise = on.flight, on.inputs.values(), None
+    need_carried(flight)
+    if covariance:
+        push = reading_deviation(flight, "coordinate_acceleration", acceleration, acceleration_noise)
+        own = flight.info.get("noise", {}).get("thrust", {}).get("noise")
+        lift = on.noise("thrust_noise", thrust_noise, own)
+        rate = own_density(flight, "gyro", gyro_noise)
+        start = 1e-3 if flight.truth is not None else 0.3
+        noise = AttitudeNoise(rate, (push, push, math.hypot(push, lift)), start)
+    up = np.array([0.0, 0.0, thrust["thrust"][0]])
+    return on.case(
+        scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
+        start=first_attitude(flight, gyro, up - acceleration["acceleration"][0]),
+        alpha=alpha,
+        heading=heading,
+        covariance=noise,
+    )
+
+
+def need_carried(flight: Flight) -> None:
+    """Refuse a flight of which the thrust is not all that carries the vehicle."""
     if flight.info.get("across", 0.0) > MOST_ACROSS:
         raise DataError(
             "thrust is not all that carries this vehicle",
@@ -150,22 +149,3 @@ def for_flight(
             got=f"{flight.info['across']:.2g} m/s^2: the body is held, and its thrust shows no vertical",
             fix="choose a flying world, --data sim:thesis or sim:hover, or the graph complementary",
         )
-    gyro, acceleration, thrust = inputs.values()
-    noise = None
-    if covariance:
-        push = reading_deviation(flight, "coordinate_acceleration", acceleration, acceleration_noise)
-        own = flight.info.get("noise", {}).get("thrust", {}).get("noise")
-        lift = noise_of("orientation_complementary", flight, "thrust_noise", thrust_noise, own)
-        rate = own_density(flight, "gyro", gyro_noise)
-        start = 1e-3 if flight.truth is not None else 0.3
-        noise = AttitudeNoise(rate, (push, push, math.hypot(push, lift)), start)
-    up = np.array([0.0, 0.0, thrust["thrust"][0]])
-    built = orientation_complementary.build(
-        **clocks_of(inputs),
-        start=first_attitude(flight, gyro, up - acceleration["acceleration"][0]),
-        alpha=alpha,
-        heading=heading,
-        covariance=noise,
-    )
-    estimate = "belief" if covariance else "attitude"
-    return Case(built, inputs, scorer(flight, attitude_errors, estimate=estimate, settle=settle), estimate)

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, Flight, Stream, clocks_of, collect, delay, graph, latest
-from flowgraph.blocks.kalman.filters import Gaussian, update_extended
+from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.outdoor.belief import (
@@ -33,9 +33,8 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.language.checks import need_numbers
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
 
 @graph
@@ -89,15 +88,13 @@ def outdoor_eskf(
     return {"belief": outdoor_pose(now)}
 
 
-@outdoor_eskf.on_flight
-def for_flight(flight: Flight, *, settle: float = 1.0) -> Case:
+@on_flight(outdoor_eskf)
+def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
-        settle: seconds at the start that the errors leave out.
     """
-    need_numbers("outdoor_eskf", not_negative={"settle": settle})
-    inputs, sensors, first = outdoor_flight(flight, "outdoor_eskf")
-    built = outdoor_eskf.build(**clocks_of(inputs), start=start_outdoor(first), sensors=sensors)
-    return Case(built, inputs, scorer(flight, pose_errors, settle=settle))
+    inputs, sensors, first = outdoor_flight(on.flight, on.name)
+    score = scored.score(on, pose_errors)
+    return on.case(score, inputs=inputs, start=start_outdoor(first), sensors=sensors)

@@ -10,30 +10,26 @@ the filter be compared with the exact answer.
 
 Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section on the particle filter; N.
 Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stand in
-`blocks/particles/plane.py`.
+`blocks/models/plane.py`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
-from flowgraph.blocks.particles.plane import (
-    PlaneCloud,
-    PlanePosition,
-    PlaneVelocity,
+from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph.blocks.metrics.errors import plane_errors
+from flowgraph.blocks.models.plane import (
     average_plane,
     move_plane,
-    plane_errors,
     plane_sample_size,
     resample_plane,
     start_plane,
     weigh_plane,
 )
-from flowgraph.blocks.particles.resampling import MOST_PARTICLES
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import noise_of
-from flowgraph.language.checks import need_count, need_numbers
+from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
 
 
 @graph
@@ -69,48 +65,31 @@ def particle(
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@particle.on_flight
+@on_flight(particle, "velocity", "position")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    particles: int = 1000,
-    seed: int = 0,
-    resample_below: float = 0.5,
-    scheme: str = "systematic",
-    velocity_noise: float | None = None,
-    position_noise: float | None = None,
-    spread: float = 1.0,
-    settle: float = 1.0,
+    cloud: Particles,
+    velocity_noise: Positive | None = None,
+    position_noise: Positive | None = None,
+    spread: Positive = 1.0,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
 
     Args:
         flight: with the streams `velocity` and `position`.
-        particles: how many.
-        seed: of the start's draws; that of the run is given to `simulate`.
-        resample_below: resample when the effective sample size is below this fraction of the particles.
-        scheme: systematic, stratified, residual or multinomial.
         velocity_noise, position_noise: density in m/s/sqrt(Hz) and standard deviation in m; the flight's own
             if left out.
         spread: standard deviation of the start, m.
-        settle: seconds at the start that the error leaves out.
 
     Raises:
         DataError: where the flight lacks a stream; DeclarationError: for a setting that is out of range.
     """
-    need_numbers(
-        "particle",
-        positive={"velocity_noise": velocity_noise, "position_noise": position_noise, "spread": spread},
-        not_negative={"resample_below": resample_below, "settle": settle},
+    return on.case(
+        scored.score(on, plane_errors),
+        start=start_plane(cloud.particles, seed=cloud.seed, spread=spread),
+        velocity_noise=on.noise("velocity_noise", velocity_noise),
+        position_noise=on.noise("position_noise", position_noise),
+        **cloud.resampling(),
     )
-    need_count("particle", "particles", particles, least=1, most=MOST_PARTICLES)
-    inputs = flight.need("particle", "velocity", "position")
-    built = particle.build(
-        **clocks_of(inputs),
-        start=start_plane(particles, seed=seed, spread=spread),
-        velocity_noise=noise_of("particle", flight, "velocity_noise", velocity_noise),
-        position_noise=noise_of("particle", flight, "position_noise", position_noise),
-        resample_below=resample_below,
-        scheme=scheme,
-    )
-    return Case(built, inputs, scorer(flight, plane_errors, settle=settle))

@@ -19,10 +19,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Stream, clocks_of, collect, delay, graph
+from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman.filters import Gaussian
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -32,10 +31,11 @@ from flowgraph.blocks.orientation.accelerometer import (
     start_orientation,
     turn_by_rate,
 )
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.signals import Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
-from flowgraph.language.checks import need_numbers
 
 KRAFT = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0, mean="kraft")
 """2 n points at sqrt(n) deviations, of weight 1/(2 n)."""
@@ -92,23 +92,23 @@ def quaternion_ukf(
     return {"belief": named_orientation(posterior)}
 
 
-@quaternion_ukf.on_flight
+@on_flight(quaternion_ukf, "imu")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    attitude_walk: float = 0.02,
-    rate_walk: float = 10.0,
-    gyro_noise: float = 0.02,
-    force_noise: float = 2.0,
+    attitude_walk: Positive = 0.02,
+    rate_walk: Positive = 10.0,
+    gyro_noise: Positive = 0.02,
+    force_noise: Positive = 2.0,
     weighted: bool = False,
-    alpha: float = 1.0,
+    alpha: Positive = 1.0,
     beta: float = 2.0,
     kappa: float = 0.0,
     mean: str = "kraft",
-    still: float | None = None,
-    frozen: float = 0.15,
-    gate: float | None = None,
-    settle: float = 1.0,
+    still: NotNegative | None = None,
+    frozen: NotNegative = 0.15,
+    gated: Gated,
+    scored: Scored,
 ) -> Case:
     """Start the filter on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
@@ -121,20 +121,10 @@ def for_flight(
         mean: of quaternions, "kraft" or "markley".
         still: seconds at the start in which the body rests; told by the flight or its readings if left out.
         frozen: after so many seconds of one level a gyroscope is taken to read nothing; 0 for never.
-        gate: a reading with a larger normalised innovation squared changes nothing.
-        settle: seconds at the start that the errors leave out.
     """
-    numbers = {"attitude_walk": attitude_walk, "rate_walk": rate_walk, "gyro_noise": gyro_noise}
-    numbers.update(force_noise=force_noise, alpha=alpha)
-    need_numbers(
-        "quaternion_ukf",
-        positive={**numbers, "gate": gate},
-        not_negative={"still": still, "frozen": frozen, "settle": settle},
-    )
-    inputs = flight.need("quaternion_ukf", "imu")
-    begin = orientation_start(flight, inputs["imu"], still)
-    built = quaternion_ukf.build(
-        **clocks_of(inputs),
+    begin = orientation_start(on.flight, on.inputs["imu"], still)
+    return on.case(
+        scored.score(on, orientation_errors, innovations=False),
         start=start_orientation(begin.attitude),
         attitude_walk=attitude_walk,
         rate_walk=rate_walk,
@@ -144,11 +134,5 @@ def for_flight(
         still=begin.still,
         up=begin.up,
         frozen=frozen,
-        gate=gate,
+        gate=gated.gate,
     )
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else orientation_errors(result["belief"], truth, settle=settle)
-
-    return Case(built, inputs, score)

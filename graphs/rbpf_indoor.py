@@ -15,17 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import (
-    Case,
-    Flight,
-    Series,
-    Stream,
-    clocks_of,
-    delay,
-    graph,
-    latest,
-    merge,
-)
+from flowgraph import Case, Series, Stream, delay, graph, latest, merge
 from flowgraph.blocks.geometry.rotations import level, to_matrix
 from flowgraph.blocks.inertial.alignment import StartSpread
 from flowgraph.blocks.inertial.calibration import subtract_rest_bias
@@ -43,11 +33,11 @@ from flowgraph.blocks.particles.cloud import (
     weights,
 )
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
-from flowgraph.blocks.particles.resampling import MOST_PARTICLES, draw_ancestors, take_ancestors
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
+from flowgraph.blocks.particles.resampling import draw_ancestors, take_ancestors
+from flowgraph.blocks.scoring.cases import OnFlight, Particles, PoseAided, on_flight
+from flowgraph.blocks.scoring.settings import NotNegative
+from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Cloud, Imu, Pose
-from flowgraph.language.checks import need_count, need_numbers
 
 
 @graph
@@ -141,21 +131,14 @@ def rbpf_indoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@rbpf_indoor.on_flight
+@on_flight(rbpf_indoor, "imu", "vicon")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    particles: int = 1000,
-    seed: int = 0,
-    resample_below: float = 0.5,
-    scheme: str = "systematic",
+    cloud: Particles,
     unknown_yaw: bool = True,
-    gyro_factor: float | None = None,
-    accelerometer_factor: float | None = None,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    still: float | None = None,
-    settle: float = 1.0,
+    filter: PoseAided,
+    still: NotNegative | None = None,
 ) -> Case:
     """Start and tune the filter for a flight with an IMU and a motion capture.
 
@@ -165,69 +148,39 @@ def for_flight(
 
     Args:
         flight: with the streams `imu` and `vicon` (Pose).
-        particles: how many.
-        seed: of the start's draws; that of the run is given to `simulate`.
-        resample_below: resample when the effective sample size is below this fraction of the particles.
-        scheme: systematic, stratified, residual or multinomial.
         unknown_yaw: whether nothing is known of the heading at first.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. For real units as in
             `ins_eskf`: a data sheet knows nothing of vibration. The simulated one gets 3 and 2: what
             calibration leaves of a bias is no white noise, and particles need room to move after the first
             pose has left a few of them.
-        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
         still: seconds at the start in which the body does not move; the flight's own, or 1 for `sim`, else 0.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight lacks a stream.
         DeclarationError: for a setting that is out of range.
         UnknownNameError: for a scheme that is not there.
     """
-    need_numbers(
-        "rbpf_indoor",
-        positive={
-            "gyro_factor": gyro_factor,
-            "accelerometer_factor": accelerometer_factor,
-            "position_noise": position_noise,
-            "attitude_noise": attitude_noise,
-        },
-        not_negative={"still": still, "settle": settle, "resample_below": resample_below},
-    )
-    need_count("rbpf_indoor", "particles", particles, least=1, most=MOST_PARTICLES)
-    inputs = flight.need("rbpf_indoor", "imu", "vicon")
-    imu, vicon = inputs.values()
-    simulated = "position_noise" in flight.info
-    still = given(still, flight.info.get("still", 1.0 if simulated else 0.0))
-    attitude = None
-    up = np.array([0.0, 0.0, 1.0])
-    if not unknown_yaw:
-        attitude = _first_attitude(imu, vicon, still)
-        up = to_matrix(attitude, xp=np)[2]
-    built = rbpf_indoor.build(
-        **clocks_of(inputs),
-        start=start_cloud(
-            particles, seed=seed, position=vicon.position[0], attitude=attitude, spread=StartSpread()
-        ),
-        noise=imu_noise_of(
-            "rbpf_indoor",
-            flight,
-            given(gyro_factor, 3.0 if simulated else 15.0),
-            given(accelerometer_factor, 2.0 if simulated else 20.0),
-        ),
-        position_noise=noise_of("rbpf_indoor", flight, "position_noise", position_noise, 0.004),
-        attitude_noise=noise_of("rbpf_indoor", flight, "attitude_noise", attitude_noise, 0.01),
-        lever=flight.info.get("vicon_lever", (0.0, 0.0, 0.0)),
+    imu, vicon = on.inputs.values()
+    info, simulated = on.flight.info, "position_noise" in on.flight.info
+    still = given(still, info.get("still", 1.0 if simulated else 0.0))
+    attitude = None if unknown_yaw else _first_attitude(imu, vicon, still)
+    up = np.array([0.0, 0.0, 1.0]) if attitude is None else to_matrix(attitude, xp=np)[2]
+    place, spread = vicon["position"][0], StartSpread()
+    return on.case(
+        filter.score(on, pose_errors, estimate="pose"),
+        start=start_cloud(cloud.particles, seed=cloud.seed, position=place, attitude=attitude, spread=spread),
+        noise=filter.imu_noise(on, (3.0, 2.0) if simulated else (15.0, 20.0)),
+        **filter.measured(on),
+        lever=info.get("vicon_lever", (0.0, 0.0, 0.0)),
         still=still,
         up=tuple(up.tolist()),
-        resample_below=resample_below,
-        scheme=scheme,
+        **cloud.resampling(),
     )
-    return Case(built, inputs, scorer(flight, pose_errors, estimate="pose", settle=settle), estimate="pose")
 
 
 def _first_attitude(imu: Series, vicon: Series, still: float) -> np.ndarray:
     """The mean attitude (4) measured at rest; without a rest the first one, levelled with the force."""
     if still <= 0.0:
-        return np.asarray(level(vicon.attitude[0], imu.specific_force[0], xp=np))
-    seen = vicon.attitude[vicon.time - vicon.time[0] <= round(still * 1e9)]
+        return np.asarray(level(vicon["attitude"][0], imu["specific_force"][0], xp=np))
+    seen = vicon["attitude"][vicon.time - vicon.time[0] <= round(still * 1e9)]
     return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), seen[0], xp=np))

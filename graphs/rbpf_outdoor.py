@@ -14,11 +14,10 @@ q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
 
 from __future__ import annotations
 
-from flowgraph import Case, Flight, Stream, clocks_of, delay, graph, latest, merge
+from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.outdoor.cloud import (
-    OutdoorCloud,
     as_cloud,
     correct_distance,
     correct_field,
@@ -31,10 +30,9 @@ from flowgraph.blocks.outdoor.cloud import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
-from flowgraph.blocks.particles.resampling import MOST_PARTICLES, draw_ancestors
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Position, Range
-from flowgraph.language.checks import need_count, need_numbers
+from flowgraph.blocks.particles.resampling import draw_ancestors
+from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
 
 @graph
@@ -90,41 +88,24 @@ def rbpf_outdoor(
     return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
 
 
-@rbpf_outdoor.on_flight
-def for_flight(
-    flight: Flight,
-    *,
-    particles: int = 1000,
-    seed: int = 0,
-    resample_below: float = 0.5,
-    scheme: str = "systematic",
-    settle: float = 1.0,
-) -> Case:
+@on_flight(rbpf_outdoor)
+def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for, such as that of
             `sim:thesis` with sensors=imu,gps,gps2,altimeter,magnetometer,optical_flow.
-        particles: how many.
-        seed: of the start's draws; that of the run is given to `simulate`.
-        resample_below: resample when the effective sample size is below this fraction of the particles.
-        scheme: systematic, stratified, residual or multinomial.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight lacks a stream, or optical flow has a gap.
         DeclarationError: for a setting that is out of range.
         UnknownNameError: for a scheme that is not there.
     """
-    need_numbers("rbpf_outdoor", not_negative={"settle": settle, "resample_below": resample_below})
-    need_count("rbpf_outdoor", "particles", particles, least=1, most=MOST_PARTICLES)
-    inputs, sensors, first = outdoor_flight(flight, "rbpf_outdoor")
-    built = rbpf_outdoor.build(
-        **clocks_of(inputs),
-        start=start_outdoor_cloud(particles, first, seed=seed),
+    inputs, sensors, first = outdoor_flight(on.flight, on.name)
+    return on.case(
+        scored.score(on, pose_errors, estimate="pose"),
+        inputs=inputs,
+        start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
         sensors=sensors,
-        resample_below=resample_below,
-        scheme=scheme,
+        **cloud.resampling(),
     )
-    score = scorer(flight, pose_errors, estimate="pose", settle=settle)
-    return Case(built, inputs, score, estimate="pose")

@@ -10,11 +10,11 @@ the signs of this library: specific force, z up.
 
 from __future__ import annotations
 
-from flowgraph import Case, Flight, Result, Stream, clocks_of, graph
+from flowgraph import Case, Stream, graph
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import roll_pitch_attitude
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.signals import Imu
-from flowgraph.language.checks import need_numbers
 
 
 @graph
@@ -26,19 +26,11 @@ def roll_pitch(imu: Stream[Imu]):
     return {"attitude": roll_pitch_attitude(imu, name="attitude")}
 
 
-@roll_pitch.on_flight
-def for_flight(flight: Flight, *, settle: float = 1.0) -> Case:
+@on_flight(roll_pitch, "imu")
+def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     """Run it on a flight with an inertial unit.
 
     Args:
         flight: with the stream `imu`.
-        settle: seconds at the start that the errors leave out.
     """
-    need_numbers("roll_pitch", not_negative={"settle": settle})
-    inputs = flight.need("roll_pitch", "imu")
-    truth = flight.truth
-
-    def score(result: Result) -> dict[str, float]:
-        return {} if truth is None else orientation_errors(result["attitude"], truth, settle=settle)
-
-    return Case(roll_pitch.build(**clocks_of(inputs)), inputs, score, "attitude")
+    return on.case(scored.score(on, orientation_errors, estimate="attitude", innovations=False))

@@ -1,30 +1,29 @@
 """The pose of a body from the tags that its camera sees: the stage on the host, before any filter.
 
 Finding a pose in an image takes OpenCV, which no pipeline holds. So this graph is one of its own, run in
-Python,
-and what it gives is a source of the filters: they are lowered, and it is not. Lowering it says so.
+Python, and what it gives is a source of the filters: they are lowered, and it is not. Lowering it says so.
 
 Sources: `blocks/vision/pnp.py`; the map of tags that nobody surveyed, `blocks/vision/mapping.py`.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, simulate
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.signals import Pose
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.settings import Positive, named, positive
+from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.signals import Pose, PoseMeasurement, Tags
 from flowgraph.blocks.vision.camera import Camera, Mount
-from flowgraph.blocks.vision.mapping import build_map, frames_of
-from flowgraph.blocks.vision.pnp import PoseMeasurement, as_measurements, find_pose, no_pose
-from flowgraph.blocks.vision.tags import TagMap, Tags
-from flowgraph.data.inputs import clocks_of
-from flowgraph.errors import UnknownNameError
-from flowgraph.language.checks import need_numbers
+from flowgraph.blocks.vision.mapping import map_of
+from flowgraph.blocks.vision.pnp import as_measurements, find_pose, no_pose
+from flowgraph.blocks.vision.tags import TagMap
 
-WHICH = ("all", "even", "odd")
+_AT_ONCE = Scored(settle=0.0)
 
 
 @graph
@@ -51,14 +50,14 @@ def tag_pose(
     return {"pose": pose}
 
 
-@tag_pose.on_flight
+@on_flight(tag_pose, "tags")
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    tags: str = "all",
-    pixel_noise: float | None = None,
-    least: int = 1,
-    settle: float = 0.0,
+    tags: Annotated[str, named("set of tags", ("all", "even", "odd"))] = "all",
+    pixel_noise: Positive | None = None,
+    least: Annotated[int, positive] = 1,
+    scored: Scored = _AT_ONCE,
 ) -> Case:
     """Find the poses of a flight with a camera.
 
@@ -68,50 +67,34 @@ def for_flight(
         tags: all, even or odd: the ids that are used.
         pixel_noise: standard deviation of a corner's coordinate, px; the flight's, or 0.5, if left out.
         least: how many tags there must be.
-        settle: seconds at the start that the errors leave out.
 
     Raises:
         DataError: where the flight has no tags.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    need_numbers(
-        "tag_pose", positive={"pixel_noise": pixel_noise, "least": least}, not_negative={"settle": settle}
-    )
-    if tags not in WHICH:
-        raise UnknownNameError("set of tags", tags, WHICH, path="tag_pose.tags")
-    inputs = flight.need("tag_pose", "tags")
-    tag_map = map_of(flight)
+    info, images = on.flight.info, on.inputs["tags"]
+    tag_map = map_of(on.flight)
     if tags != "all":
         tag_map = tag_map.only(tag_map.ids[tag_map.ids % 2 == (tags == "odd")].tolist())
-    noise = flight.info.get("pixel_noise", 0.5) if pixel_noise is None else pixel_noise
-    built = tag_pose.build(
-        **clocks_of(inputs),
-        sizes={"tags": inputs["tags"]["ids"].shape[1]},
-        tag_map=tag_map,
-        camera=flight.info["camera"],
-        mount=flight.info["mount"],
-        pixel_noise=noise,
-        least=least,
-    )
-    truth = flight.truth
+    errors = scored.score(on, pose_errors, estimate="pose")
 
     def score(result: Result) -> dict[str, float]:
         found = result["pose"]
-        row = {"images": float(len(inputs["tags"])), "poses": float(len(found))}
+        row = {"images": float(len(images)), "poses": float(len(found))}
         if len(found):
             row["reprojection_px"] = float(np.median(found["error"]))
-        return row | ({} if truth is None else pose_errors(found, truth, settle=settle))
+        return row | errors(result)
 
-    return Case(built, inputs, score, estimate="pose")
-
-
-def map_of(flight: Flight) -> TagMap:
-    """The flight's map of tags; where nobody surveyed it, one made of all its images."""
-    if "tag_map" in flight.info:
-        found: TagMap = flight.info["tag_map"]
-        return found
-    frames = frames_of(flight.streams["tags"])
-    return build_map(frames, flight.info["camera"], side=flight.info["tag_side"]).tag_map
+    return on.case(
+        score,
+        estimate="pose",
+        sizes={"tags": images["ids"].shape[1]},
+        tag_map=tag_map,
+        camera=info["camera"],
+        mount=info["mount"],
+        pixel_noise=given(pixel_noise, info.get("pixel_noise", 0.5)),
+        least=least,
+    )
 
 
 def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
@@ -149,4 +132,4 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
     )
 
 
-__all__ = ["PoseMeasurement", "map_of", "poses_of", "tag_pose"]
+__all__ = ["PoseMeasurement", "poses_of", "tag_pose"]

@@ -23,20 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import (
-    Array,
-    Case,
-    Flight,
-    Stream,
-    clocks_of,
-    collect,
-    delay,
-    graph,
-    latest,
-)  # fmt: skip
+from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import POSE, between_imu
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -46,16 +34,10 @@ from flowgraph.blocks.models.unscented_pose import (
     see_pose,
     start_state,
 )
-from flowgraph.blocks.scoring.scorer import scorer
-from flowgraph.blocks.scoring.tuning import (
-    check_settings,
-    gravity_of,
-    noise_of,
-    reading_of,
-    unbiased_noise_of,
-    with_imu,
-)
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.scoring.tuning import with_imu
+from flowgraph.blocks.signals import Gaussian, Imu, Pose
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 
@@ -114,20 +96,15 @@ def ukf(
     return {"belief": named_pose(posterior)}
 
 
-@ukf.on_flight
+@on_flight(ukf, "imu", "vicon", told=with_imu)
 def for_flight(
-    flight: Flight,
+    on: OnFlight,
     *,
-    gyro_factor: float | None = None,
-    accelerometer_factor: float | None = None,
-    position_noise: float | None = None,
-    attitude_noise: float | None = None,
-    alpha: float = 1.0,
+    filter: PoseFilter,
+    alpha: Positive = 1.0,
     beta: float = 2.0,
     kappa: float = 0.0,
     mean: str = "markley",
-    gate: float | None = None,
-    settle: float = 1.0,
 ) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the capture's first pose and at rest.
 
@@ -136,28 +113,7 @@ def for_flight(
             `gyro` and `coordinate_acceleration`, with the same times.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
-        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
         alpha, beta, kappa: of the sigma points; in float32 or fixed point alpha must be at least 0.1.
         mean: of quaternions, "markley" or "kraft".
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
-        settle: seconds at the start that the errors leave out.
     """
-    factors = {"gyro_factor": gyro_factor, "accelerometer_factor": accelerometer_factor}
-    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise}
-    check_settings("ukf", {**factors, **noises, "alpha": alpha, "gate": gate}, settle=settle)
-    flight = with_imu(flight)
-    inputs = flight.need("ukf", "imu", "vicon")
-    first = inputs["vicon"][0]
-    built = ukf.build(
-        **clocks_of(inputs),
-        start=start_state(first.position, first.attitude),
-        noise=unbiased_noise_of("ukf", flight, gyro_factor, accelerometer_factor),
-        position_noise=noise_of("ukf", flight, "position_noise", position_noise, 0.004),
-        attitude_noise=noise_of("ukf", flight, "attitude_noise", attitude_noise, 0.01),
-        lever=tuple(flight.info.get("vicon_lever", _NONE)),
-        reading=reading_of(flight),
-        gravity=gravity_of(flight),
-        points=SigmaPoints(alpha, beta, kappa, mean),
-        gate=gate,
-    )
-    return Case(built, inputs, scorer(flight, pose_errors, settle=settle))
+    return on_capture(on, filter, start=start_state, points=SigmaPoints(alpha, beta, kappa, mean))

@@ -86,8 +86,8 @@ def imports(path: Path, source: str) -> Iterator[Import]:
             for child in node.orelse:
                 yield from visit(child, inside, typing)
             return
-        for child in ast.iter_child_nodes(node):
-            yield from visit(child, inside, typing)
+        for part in ast.iter_child_nodes(node):
+            yield from visit(part, inside, typing)
 
     yield from visit(ast.parse(source), False, False)
 

@@ -42,7 +42,7 @@ def test_entry_points_exist() -> None:
     for group in (project["scripts"], *project["entry-points"].values()):
         for target in group.values():
             module, name = target.split(":")
-            assert callable(getattr(importlib.import_module(module), name, None)), target
+            assert getattr(importlib.import_module(module), name, None) is not None, target
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,26 @@ it returns is whole:
     info      calibration and noise by name, and `absent`: by stream, how many samples were NaN
     notes     what was dropped, masked, shifted or assumed, a sentence each
 
+`studentdata` reads the files of a course, `course` simulates flights in the same form, and `coursework` has
+what the course asks of its students.
+
 Rows out of order follow the setting `bad_time` (`tables.POLICIES`); values that cannot be of the unit that a
 stream declares are refused.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rob6213, rosbag, studentdata, tum, umd
+from flowgraph.blocks.datasets import (
+    broad,
+    course,
+    csv_file,
+    ese650,
+    euroc,
+    rob6213,
+    rosbag,
+    studentdata,
+    tum,
+    umd,
+)
 
-__all__ = ["broad", "csv_file", "ese650", "euroc", "rob6213", "rosbag", "studentdata", "tum", "umd"]
+__all__ = ["broad", "course", "csv_file", "ese650", "euroc", "rob6213", "rosbag", "studentdata", "tum", "umd"]

@@ -23,8 +23,9 @@ from flowgraph.blocks.datasets.studentdata import SETTINGS as READING
 from flowgraph.blocks.datasets.studentdata import flight_of
 from flowgraph.blocks.geometry.euler import angles_from_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.signals import CameraMotion
 from flowgraph.blocks.vision.camera import Camera
-from flowgraph.blocks.vision.motion import CameraMotion, camera_motion_of
+from flowgraph.blocks.vision.motion import camera_motion_of
 from flowgraph.errors import DeclarationError
 
 __all__ = ["SETTINGS", "Motion", "load", "motion", "see", "simulated_content"]

@@ -27,14 +27,8 @@ from flowgraph.blocks.datasets.matfile import read_mat
 from flowgraph.blocks.datasets.shape import Recording, known, offset, policy
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.inertial.imu_calibration import (
-    CountsCalibration,
-    ImuCounts,
-    calibrated,
-    fit_counts,
-    windows_of,
-)  # fmt: skip
-from flowgraph.blocks.signals import Attitude, Imu
+from flowgraph.blocks.inertial.imu_calibration import CountsCalibration, calibrated, fit_counts, windows_of
+from flowgraph.blocks.signals import Attitude, Imu, ImuCounts
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["DATA_SHEET", "LATE", "NOISE", "SETTINGS", "load", "sets_in"]

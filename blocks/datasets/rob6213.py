@@ -28,20 +28,20 @@ import numpy as np
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
-from flowgraph import Array, Flight, Series, Signal, real
+from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
 from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
 from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.geometry.euler import quaternion_from_angles
 from flowgraph.blocks.geometry.rotations import multiply
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import CameraMotion, Imu, MotionTruth
 from flowgraph.blocks.vision.camera import COURSE_MOUNT
-from flowgraph.blocks.vision.motion import CameraMotion, find_delay, velocity_error
+from flowgraph.blocks.vision.motion import find_delay, velocity_error
 from flowgraph.blocks.vision.pnp import as_measurements
 from flowgraph.errors import DataError
 
-__all__ = ["NOISE", "SETTINGS", "MotionTruth", "derived_imu", "load"]
+__all__ = ["NOISE", "SETTINGS", "derived_imu", "load"]
 
 SETTINGS: Mapping[str, str] = {
     "frame": "registered: poses taken into the motion capture's world; raw: as recorded",
@@ -66,15 +66,6 @@ POSE_NOISE = {"position_noise": 0.01, "attitude_noise": 0.05}
 more than the errors' own 0.015."""
 
 _COLUMNS = "t,x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz"
-
-
-class MotionTruth(Signal):
-    """What a motion capture knows: pose, velocity (world) and angular rate (body)."""
-
-    position: Array = real(3, unit="m", frame="world")
-    velocity: Array = real(3, unit="m/s", frame="world")
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    rate: Array = real(3, unit="rad/s", frame="body")
 
 
 def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:

@@ -27,7 +27,7 @@ from flowgraph.blocks.datasets.shape import chosen, known, number, split_argumen
 from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.geometry.euler import quaternion_from_angles
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Imu, MotionTruth
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import measure
 from flowgraph.blocks.vision.tags import tags_series
@@ -206,8 +206,6 @@ def vicon_rows(content: Mapping[str, Any], file: Path) -> tuple[np.ndarray, np.n
 
 
 def _truth(content: Mapping[str, Any], file: Path) -> tuple[Series, list[str]]:
-    from flowgraph.blocks.datasets.rob6213 import MotionTruth
-
     seconds, x = vicon_rows(content, file)
     finite = np.isfinite(x).all(axis=1) & np.isfinite(seconds)
     notes = (

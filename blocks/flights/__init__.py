@@ -1,11 +1,12 @@
-"""Simulated flights. Recorded ones are in `flowgraph.blocks.datasets`.
+"""Simulated flights: a world, sensors in it, and a `Flight` of what they read.
 
-Each module has one entry point, `load(argument, *, seed=0, settings={}) -> Flight`; `simulated` makes
-quadrotor flights; `worlds` has those through the simulated world.
+`simulated` is the maker that `sim` stands for, `load(argument, *, seed=0, settings={}) -> Flight`: a smooth
+figure of a quadrotor with an IMU and a motion capture, or one of the others. `worlds` has the flights through
+the simulated world with sensors of choice, `plane` a point in the plane. Recorded flights are in `datasets`.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.flights import simulated
+from flowgraph.blocks.flights import plane, simulated, worlds
 
-__all__ = ["simulated"]
+__all__ = ["plane", "simulated", "worlds"]

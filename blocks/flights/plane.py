@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.particles.plane import PlanePosition, PlaneVelocity
+from flowgraph.blocks.signals import PlanePosition, PlaneVelocity
 from flowgraph.blocks.world import generator
 from flowgraph.errors import DeclarationError, UnknownNameError
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.errors import UnknownNameError
 
 __all__ = [
@@ -98,8 +99,6 @@ def angles_from_matrix(R: Array, *, order: str, xp: Any) -> Array:
 
 def angles_from_quaternion(q: Array, *, order: str, xp: Any) -> Array:
     """The angles (..., 3) of a unit quaternion (..., 4), body to world."""
-    from flowgraph.blocks.geometry.rotations import to_matrix
-
     return angles_from_matrix(to_matrix(q, xp=xp), order=order, xp=xp)
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Flight, Series, Signal, block, real
+from flowgraph import Array, Flight, Series, block
 from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     level,
@@ -23,10 +23,9 @@ from flowgraph.blocks.geometry.rotations import (
     rotate,
     to_matrix,
 )
-from flowgraph.blocks.signals import Attitude, Belief, Imu, MagneticField, SpecificForce
+from flowgraph.blocks.signals import Alignment, Attitude, Belief, Imu, MagneticField, SpecificForce
 
 __all__ = [
-    "Alignment",
     "Start",
     "StartSpread",
     "align_static",
@@ -36,19 +35,6 @@ __all__ = [
     "start_belief",
     "static_alignment",
 ]
-
-
-class Alignment(Signal):
-    """What the readings of a body at rest say of it.
-
-    attitude: body to world. gyro_bias: rad/s, body. resting: 1 while the readings are those of a body at
-    rest, else 0; then attitude and bias are the last that were found. seconds: how long it has rested.
-    """
-
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    gyro_bias: Array = real(3, unit="rad/s", frame="body")
-    resting: Array = real()
-    seconds: Array = real(unit="s")
 
 
 @block

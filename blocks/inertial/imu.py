@@ -23,12 +23,9 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
     to_matrix,
 )
-from flowgraph.blocks.signals import Belief, Imu
+from flowgraph.blocks.signals import GRAVITY, Belief, Imu
 
 __all__ = ["GRAVITY", "ImuNoise", "predict"]
-
-GRAVITY = (0.0, 0.0, -9.81)
-"""Gravity in the world, m/s^2: z is up."""
 
 
 @dataclass(frozen=True)

@@ -27,17 +27,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, real, when
+from flowgraph import Array, block, when
 from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate, to_rotation_vector
-from flowgraph.blocks.signals import Attitude, Imu
+from flowgraph.blocks.signals import Attitude, CountsSum, Imu, ImuCounts, NormalEquations, Window
 from flowgraph.errors import DataError
 
 __all__ = [
     "CountsCalibration",
-    "CountsSum",
-    "ImuCounts",
-    "NormalEquations",
-    "Window",
     "calibrated",
     "collect_equations",
     "fit_counts",
@@ -61,47 +57,6 @@ LEAST = 50
 
 SAMPLES = 5
 """Motion capture samples on either side of a window's middle; at 100 Hz the window lasts 0.1 s."""
-
-
-class ImuCounts(Signal):
-    """What the converters of an inertial unit give, before any calibration: counts, in the body's axes."""
-
-    gyro: Array = real(3, frame="body")
-    force: Array = real(3, frame="body")
-
-
-class CountsSum(Signal):
-    """The integral of counts over time so far, each reading held until the next.
-
-    total: (gyro, force), counts s. running: 1 once there was a reading, before that 0.
-    """
-
-    total: Array = real(6)
-    running: Array = real()
-
-
-class Window(Signal):
-    """Mean counts over a window beside what the motion capture says they are worth.
-
-    counts: (gyro, force). rate: rad/s, body. force: m/s^2, body.
-    """
-
-    counts: Array = real(6)
-    rate: Array = real(3, unit="rad/s", frame="body")
-    force: Array = real(3, unit="m/s^2", frame="body")
-
-
-class NormalEquations(Signal):
-    """A^T A and A^T y of both fits, so far, with a = [(c - CENTRE) / SPAN, 1].
-
-    The unknowns of each are 3 x 3 and a constant. used: how many windows counted.
-    """
-
-    gyro_square: Array = real(4, 4)
-    gyro_right: Array = real(4, 3)
-    force_square: Array = real(4, 4)
-    force_right: Array = real(4, 3)
-    used: Array = real(2)
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,50 @@
-"""Kalman."""
+"""The Kalman filter: predict and correct a Gaussian over any state, and smooth a whole run afterwards.
+
+`linear` is motion in continuous time and its exact steps over any dt. `filters` predicts and corrects with
+it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
+its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `smoothing`
+goes back over a run and adds to each state what later measurements say of it. What moves and what is measured
+is not said here: see `models`.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.kalman.filters import (
+    Correction,
+    Vector,
+    correct,
+    predict_linear,
+    update_extended,
+    update_linear,
+)
+from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.roots import (
+    lower_root,
+    predict_root,
+    semidefinite_root,
+    update_extended_root,
+    update_root,
+)
+from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+
+__all__ = [
+    "LinearModel",
+    "Correction",
+    "Vector",
+    "correct",
+    "predict_linear",
+    "update_extended",
+    "update_linear",
+    "lower_root",
+    "predict_root",
+    "semidefinite_root",
+    "update_extended_root",
+    "update_root",
+    "Steps",
+    "fixed_lag",
+    "lag_ticks",
+    "rauch_tung_striebel",
+    "Gaussian",
+    "KalmanInnovation",
+]

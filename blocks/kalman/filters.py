@@ -20,15 +20,14 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, boolean, real, when
+from flowgraph import Array, block, real, when
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.metrics.chi_square import gate_table
+from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
     "Correction",
-    "Gaussian",
-    "KalmanInnovation",
     "Vector",
     "correct",
     "predict_linear",
@@ -38,29 +37,6 @@ __all__ = [
 
 Vector = Annotated[Any, real("m")]
 """A control or a measurement: m real numbers."""
-
-
-class Gaussian(Signal):
-    """A Gaussian belief: its mean (n) and its covariance (t, t) in the tangent space; t = n for vectors."""
-
-    mean: Array = real("n")
-    covariance: Array = real("t", "t")
-
-
-class KalmanInnovation(Signal):
-    """What a measurement said beyond its prediction.
-
-    residual: measured minus predicted, 0 where an entry is missing. covariance: of the residual, as the
-    filter expects it; 1 on the diagonal where an entry is missing. nis: residual^T covariance^-1 residual.
-    parts: how many entries there were, which is the mean of `nis` in a consistent filter. accepted: whether
-    it passed the gate.
-    """
-
-    residual: Array = real("m")
-    covariance: Array = real("m", "m")
-    nis: Array = real()
-    parts: Array = real()
-    accepted: Array = boolean()
 
 
 class Correction(NamedTuple):

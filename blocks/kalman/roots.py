@@ -21,34 +21,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import (
-    KalmanInnovation,
-    Vector,
-    accepts,
-    innovate,
-    masked,
-    moved,
-    where_any,
-)
+from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
 from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.signals import GaussianRoot, KalmanInnovation
 
 __all__ = [
-    "GaussianRoot",
     "lower_root",
     "predict_root",
     "semidefinite_root",
     "update_extended_root",
     "update_root",
 ]
-
-
-class GaussianRoot(Signal):
-    """A Gaussian belief by the lower triangular root of its covariance: covariance = root root^T."""
-
-    mean: Array = real("n")
-    root: Array = real("t", "t")
 
 
 @block

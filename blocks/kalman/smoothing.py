@@ -21,15 +21,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Result, Series
-from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
-from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph import Series
+from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.models.point import point_belief
-from flowgraph.blocks.models.pose import PoseBelief, pose_belief, tangent_jacobian
+from flowgraph.blocks.signals import Gaussian
 from flowgraph.errors import DataError
 
-__all__ = ["Steps", "fixed_lag", "lag_ticks", "point_steps", "pose_steps", "rauch_tung_striebel"]
+__all__ = ["Steps", "fixed_lag", "lag_ticks", "rauch_tung_striebel"]
 
 Transition = LinearModel | np.ndarray
 """How the state at one tick goes on to the next: a model, or the n - 1 Jacobians (t, t) of the steps."""
@@ -43,42 +41,6 @@ class Steps(NamedTuple):
     transition: Transition
     space: StateSpace | None
     named: Callable[[Series], Series]
-
-
-def point_steps(result: Result, model: LinearModel) -> Steps:
-    """Those of a run of `kalman` or `async_kalman`, which collect `prior` and `posterior`."""
-
-    def named(smoothed: Series) -> Series:
-        return Series(smoothed.time, point_belief.step(smoothed.values), name=smoothed.name)
-
-    return Steps(result["prior"], result["posterior"], model, None, named)
-
-
-def pose_steps(result: Result) -> Steps:
-    """Those of a run of `ekf`, which collects `prior`, `posterior` and the `control` of each prediction.
-
-    The state is (position, velocity, attitude), ten numbers, and its errors are the nine of `PoseBelief`.
-    """
-    prior, posterior = (_in_tangent_space(result[name]) for name in ("prior", "posterior"))
-    rows = zip(
-        posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
-        np.diff(posterior.time) * 1e-9, strict=True,
-    )  # fmt: skip
-    jacobians = [tangent_jacobian(q, ahead, control, dt, np) for q, ahead, control, dt in rows]
-    space = StateSpace(euclidean(6), quaternion())
-
-    def named(smoothed: Series) -> Series:
-        p, v, q = np.split(smoothed["mean"], (3, 6), axis=-1)
-        return Series(smoothed.time, PoseBelief(p, v, q, smoothed["covariance"]), name=smoothed.name)
-
-    return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
-
-
-def _in_tangent_space(series: Series) -> Series:
-    """A series of `QuaternionBelief` as `Gaussian` of (position, velocity, attitude)."""
-    belief = pose_belief.step(series.values, xp=np)
-    mean = np.concatenate([belief.position, belief.velocity, belief.attitude], axis=-1)
-    return Series(series.time, Gaussian(mean=mean, covariance=belief.covariance), name=series.name)
 
 
 def rauch_tung_striebel(

@@ -1,1 +1,53 @@
-"""Metrics."""
+"""Metrics: how good an estimate is, and whether its filter knew.
+
+`errors` compares an estimate with a truth: metres, degrees, and the NEES, the squared error in deviations of
+the filter's own. `chi_square` says how large such a square is when all is well, which gives bands for the
+average and gates for single measurements. `consistency` has what needs no truth, the NIS of innovations. All
+run on the host after a run, but for the limits of a gate, which become constants of the graph.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.metrics.chi_square import (
+    chi_square,
+    chi_square_band,
+    chi_square_gate,
+    gate_table,
+    inside,
+)
+from flowgraph.blocks.metrics.consistency import nis_summary, point_errors, state_nees
+from flowgraph.blocks.metrics.errors import (
+    attitude_errors,
+    error_summary,
+    interpolate,
+    interpolate_pose,
+    nees,
+    nees_summary,
+    orientation_errors,
+    plane_errors,
+    pose_errors,
+    state_error,
+    within_truth,
+)
+
+__all__ = [
+    "chi_square",
+    "chi_square_band",
+    "chi_square_gate",
+    "gate_table",
+    "inside",
+    "attitude_errors",
+    "error_summary",
+    "interpolate",
+    "interpolate_pose",
+    "nees",
+    "nees_summary",
+    "orientation_errors",
+    "plane_errors",
+    "pose_errors",
+    "state_error",
+    "within_truth",
+    "nis_summary",
+    "point_errors",
+    "state_nees",
+]

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaincc, gammainccinv, gammaincinv
 
 __all__ = ["chi_square", "chi_square_band", "chi_square_gate", "gate_table", "inside"]
 
 
 def chi_square(probability: npt.ArrayLike, parts: npt.ArrayLike) -> np.ndarray:
     """What a chi-square variable with `parts` degrees of freedom stays below with this probability."""
+    from scipy.special import gammaincinv  # slow to import, and only gates and scores need it
+
     return np.asarray(
         2.0 * gammaincinv(0.5 * np.asarray(parts, dtype=float), np.asarray(probability, dtype=float))
     )
@@ -49,6 +50,8 @@ def gate_table(gate: float, parts: int) -> np.ndarray:
     n = np.arange(1, parts + 1)
     if gate < 1.0:
         return np.r_[0.0, chi_square(gate, n)]
+    from scipy.special import gammaincc, gammainccinv  # slow to import, and only gates need it
+
     beyond = gammaincc(0.5 * parts, 0.5 * gate)  # 0 for what nothing exceeds: then the limit stays
     return np.r_[0.0, np.minimum(2.0 * gammainccinv(0.5 * n[:-1], beyond), gate), gate]
 

@@ -15,21 +15,10 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Series
-from flowgraph.blocks.metrics.chi_square import chi_square, chi_square_band, chi_square_gate, inside
+from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error, within_truth
 
-__all__ = [
-    "chi_square_band",
-    "chi_square_gate",
-    "error_summary",
-    "inside",
-    "nees",
-    "nees_summary",
-    "nis_summary",
-    "point_errors",
-    "state_error",
-    "state_nees",
-]
+__all__ = ["nis_summary", "point_errors", "state_nees"]
 
 
 def state_nees(estimate: Series, truth: Series) -> np.ndarray:

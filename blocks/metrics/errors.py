@@ -37,6 +37,7 @@ __all__ = [
     "nees",
     "nees_summary",
     "orientation_errors",
+    "plane_errors",
     "pose_errors",
     "state_error",
     "within_truth",
@@ -198,6 +199,25 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
             turn = _turn(chosen["attitude"], attitude)
             found.update(nees_summary(np.concatenate([-error, -speed, turn], axis=-1), P))
     return found
+
+
+def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
+    """Compare `PlaneBelief`s with the truth, where it covers them and after `settle` seconds.
+
+    Returns:
+        position_rmse_m, position_mean_m, position_max_m, the `nees_summary` (2 on average in a consistent
+        filter) and compared_ticks.
+
+    Raises:
+        DataError: when no tick of the estimate lies within the truth.
+    """
+    chosen = within_truth(estimate, truth, settle)
+    error = interpolate(truth, "position", chosen.time) - chosen["position"]
+    return {
+        **{f"position_{name}_m": value for name, value in error_summary(error).items()},
+        **nees_summary(error, chosen["covariance"]),
+        "compared_ticks": float(len(chosen)),
+    }
 
 
 def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import (
     NEAR,
     angles_from_matrix,
@@ -40,13 +40,11 @@ from flowgraph.blocks.geometry.euler import (
 from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Correction, Gaussian, KalmanInnovation, correct
-from flowgraph.blocks.signals import Belief, Imu
-from flowgraph.blocks.vision.pnp import PoseMeasurement
+from flowgraph.blocks.kalman.filters import Correction, correct
+from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
 __all__ = [
     "STATE",
-    "EulerAngles",
     "euler_angles",
     "measured_angles",
     "move",
@@ -62,18 +60,6 @@ STATE = StateSpace(euclidean(3), angle(3), euclidean(9))
 
 _POSE = StateSpace(euclidean(3), angle(3))
 _SEES_POSE = np.eye(6, 15)
-
-
-class EulerAngles(Signal):
-    """The attitude as the filter holds it, and how far it is from where its angles fail.
-
-    angles: phi, theta, psi, rad. cosine: that of the angle that must stay off +-90 degrees; below 0.02 the
-    rates of the angles are held finite, and are wrong. deviations: of the angles, rad.
-    """
-
-    angles: Array = real(3, unit="rad")
-    cosine: Array = real()
-    deviations: Array = real(3, unit="rad")
 
 
 def increments(x: Array, imu: Imu, dt: Any) -> tuple[Array, Array]:

@@ -11,59 +11,21 @@ sec. 6.2.2 (white noise acceleration).
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Flight, Series, Signal, block, real
-from flowgraph.blocks.geometry.rotations import to_matrix
-from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph import Result, Series, block
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.metrics.errors import interpolate_pose
-from flowgraph.blocks.scoring.tuning import reading_of
-from flowgraph.errors import DataError
+from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.signals import Gaussian, PointBelief, WorldAcceleration
 
 __all__ = [
-    "PointBelief",
-    "PointReading",
-    "WorldAcceleration",
     "between",
     "point_belief",
     "point_model",
+    "point_steps",
     "start_point",
-    "told_acceleration",
 ]
-
-
-class WorldAcceleration(Signal):
-    """The second derivative of position, m/s^2, in world coordinates."""
-
-    acceleration: Array = real(3, unit="m/s^2", frame="world")
-
-    @classmethod
-    def at_rest(cls) -> Self:
-        """None."""
-        return cls(acceleration=np.zeros(3))
-
-
-class PointReading(Signal):
-    """A control and what was measured with it: acceleration (m/s^2) and position (m), both world.
-
-    A coordinate that was not measured is NaN.
-    """
-
-    acceleration: Array = real(3, unit="m/s^2", frame="world")
-    position: Array = real(3, unit="m", frame="world")
-
-
-class PointBelief(Signal):
-    """The belief about a point: position (m) and velocity (m/s), world, with the covariance of both."""
-
-    position: Array = real(3, unit="m", frame="world")
-    velocity: Array = real(3, unit="m/s", frame="world")
-    covariance: Array = real(6, 6)
 
 
 @block
@@ -108,27 +70,10 @@ def start_point(
     return Gaussian(mean=mean, covariance=P)
 
 
-def told_acceleration(flight: Flight) -> Series:
-    """The flight's specific force as a `WorldAcceleration`, by the truth's attitude and accelerometer bias.
+def point_steps(result: Result, model: LinearModel) -> Steps:
+    """Those of a run of `kalman` or `async_kalman`, which collect `prior` and `posterior`."""
 
-    Raises:
-        DataError: for a flight without an IMU or without a truth.
-    """
-    imu, truth = flight.streams.get("imu"), flight.truth
-    if imu is None or truth is None:
-        raise DataError(
-            "the acceleration in the world is not known",
-            path=flight.name,
-            expected="a stream imu, and a truth that tells the attitude",
-            got=", ".join(flight.streams) + (", no truth" if truth is None else ""),
-            fix="choose a simulated flight, or give the filter accelerations of your own",
-        )
-    half = flight.info["imu_period_ns"] // 2 if reading_of(flight) == "mean" else 0
-    attitude = interpolate_pose(truth, imu.time - half)[1]  # of a mean, that of its middle
-    force = imu["specific_force"]
-    if "accelerometer_bias" in truth.leaves:
-        last = np.maximum(np.searchsorted(truth.time, imu.time, side="right") - 1, 0)
-        force = force - truth["accelerometer_bias"][last]
-    turned = (to_matrix(attitude, xp=np) @ force[..., None])[..., 0]
-    found = WorldAcceleration(acceleration=turned + np.array(GRAVITY))
-    return Series(imu.time, found, name="acceleration")
+    def named(smoothed: Series) -> Series:
+        return Series(smoothed.time, point_belief.step(smoothed.values), name=smoothed.name)
+
+    return Steps(result["prior"], result["posterior"], model, None, named)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
@@ -28,17 +28,17 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import KalmanInnovation, correct
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, PoseBelief, QuaternionBelief
 
 __all__ = [
-    "PoseBelief",
-    "QuaternionBelief",
     "between_imu",
     "move",
     "move_jacobian",
     "observe_jacobian",
     "pose_belief",
+    "pose_steps",
     "predict_pose",
     "quaternion_noise",
     "start_pose",
@@ -53,31 +53,6 @@ _VV = np.diag([1.0] * 3 + [0.0] * 3)
 _PP = np.diag([0.0] * 3 + [1.0 / 3.0] * 3)
 _VP = (np.eye(6, 6, 3) + np.eye(6, 6, -3)) / 2.0
 """What white noise on the acceleration leaves in (v, p): the coefficients of dt, dt^3 and dt^2."""
-
-
-class QuaternionBelief(Signal):
-    """A Gaussian belief over (velocity, position, quaternion), ten numbers; covariance in that order.
-
-    velocity: m/s, world. position: m, world. attitude: unit quaternion, body to world.
-    """
-
-    velocity: Array = real(3, unit="m/s", frame="world")
-    position: Array = real(3, unit="m", frame="world")
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    covariance: Array = real(10, 10)
-
-
-class PoseBelief(Signal):
-    """A belief about position (m), velocity (m/s) and attitude, with the covariance of its error.
-
-    Error order, three each: position, velocity (world), attitude (rad, right rotation vector in the body),
-    which is the nine-dimensional tangent space in which a NEES is taken.
-    """
-
-    position: Array = real(3, unit="m", frame="world")
-    velocity: Array = real(3, unit="m/s", frame="world")
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    covariance: Array = real(9, 9)
 
 
 @block
@@ -287,6 +262,33 @@ def start_pose(
         attitude=q,
         covariance=P,
     )
+
+
+def pose_steps(result: Result) -> Steps:
+    """Those of a run of `ekf`, which collects `prior`, `posterior` and the `control` of each prediction.
+
+    The state is (position, velocity, attitude), ten numbers, and its errors are the nine of `PoseBelief`.
+    """
+    prior, posterior = (_in_tangent_space(result[name]) for name in ("prior", "posterior"))
+    rows = zip(
+        posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
+        np.diff(posterior.time) * 1e-9, strict=True,
+    )  # fmt: skip
+    jacobians = [tangent_jacobian(q, ahead, control, dt, np) for q, ahead, control, dt in rows]
+    space = StateSpace(euclidean(6), quaternion())
+
+    def named(smoothed: Series) -> Series:
+        p, v, q = np.split(smoothed["mean"], (3, 6), axis=-1)
+        return Series(smoothed.time, PoseBelief(p, v, q, smoothed["covariance"]), name=smoothed.name)
+
+    return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
+
+
+def _in_tangent_space(series: Series) -> Series:
+    """A series of `QuaternionBelief` as `Gaussian` of (position, velocity, attitude)."""
+    belief = pose_belief.step(series.values, xp=np)
+    mean = np.concatenate([belief.position, belief.velocity, belief.attitude], axis=-1)
+    return Series(series.time, Gaussian(mean=mean, covariance=belief.covariance), name=series.name)
 
 
 def _to_angle(q: Array, xp: Any) -> Array:

@@ -21,12 +21,12 @@ import numpy as np
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
-from flowgraph.blocks.kalman.filters import Gaussian, KalmanInnovation, correct
+from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.blocks.vision.camera import Mount
-from flowgraph.blocks.vision.motion import CameraMotion, camera_velocity
+from flowgraph.blocks.vision.motion import camera_velocity
 from flowgraph.errors import UnknownNameError
 
 __all__ = ["RATES", "carried", "far_points", "update_camera_velocity"]

@@ -17,9 +17,7 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, rotate
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.models.pose import PoseBelief
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Gaussian, Imu, PoseBelief
 
 __all__ = ["STATE", "carry_pose", "imu_density", "named_pose", "see_pose", "start_state"]
 

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, rotate
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.signals import Attitude, Imu
+from flowgraph.blocks.signals import Attitude, AttitudeRateBelief, Gaussian, Imu
 
 __all__ = [
     "STATE",
@@ -34,19 +33,11 @@ __all__ = [
     "turn_by_rate",
 ]
 
+OrientationBelief = AttitudeRateBelief
+"""The older name of the belief over attitude and body rate."""
+
 STATE = StateSpace(quaternion(), euclidean(3))
 """Attitude, body rate."""
-
-
-class OrientationBelief(Signal):
-    """A belief about attitude and body rate (rad/s), with the covariance of its error.
-
-    Error order, three each: attitude (rad, right rotation vector in the body), rate (rad/s, body).
-    """
-
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    rate: Array = real(3, unit="rad/s", frame="body")
-    covariance: Array = real(6, 6)
 
 
 def turn_by_rate(x: Array, control: Any, noise: Array | None, dt: Any, xp: Any) -> Array:
@@ -69,10 +60,10 @@ def stacked_imu(imu: Imu, *, xp: Any) -> Array:
 
 
 @block
-def named_orientation(belief: Gaussian) -> OrientationBelief:
+def named_orientation(belief: Gaussian) -> AttitudeRateBelief:
     """The belief over (q, w) with names and units."""
     x = belief.mean
-    return OrientationBelief(attitude=x[..., :4], rate=x[..., 4:], covariance=belief.covariance)
+    return AttitudeRateBelief(attitude=x[..., :4], rate=x[..., 4:], covariance=belief.covariance)
 
 
 def start_orientation(

@@ -16,13 +16,11 @@ complementary filters.
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Flight, Series, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
     from_rotation_vector,
@@ -33,7 +31,6 @@ from flowgraph.blocks.geometry.rotations import (
     to_rotation_vector,
 )
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.signals import (
     Attitude,
     CoordinateAcceleration,
@@ -43,11 +40,10 @@ from flowgraph.blocks.signals import (
     PoseEstimate,
     SpecificForce,
     Thrust,
+    WorldForce,
 )
-from flowgraph.errors import DataError, DeclarationError
 
 __all__ = [
-    "WorldForce",
     "turn_by_gyro",
     "carry_to_world",
     "level_near",
@@ -55,23 +51,7 @@ __all__ = [
     "blend",
     "dead_reckon",
     "correct_by_pose",
-    "first_attitude",
-    "with_parts",
-    "own_density",
-    "reading_deviation",
-    "check_alpha",
 ]
-
-
-class WorldForce(Signal):
-    """A specific force in world coordinates, m/s^2; (0, 0, 9.81) at rest."""
-
-    force: Array = real(3, unit="m/s^2", frame="world")
-
-    @classmethod
-    def at_rest(cls) -> WorldForce:
-        """That of a body that does not accelerate."""
-        return cls(force=-np.array(GRAVITY))
 
 
 # -- the gyroscope's side --------------------------------------------------------------------------------
@@ -228,76 +208,3 @@ def correct_by_pose(
 @correct_by_pose.init
 def _(prior: Any, pose: Any, **_: Any) -> Any:
     return {"measured": np.zeros(3), "own": np.zeros(3)}
-
-
-# -- flights and their scores (NumPy) --------------------------------------------------------------------
-
-
-def with_parts(flight: Flight) -> Flight:
-    """The flight, with `gyro` and `accelerometer` taken out of its `imu` where they are missing."""
-    streams = dict(flight.streams)
-    if "imu" in streams:
-        imu = streams["imu"]
-        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
-        force = SpecificForce(force=imu["specific_force"])
-        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
-    return replace(flight, streams=streams)
-
-
-def reading_deviation(flight: Flight, part: str, series: Series, density: float | None) -> float:
-    """The standard deviation of one reading of a gyroscope or accelerometer: its density times sqrt(rate).
-
-    Args:
-        part: gyro, accelerometer or coordinate_acceleration.
-        density: the setting; the flight's own if left out.
-    """
-    step = float(np.median(np.diff(series.time))) * 1e-9 if len(series) > 1 else 1.0
-    return own_density(flight, part, density) / math.sqrt(step)
-
-
-def own_density(flight: Flight, part: str, density: float | None) -> float:
-    """The density of the white noise of an inertial sensor: the setting, or the flight's own.
-
-    Raises:
-        DataError: where nobody says it.
-    """
-    own = flight.info.get("noise", {}).get(part, {}).get("noise")
-    if density is None and own is None and "imu_noise" in flight.info:
-        own = getattr(flight.info["imu_noise"], part, None)
-    if density is None and own is None:
-        raise DataError(
-            f"this flight does not say the noise of its {part}, and a covariance needs it",
-            path=f"{flight.name}: info",
-            expected="imu_noise, or noise by sensor",
-            got=", ".join(flight.info) or "nothing",
-            fix="give it as a setting, or leave the covariance out",
-        )
-    return float(own if density is None else density)
-
-
-def check_alpha(graph: str, *alphas: float) -> None:
-    """Refuse a share outside (0, 1].
-
-    Raises:
-        DeclarationError: for one that is.
-    """
-    for alpha in alphas:
-        if not 0.0 < alpha <= 1.0:
-            raise DeclarationError(
-                "alpha is outside (0, 1]",
-                path=graph,
-                expected="0 < alpha <= 1; 1 is the gyroscope alone",
-                got=f"{alpha!r}",
-                fix="write alpha=0.98",
-            )
-
-
-def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:
-    """The truth's attitude at the gyroscope's first reading; without a truth, that which `force` (3,) shows.
-
-    Args:
-        force: m/s^2, body: the direction that is up at the start. Its heading is taken as zero.
-    """
-    if flight.truth is not None:
-        return Attitude(attitude=interpolate_pose(flight.truth, gyro.time[:1])[1][0])
-    return Attitude(attitude=np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np)))

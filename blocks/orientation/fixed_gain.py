@@ -21,22 +21,22 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.models.pose import PoseBelief
-from flowgraph.blocks.signals import Attitude, Imu, Pose, PoseEstimate, SpecificForce
+from flowgraph.blocks.signals import (
+    Attitude,
+    AttitudeBelief,
+    Imu,
+    Pose,
+    PoseBelief,
+    PoseEstimate,
+    SpecificForce,
+)
 
-__all__ = ["AttitudeBelief", "AttitudeNoise", "PoseNoise", "attitude_spread", "pose_spread"]
+__all__ = ["AttitudeNoise", "PoseNoise", "attitude_spread", "pose_spread"]
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-class AttitudeBelief(Signal):
-    """An attitude and the covariance (rad^2) of its error, a right rotation vector in the body."""
-
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    covariance: Array = real(3, 3, unit="rad^2")
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import block
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, normalize, rotate, to_matrix
-from flowgraph.blocks.inertial.alignment import Alignment
-from flowgraph.blocks.orientation.marg import LevelBelief, Rest
-from flowgraph.blocks.signals import Imu, MagneticField
+from flowgraph.blocks.signals import (
+    Alignment,
+    AttitudeBiasBelief,
+    HeadingBelief,
+    Imu,
+    LevelBelief,
+    MagneticField,
+    Rest,
+)
 
 __all__ = [
     "FieldTrust",
-    "HeadingBelief",
     "OrientationBelief",
     "join_orientation",
     "predict_heading",
@@ -33,26 +38,8 @@ __all__ = [
     "update_heading",
 ]
 
-
-class HeadingBelief(Signal):
-    """The angle (rad) about the vertical from the level frame to the world, its variance (rad^2), and the
-    strength (T) and dip (rad, below the horizon) of the field where nothing disturbs it."""
-
-    angle: Array = real(unit="rad")
-    variance: Array = real(unit="rad^2")
-    strength: Array = real(unit="T")
-    dip: Array = real(unit="rad")
-
-
-class OrientationBelief(Signal):
-    """A Gaussian belief about attitude and gyroscope bias.
-
-    Error order, three each: attitude (rad, right rotation vector in the body), gyroscope bias (rad/s, body).
-    """
-
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    gyro_bias: Array = real(3, unit="rad/s", frame="body")
-    covariance: Array = real(6, 6)
+OrientationBelief = AttitudeBiasBelief
+"""The older name of the belief over attitude and gyroscope bias."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +164,7 @@ def _(*_: Any, **__: Any) -> Any:
 
 
 @block
-def join_orientation(level: LevelBelief, heading: HeadingBelief, *, xp: Any) -> OrientationBelief:
+def join_orientation(level: LevelBelief, heading: HeadingBelief, *, xp: Any) -> AttitudeBiasBelief:
     """Attitude Exp(a e_z) * q, with the variance of the heading about the vertical and that of the tilt about
     the horizontal axes: P = T P_level T^T + var u u^T, u the vertical in the body, T = I - u u^T on the
     attitude."""
@@ -195,7 +182,7 @@ def join_orientation(level: LevelBelief, heading: HeadingBelief, *, xp: Any) -> 
     spread = xp.concat([u, 0.0 * u], axis=-1)
     P = T @ level.covariance @ T.mT
     P = P + heading.variance[..., None, None] * (spread[..., :, None] * spread[..., None, :])
-    return OrientationBelief(
+    return AttitudeBiasBelief(
         attitude=normalize(multiply(turn, level.attitude, xp=xp), xp=xp),
         gyro_bias=level.gyro_bias,
         covariance=0.5 * (P + P.mT),

@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import block
 from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     multiply,
@@ -39,14 +39,11 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
     to_matrix,
 )
-from flowgraph.blocks.inertial.alignment import Alignment
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Alignment, Imu, LevelBelief, Rest
 
 __all__ = [
     "UNIT",
-    "LevelBelief",
-    "Rest",
     "RestRule",
     "detect_rest",
     "hold_velocity",
@@ -57,25 +54,6 @@ __all__ = [
 
 UNIT = ImuNoise(gyro=1e-3, accelerometer=5e-3, gyro_bias=1e-4, accelerometer_bias=1e-3)
 """Noise densities for a unit of which nothing is said."""
-
-
-class LevelBelief(Signal):
-    """A Gaussian belief about velocity, tilt and gyroscope bias, in a frame with z up and a free heading.
-
-    Error order, three each: velocity (m/s, level), attitude (rad, right rotation vector in the body), bias
-    (rad/s, body). A bias is what the reading has too much.
-    """
-
-    velocity: Array = real(3, unit="m/s", frame="level")
-    attitude: Array = real(4, unit="1", frame="level<-body")
-    gyro_bias: Array = real(3, unit="rad/s", frame="body")
-    covariance: Array = real(9, 9)
-
-
-class Rest(Signal):
-    """Whether the body rests: 1 or 0."""
-
-    still: Array = real()
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,68 @@
-"""Outdoor."""
+"""Outdoors: six sensors on a vehicle with clocks of their own, fused twice, by a Gaussian and by particles.
+
+`flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
+Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
+on the same sensors, with the same knowledge, so that the two can be compared.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.outdoor.belief import (
+    FLOW,
+    OUTDOOR,
+    FieldObserver,
+    PositionObserver,
+    flow_vector,
+    new_picture,
+    observe_distance,
+    observe_flow,
+    outdoor_pose,
+    predict_clone,
+    start_outdoor,
+)
+from flowgraph.blocks.outdoor.cloud import (
+    as_cloud,
+    correct_distance,
+    correct_field,
+    correct_flow,
+    correct_position,
+    predict_outdoor,
+    start_outdoor_cloud,
+    take_outdoor_ancestors,
+    take_picture,
+)
+from flowgraph.blocks.outdoor.flight import (
+    STREAMS,
+    OutdoorSensors,
+    OutdoorStart,
+    attitude_of_two,
+    outdoor_flight,
+)
+
+__all__ = [
+    "STREAMS",
+    "OutdoorSensors",
+    "OutdoorStart",
+    "attitude_of_two",
+    "outdoor_flight",
+    "FLOW",
+    "FieldObserver",
+    "OUTDOOR",
+    "PositionObserver",
+    "flow_vector",
+    "new_picture",
+    "observe_distance",
+    "observe_flow",
+    "outdoor_pose",
+    "predict_clone",
+    "start_outdoor",
+    "as_cloud",
+    "correct_distance",
+    "correct_field",
+    "correct_flow",
+    "correct_position",
+    "predict_outdoor",
+    "start_outdoor_cloud",
+    "take_outdoor_ancestors",
+    "take_picture",
+]

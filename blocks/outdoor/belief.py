@@ -27,10 +27,8 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.models.pose import PoseBelief
 from flowgraph.blocks.outdoor.flight import OutdoorStart
-from flowgraph.blocks.signals import Imu, OpticalFlow
+from flowgraph.blocks.signals import Gaussian, Imu, OpticalFlow, PoseBelief
 
 __all__ = [
     "FLOW",

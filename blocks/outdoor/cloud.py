@@ -29,15 +29,23 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Signal, block, real
+from flowgraph import Array, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor.flight import OutdoorStart
 from flowgraph.blocks.particles.cloud import log_sum_exp, start_cloud
-from flowgraph.blocks.signals import Ancestors, Cloud, Imu, MagneticField, OpticalFlow, Position, Range
+from flowgraph.blocks.signals import (
+    Ancestors,
+    Cloud,
+    Imu,
+    MagneticField,
+    OpticalFlow,
+    OutdoorCloud,
+    Position,
+    Range,
+)
 
 __all__ = [
-    "OutdoorCloud",
     "as_cloud",
     "correct_distance",
     "correct_field",
@@ -78,22 +86,6 @@ _KEPT = np.repeat([1.0, 1.0, 0.0, 0.0], 3)
 
 _LEAST_VARIANCE = 1e-20
 """Below it (rad^2) a turn is taken for certain when it is drawn; in float32 too it is not zero."""
-
-
-class OutdoorCloud(Signal):
-    """A Rao-Blackwellized cloud whose particles remember the last picture. The particle is the last axis.
-
-    log_weight: natural logarithm of the weights, which add up to 1. attitude: the mean of now, so that the
-    true one is Exp(e) * attitude; picture: at the last picture, exactly. motion: the mean of (velocity in
-    m/s, position in m, displacement since the last picture in m), world; covariance: of it and of e (rad,
-    world), the mean of which is zero.
-    """
-
-    log_weight: Array = real("particles")
-    attitude: Array = real(4, "particles", unit="1", frame="world<-body")
-    picture: Array = real(4, "particles", unit="1", frame="world<-body")
-    motion: Array = real(9, "particles", frame="world")
-    covariance: Array = real(12, 12, "particles")
 
 
 @block

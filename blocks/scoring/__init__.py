@@ -1,1 +1,80 @@
-"""Scoring."""
+"""Scoring: what makes a case of a flight and a filter, and what a run of it is worth.
+
+`cases` makes a case of a flight, with the settings that filters share, each declared once as `settings` lets
+graphs do; `point` does so for linear filters, and `euler` for those with Euler angles. `tuning` finds the
+noise that a filter is told, in its settings or in the flight; `streams` makes the streams that it asks for
+out of those that a flight has. `scorer` compares a run with the truth: errors, consistency, and the same for
+the smoothed run; `orientation` counts only the times that a recording says count, and `calibration` how well
+one explains its windows. `settings`, `point`, `euler` and `calibration` are imported by their own names.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.scoring.cases import (
+    Factors,
+    Gated,
+    OnFlight,
+    Particles,
+    PoseAided,
+    PoseFilter,
+    PoseNoises,
+    Scored,
+    Smoothed,
+    SmoothedPoseFilter,
+    on_capture,
+    on_flight,
+)
+from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
+from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
+from flowgraph.blocks.scoring.streams import (
+    first_attitude,
+    own_density,
+    reading_deviation,
+    told_acceleration,
+    with_parts,
+)
+from flowgraph.blocks.scoring.tuning import (
+    WEIGHTLESS,
+    given,
+    imu_noise_of,
+    noise_of,
+    reading_of,
+    unbiased_factors,
+    with_imu,
+)
+
+__all__ = [
+    "settings",
+    "point",
+    "euler",
+    "calibration",
+    "OnFlight",
+    "on_flight",
+    "on_capture",
+    "Factors",
+    "Gated",
+    "Particles",
+    "PoseAided",
+    "PoseFilter",
+    "PoseNoises",
+    "Scored",
+    "Smoothed",
+    "SmoothedPoseFilter",
+    "SMOOTHED",
+    "Scorer",
+    "WEIGHTLESS",
+    "given",
+    "imu_noise_of",
+    "noise_of",
+    "reading_of",
+    "unbiased_factors",
+    "with_imu",
+    "first_attitude",
+    "own_density",
+    "reading_deviation",
+    "told_acceleration",
+    "with_parts",
+    "Share",
+    "counted_errors",
+    "scored_errors",
+]

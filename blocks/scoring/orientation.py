@@ -1,13 +1,35 @@
-"""Errors as a recording counts them: only at the times that it says count, against a truth with gaps."""
+"""Filters of an attitude on flights: shares of a sensor, and errors as a recording counts them.
+
+Some recordings say at what times an error counts, and have a truth with gaps.
+"""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.metrics.errors import orientation_errors
+from flowgraph.blocks.scoring.scorer import Errors
+from flowgraph.errors import DeclarationError
 
-__all__ = ["scored_errors"]
+__all__ = ["Share", "counted_errors", "scored_errors"]
+
+
+def check_alpha(graph: str, name: str, alpha: float) -> None:
+    """Refuse a share outside (0, 1]."""
+    if not 0.0 < alpha <= 1.0:
+        raise DeclarationError(
+            "alpha is outside (0, 1]",
+            path=graph,
+            expected="0 < alpha <= 1; 1 is the gyroscope alone",
+            got=f"{alpha!r}",
+            fix="write alpha=0.98",
+        )
+
+
+Share = Annotated[float, check_alpha]
 
 
 def scored_errors(estimate: Series, flight: Flight, *, settle: float = 1.0) -> dict[str, float]:
@@ -26,3 +48,12 @@ def scored_errors(estimate: Series, flight: Flight, *, settle: float = 1.0) -> d
         return orientation_errors(estimate, flight.truth, settle=settle)
     counted = scored.time[scored["value"]]
     return orientation_errors(estimate[np.isin(estimate.time, counted)], flight.truth, settle=0.0)
+
+
+def counted_errors(flight: Flight) -> Errors:
+    """`scored_errors` of that flight, as a `Scorer` asks for errors."""
+
+    def errors(estimate: Series, truth: Series, *, settle: float) -> dict[str, float]:
+        return scored_errors(estimate, flight, settle=settle)
+
+    return errors

@@ -1,6 +1,6 @@
 """What a run is worth, in one table: errors against the truth, consistency, and what a smoother makes of it.
 
-Every graph scores its runs with `scorer`, so all print the same names: those of `metrics` and `consistency`
+Every graph scores its runs with a `Scorer`, so all print the same names: those of `metrics` and `consistency`
 for the estimate; for each stream of innovations those of `nis_summary`, with the name of the stream in front
 where there are several; and the errors of the smoothed run behind `smoothed_` and `lagged_` where that was
 asked for.
@@ -8,16 +8,16 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flowgraph import Flight, Graph, Result, Series
+from flowgraph import Graph, Result, Series
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
 from flowgraph.blocks.metrics.consistency import nis_summary
 from flowgraph.types import leaves_of
 
-__all__ = ["SMOOTHED", "Scorer", "scorer"]
+__all__ = ["SMOOTHED", "Scorer"]
 
 Errors = Callable[..., dict[str, float]]
 
@@ -32,41 +32,29 @@ SMOOTHED = (
 """The errors of a smoothed run that are worth a line."""
 
 
-def scorer(
-    flight: Flight,
-    errors: Errors,
-    *,
-    estimate: str = "belief",
-    settle: float = 1.0,
-    steps: Callable[[Result], Steps] | None = None,
-    smooth: str = "none",
-    lag: float | None = None,
-) -> Scorer:
-    """The `score` of a `Case`.
+@dataclass(frozen=True)
+class Scorer:
+    """The `score` of a `Case`, which says what streams it reads, so that a run of many need not keep others.
 
     Args:
-        flight: whose truth the estimate is compared with; without one there are innovations only.
-        errors: `pose_errors`, `point_errors` or `attitude_errors`.
+        truth: with which the estimate is compared; without one there are innovations only.
+        errors: such as `pose_errors`, `point_errors` or `attitude_errors`.
         estimate: the stream that is compared.
         settle: seconds at the start that the errors leave out.
+        innovations: whether those that a run collects are summed up too.
         steps: what a smoother needs of a result.
         smooth: "rts" smooths the whole run, "none" does not.
         lag: s: with one, each tick is smoothed with what came until so much later.
     """
-    return Scorer(flight.truth, errors, estimate, settle, steps, smooth, lag)
-
-
-@dataclass(frozen=True)
-class Scorer:
-    """A score that says which streams it reads, so that a run of many need not keep the others."""
 
     truth: Series | None
     errors: Errors
-    estimate: str
-    settle: float
-    steps: Callable[[Result], Steps] | None
-    smooth: str
-    lag: float | None
+    estimate: str = "belief"
+    settle: float = 1.0
+    innovations: bool = True
+    steps: Callable[[Result], Steps] | None = None
+    smooth: str = "none"
+    lag: float | None = None
 
     @property
     def smoothing(self) -> bool:
@@ -79,11 +67,11 @@ class Scorer:
         types = {c.name: graph.port(c.wire).type for c in graph.collected}
         if self.smoothing:
             return list(types)
-        return [n for n, t in types.items() if n == self.estimate or "nis" in dict(leaves_of(t))]
+        return [n for n, t in types.items() if n == self.estimate or self._sums_up(dict(leaves_of(t)))]
 
     def __call__(self, result: Result) -> dict[str, float]:
         found = self._compared(result[self.estimate])
-        innovations = {n: s for n, s in result.series.items() if "nis" in s.leaves and len(s)}
+        innovations = {n: s for n, s in result.series.items() if self._sums_up(s.leaves) and len(s)}
         for name, series in innovations.items():
             front = name.removesuffix("innovation")
             found.update({front + key: value for key, value in nis_summary(series).items()})
@@ -99,6 +87,9 @@ class Scorer:
                 better = self._compared(named(series))
                 found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
         return found
+
+    def _sums_up(self, leaves: Mapping[str, object]) -> bool:
+        return self.innovations and "nis" in leaves
 
     def _compared(self, series: Series) -> dict[str, float]:
         return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)

@@ -6,32 +6,20 @@ taken for the truth and divided by. That is refused here, by the name of what wo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu
 from flowgraph.errors import DataError, DeclarationError
-from flowgraph.language.checks import need_numbers
 
-__all__ = [
-    "check_choice",
-    "check_settings",
-    "given",
-    "gravity_of",
-    "imu_noise_of",
-    "noise_of",
-    "reading_of",
-    "unbiased_noise_of",
-    "with_imu",
-]
-
+__all__ = ["WEIGHTLESS", "given", "imu_noise_of", "noise_of", "reading_of", "unbiased_factors", "with_imu"]
 
 WEIGHTLESS = (0.0, 0.0, 0.0)
+"""The gravity of a world without one, m/s^2."""
 
 
 def given(value: Any, otherwise: Any) -> Any:
@@ -92,18 +80,14 @@ def imu_noise_of(
     return noise.scaled(gyro=gyro_factor, accelerometer=accelerometer_factor)
 
 
-def unbiased_noise_of(
-    graph: str, flight: Flight, gyro_factor: float | None, accelerometer_factor: float | None
-) -> ImuNoise:
-    """`imu_noise_of` for a filter that knows no biases.
+def unbiased_factors(graph: str, flight: Flight) -> tuple[float, float]:
+    """Factors on the densities of gyroscope and accelerometer, for a filter that knows no biases.
 
-    A factor left out is 20 for a unit whose biases walk, and 1 for one that has none.
+    They are 20 for a unit whose biases walk, and 1 for one that has none.
     """
     noise = imu_noise_of(graph, flight)
-    otherwise = 20.0 if noise.gyro_bias or noise.accelerometer_bias else 1.0
-    return noise.scaled(
-        gyro=given(gyro_factor, otherwise), accelerometer=given(accelerometer_factor, otherwise)
-    )
+    factor = 20.0 if noise.gyro_bias or noise.accelerometer_bias else 1.0
+    return factor, factor
 
 
 def reading_of(flight: Flight) -> str:
@@ -126,42 +110,3 @@ def with_imu(flight: Flight) -> Flight:
     told = [flight.info["noise"][name] for name in parts]
     noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
     return replace(flight, streams=streams, info={**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS})
-
-
-def gravity_of(flight: Flight) -> tuple[float, float, float]:
-    """The gravity, m/s^2, world, that the flight's imu does not feel."""
-    found: tuple[float, float, float] = flight.info.get("gravity", GRAVITY)
-    return found
-
-
-def check_settings(
-    graph: str,
-    positive: Mapping[str, object],
-    *,
-    settle: float,
-    smooth: str = "none",
-    lag: float | None = None,
-) -> None:
-    """Refuse what no filter can be set to: numbers that are not positive, a smoother that there is not.
-
-    Raises:
-        DeclarationError: naming the setting.
-    """
-    need_numbers(graph, positive=positive, not_negative={"settle": settle, "lag": lag})
-    check_choice(graph, "smooth", smooth, ("none", "rts"))
-
-
-def check_choice(graph: str, name: str, value: object, valid: tuple[str, ...]) -> None:
-    """Refuse a setting that is none of a few words.
-
-    Raises:
-        DeclarationError: for one that is.
-    """
-    if value not in valid:
-        raise DeclarationError(
-            f"setting {name!r} has no such value",
-            path=f"{graph}.{name}",
-            expected=" or ".join(valid),
-            got=repr(value),
-            fix=f"write {name}={valid[-1]}",
-        )

@@ -21,7 +21,7 @@ from flowgraph.blocks.sensors.inertial import (
 )
 from flowgraph.blocks.sensors.magnetic import MagneticAttitude, Magnetometer, earth_field
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
-from flowgraph.blocks.sensors.pose import AttitudeSensor, PositionSensor, Vicon
+from flowgraph.blocks.sensors.pose import AttitudeSensor, PositionSensor, Vicon, turned
 from flowgraph.blocks.sensors.sensor import Recording, Sensor
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
     "PositionSensor",
     "AttitudeSensor",
     "Vicon",
+    "turned",
     "Gps",
     "Magnetometer",
     "MagneticAttitude",

@@ -1,1 +1,21 @@
-"""Unscented."""
+"""The unscented filter: a Gaussian through any function by a few points, without Jacobians.
+
+`sigma_points` places the points, on vectors as on angles and quaternions, and takes their mean and
+covariance; `filters` predicts and corrects a `Gaussian` with them. The functions of motion and measurement
+are those of `models` and `orientation`, or your own.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, MEANS, Cluster, SigmaPoints, mean_turn
+
+__all__ = [
+    "GAUSSIAN",
+    "MEANS",
+    "Cluster",
+    "SigmaPoints",
+    "mean_turn",
+    "predict_unscented",
+    "update_unscented",
+]

@@ -25,17 +25,9 @@ import numpy.typing as npt
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import (
-    Gaussian,
-    KalmanInnovation,
-    Vector,
-    accepts,
-    innovate,
-    masked,
-    moved,
-    where_any,
-)
+from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
 from flowgraph.blocks.kalman.roots import semidefinite_root
+from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
 from flowgraph.language.block import Limit
 

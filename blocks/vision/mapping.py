@@ -20,14 +20,14 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from flowgraph import Series
+from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import skew
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import solve
 from flowgraph.blocks.vision.tags import TagMap
 from flowgraph.errors import DataError
 
-__all__ = ["Frames", "Survey", "build_map", "keyframes"]
+__all__ = ["Frames", "Survey", "build_map", "keyframes", "map_of"]
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray]]
 """(ids (k,), corners (k, 4, 2) px) of images."""
@@ -108,6 +108,15 @@ def build_map(
     x, error = problem.adjust()
     tag_map = TagMap(np.array(problem.names), _levelled(problem.corners(x), problem.root))
     return Survey(tag_map, error, len(cameras), 4 * len(problem.camera_of))
+
+
+def map_of(flight: Flight) -> TagMap:
+    """The flight's map of tags; where nobody surveyed it, one made of all its images."""
+    if "tag_map" in flight.info:
+        found: TagMap = flight.info["tag_map"]
+        return found
+    frames = frames_of(flight.streams["tags"])
+    return build_map(frames, flight.info["camera"], side=flight.info["tag_side"]).tag_map
 
 
 def _levelled(corners: np.ndarray, root: int) -> np.ndarray:

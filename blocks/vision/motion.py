@@ -17,19 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series, Signal, real
+from flowgraph import Array, Series
 from flowgraph.blocks.geometry.rotations import skew, slerp, to_matrix
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.errors import DataError
 
-__all__ = ["CameraMotion", "adjoint", "camera_motion_of", "camera_velocity", "find_delay", "velocity_error"]
-
-
-class CameraMotion(Signal):
-    """A camera's linear (m/s) and angular (rad/s) velocity relative to the world, in camera coordinates."""
-
-    velocity: Array = real(3, unit="m/s", frame="camera")
-    rate: Array = real(3, unit="rad/s", frame="camera")
+__all__ = ["adjoint", "camera_motion_of", "camera_velocity", "find_delay", "velocity_error"]
 
 
 def adjoint(mount: Mount) -> np.ndarray:

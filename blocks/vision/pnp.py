@@ -21,30 +21,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Signal, block, integer, real, when
+from flowgraph import block, when
 from flowgraph.blocks.geometry.rotations import skew
+from flowgraph.blocks.signals import PoseMeasurement, Tags
 from flowgraph.blocks.vision.camera import Camera, Mount
-from flowgraph.blocks.vision.tags import TagMap, Tags
+from flowgraph.blocks.vision.tags import TagMap
 
-__all__ = ["PoseMeasurement", "Solution", "find_pose", "quaternion_of", "rotation_of", "solve"]
+__all__ = ["Solution", "find_pose", "quaternion_of", "rotation_of", "solve"]
 
 _REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-14)
 _HOPELESS = 4.0  # a start with so many times the best one's error is not refined
 _APART = 16.0  # squared errors closer than this, in units of the noise, do not tell two poses apart
-
-
-class PoseMeasurement(Signal):
-    """A measured pose of the body with its own covariance.
-
-    covariance: of (position, m, world; attitude, right rotation vector, rad, body); zero where the
-    measurement does not say. error: root mean square of the reprojection, px. tags: how many it rests on.
-    """
-
-    position: Array = real(3, unit="m", frame="world")
-    attitude: Array = real(4, unit="1", frame="world<-body")
-    covariance: Array = real(6, 6)
-    error: Array = real(unit="px")
-    tags: Array = integer()
 
 
 class Solution(NamedTuple):

@@ -15,21 +15,11 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Series, Signal, boolean, integer, real
+from flowgraph import Series
+from flowgraph.blocks.signals import Tags
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["TagMap", "Tags", "course_map", "grid_map", "tags_series"]
-
-
-class Tags(Signal):
-    """The tags in one image, padded to a fixed number; only those `seen` mean anything.
-
-    ids: of each tag. corners: px, four a tag, (u right, v down) from the centre of the first pixel.
-    """
-
-    ids: Array = integer("tags")
-    corners: Array = real("tags", 4, 2, unit="px", frame="image")
-    seen: Array = boolean("tags")
+__all__ = ["TagMap", "course_map", "grid_map", "tags_series"]
 
 
 @dataclass(frozen=True)

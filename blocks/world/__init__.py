@@ -7,8 +7,9 @@ turns out and back in its place, `Hover` stays.
 
 from __future__ import annotations
 
+from flowgraph.blocks.world import thesis
 from flowgraph.blocks.world.draws import generator
-from flowgraph.blocks.world.feasibility import LIMITS, Limits
+from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join
@@ -27,7 +28,9 @@ __all__ = [
     "carried_by_thrust",
     "Limits",
     "LIMITS",
+    "feasible",
     "thesis_flight",
+    "thesis",
     "RoundTrip",
     "Hover",
     "Figures",

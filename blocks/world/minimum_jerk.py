@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph.errors import DeclarationError
 
-__all__ = ["KeyPoint", "Primitives", "Vector", "join"]
+__all__ = ["KeyPoint", "Primitives", "join"]
 
 Vector = tuple[float, float, float]
 

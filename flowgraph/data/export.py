@@ -70,7 +70,7 @@ def to_xarray(result: Result) -> Any:
         MissingDependencyError: without xarray.
     """
     try:
-        import xarray
+        import xarray  # may be absent
     except ImportError:
         raise MissingDependencyError(
             "to_xarray needs xarray",

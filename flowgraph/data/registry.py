@@ -23,12 +23,11 @@ from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
+from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
 
 if typing.TYPE_CHECKING:
     from importlib.metadata import EntryPoint
-
-    from flowgraph.language.declare import GraphFunction
 
 
 @dataclass(frozen=True)

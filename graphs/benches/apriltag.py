@@ -19,7 +19,7 @@ import numpy as np
 from flowgraph import Flight, Report, Series, simulate
 from flowgraph.blocks.datasets import course, rob6213, studentdata, umd
 from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors, within_truth
-from flowgraph.blocks.vision.mapping import frames_of
+from flowgraph.blocks.vision.mapping import frames_of, map_of
 from flowgraph.blocks.vision.motion import velocity_error
 from flowgraph.blocks.vision.pnp import rotation_of, solve
 from flowgraph.blocks.vision.tags import TagMap
@@ -28,7 +28,7 @@ from flowgraph.graphs.ins_ekf_pose import ins_ekf_pose
 from flowgraph.graphs.ins_particle import ins_particle
 from flowgraph.graphs.ins_ukf_pose import ins_ukf_pose
 from flowgraph.graphs.ins_ukf_velocity import ins_ukf_velocity
-from flowgraph.graphs.tag_pose import map_of, poses_of
+from flowgraph.graphs.tag_pose import poses_of
 
 __all__ = ["apriltag", "drift", "held_out", "lasting", "odd_reprojection", "withheld"]
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from flowgraph import Case, DeclarationError, Flight, Report, UnknownNameError, simulate
 from flowgraph.blocks.flights import simulated
-from flowgraph.blocks.particles.plane import exact, plane_errors
+from flowgraph.blocks.metrics.errors import plane_errors
+from flowgraph.blocks.models.plane import exact
 from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf

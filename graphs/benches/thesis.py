@@ -30,6 +30,7 @@ from flowgraph.blocks.models.point import start_point
 from flowgraph.blocks.models.pose import start_pose
 from flowgraph.blocks.models.unscented_pose import start_state
 from flowgraph.blocks.particles.cloud import start_cloud
+from flowgraph.blocks.scoring.point import readings
 from flowgraph.blocks.scoring.tuning import WEIGHTLESS, with_imu
 from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate, Position
 from flowgraph.errors import UnknownNameError
@@ -37,7 +38,7 @@ from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
-from flowgraph.graphs.kalman import kalman, readings
+from flowgraph.graphs.kalman import kalman
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.graphs.ukf import ukf
 from flowgraph.language.checks import need_count

@@ -21,7 +21,7 @@ import numpy as np
 from flowgraph import Graph, Series, simulate, simulate_many
 from flowgraph.blocks.flights import simulated
 from flowgraph.blocks.signals import Position
-from flowgraph.engines.many import RUNS_AT_ONCE
+from flowgraph.engines.options import RUNS_AT_ONCE
 from tests.bench import inertial
 from tests.bench.rows import Row
 

@@ -19,7 +19,8 @@ import numpy as np
 from flowgraph import Flight, Series, find_graph, load_flight, simulate, simulate_many
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.pose import PoseBelief, start_pose
+from flowgraph.blocks.models.pose import start_pose
+from flowgraph.blocks.signals import PoseBelief
 from flowgraph.study import Study, run_study
 from tests.bench import direct_ekf
 from tests.bench.rows import Row, interleaved, seconds

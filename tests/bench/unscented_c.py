@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Graph, Signal, Stream, block, delay, graph, real, simulate
-from flowgraph.blocks.kalman.filters import Gaussian
+from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.data.series import Series
 from tests.bench.generated_c import floor, loop

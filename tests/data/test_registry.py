@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -34,7 +35,7 @@ Install = Callable[[str, dict[str, str], dict[str, dict[str, str]]], None]
 
 
 @pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Put a distribution on the path, with its modules and its entry points by group."""
     installed_modules: set[str] = set()
 
@@ -153,9 +154,13 @@ def test_a_command_that_needs_a_broken_package_says_so(install: Install):
 
 @pytest.mark.parametrize(("group", "kind"), KINDS.items())
 def test_an_unknown_name_lists_what_there_is(group, kind):
-    find = {"graph": find_graph, "kind of flight": load_flight, "bench": find_bench, "engine": find_engine}[
-        kind
-    ]
+    finders: dict[str, Callable[[str], Any]] = {
+        "graph": find_graph,
+        "kind of flight": load_flight,
+        "bench": find_bench,
+        "engine": find_engine,
+    }
+    find = finders[kind]
     with pytest.raises(UnknownNameError, match=f"no {kind} is called 'nothing'") as caught:
         find("nothing")
     assert caught.value.valid == sorted(installed(group)[0])

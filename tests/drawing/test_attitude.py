@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from flowgraph import DataError, Series, UnknownNameError
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.orientation.heading import OrientationBelief
-from flowgraph.blocks.signals import Attitude
+from flowgraph.blocks.signals import Attitude, AttitudeBiasBelief
 from flowgraph.cli import app
 from flowgraph.drawing.attitude import _angle_sigmas, plot_orientation
 
@@ -26,7 +25,9 @@ def belief(n: int = 50) -> tuple[Series, Series]:
     right = from_rotation_vector(turns, xp=np)
     off = np.tile([np.cos(np.radians(1.0)), 0.0, 0.0, np.sin(np.radians(1.0))], (n, 1))
     P = np.tile(np.diag([1e-4, 1e-4, 4e-4, 1e-6, 1e-6, 1e-6]), (n, 1, 1))
-    values = OrientationBelief(attitude=multiply(off, right, xp=np), gyro_bias=np.zeros((n, 3)), covariance=P)
+    values = AttitudeBiasBelief(
+        attitude=multiply(off, right, xp=np), gyro_bias=np.zeros((n, 3)), covariance=P
+    )
     known = right + 0.0
     known[20:25] = np.nan
     return Series(time, values, name="belief"), Series(time, Attitude(attitude=known), gaps=True)

@@ -11,8 +11,8 @@ import numpy as np
 from flowgraph import Case, Flight, Graph, Result, lower, simulate
 from flowgraph.blocks.flights import simulated
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.metrics.consistency import nees, state_error
-from flowgraph.engines.many import Runs
+from flowgraph.blocks.metrics import nees, state_error
+from flowgraph.data.batch import Runs
 
 THESIS = math.sqrt(0.1 / 200.0)
 """The density of a variance of 0.1 per sample at 200 Hz."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from flowgraph import Case
 from flowgraph.cli.options import case_of
 from flowgraph.data.registry import graph_names
-from tests.blocks.test_datasets import course
+from tests.blocks.datasets.test_datasets import course
 
 ON_HOST = {"tag_pose"}
 """PnP is a host block, so the graph plays in Python."""

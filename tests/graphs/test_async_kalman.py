@@ -8,18 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Case, DataError, Flight, Series, aperiodic, periodic, simulate, simulate_many
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.metrics.consistency import chi_square_band, inside
-from flowgraph.blocks.models.point import (
-    WorldAcceleration,
-    point_model,
-    start_point,
-    told_acceleration,
+from flowgraph import (
+    Case,
+    DataError,
+    Flight,
+    Series,
+    aperiodic,
+    periodic,
+    simulate,
+    simulate_many,
 )
-from flowgraph.blocks.signals import Position, Velocity
+from flowgraph.blocks.metrics import chi_square_band, inside
+from flowgraph.blocks.models.point import point_model, start_point
+from flowgraph.blocks.scoring.point import positions
+from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 from flowgraph.graphs import async_kalman, kalman
-from flowgraph.graphs.async_kalman import positions
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, thesis
 
 RUNS = 50
@@ -46,7 +50,10 @@ def start(seed: int) -> dict[str, Gaussian]:
 
 
 def inputs(seed: int) -> dict[str, Series]:
-    return {"acceleration": told_acceleration(flight(seed)), "position": positions(flight(seed))}
+    return {
+        "acceleration": told_acceleration(flight(seed)),
+        "position": positions(flight(seed).streams["vicon"]),
+    }
 
 
 @cache

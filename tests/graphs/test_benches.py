@@ -15,7 +15,7 @@ from flowgraph.cli import app
 from flowgraph.graphs.benches import recordings
 from flowgraph.graphs.benches.broad import broad
 from flowgraph.graphs.benches.ese650 import PUBLISHED, ese650
-from tests.blocks.test_datasets import course
+from tests.blocks.datasets.test_datasets import course
 from tests.graphs.test_marg import made
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, DeclarationError, Flight, Series, load_flight, simulate, simulate_many
-from flowgraph.blocks import extended as x
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, rotate, to_rotation_vector
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.metrics.consistency import chi_square_band, inside, nis_summary
-from flowgraph.blocks.signals import Imu, Pose
+from flowgraph.blocks.metrics import chi_square_band, inside, nis_summary
+from flowgraph.blocks.models import pose as x
+from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 from flowgraph.graphs import ekf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
 
@@ -31,7 +31,7 @@ def a_state(seed: int) -> tuple[np.ndarray, Imu]:
     return state, Imu(gyro=rng.normal(size=3) * 3.0, specific_force=rng.normal(size=3) * 10.0)
 
 
-def a_belief(seed: int = 0) -> x.QuaternionBelief:
+def a_belief(seed: int = 0) -> QuaternionBelief:
     state, _ = a_state(seed)
     return x.start_pose(state[3:6], state[6:], velocity=state[:3])
 
@@ -216,7 +216,7 @@ def averaged(seed: int) -> Flight:
     return thesis(seed, imu_oversample=10.0)
 
 
-def start(truth: Series | None, seed: int) -> dict[str, x.QuaternionBelief]:
+def start(truth: Series | None, seed: int) -> dict[str, QuaternionBelief]:
     """A start whose error is drawn from its spread."""
     assert truth is not None
     error = np.random.default_rng(seed).normal(size=9) * np.repeat([0.5, 0.5, 0.1], 3)

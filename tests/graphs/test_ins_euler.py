@@ -26,6 +26,8 @@ from flowgraph import (
     simulate,
 )
 from flowgraph.blocks.metrics.errors import interpolate_pose, pose_errors, within_truth
+from flowgraph.blocks.scoring.euler import SingularityWarning
+from flowgraph.blocks.vision.mapping import map_of
 from flowgraph.blocks.vision.motion import camera_motion_of
 from flowgraph.blocks.vision.pnp import as_measurements, rotation_of
 from flowgraph.drawing.trajectory import plot_ins, plot_space
@@ -39,8 +41,7 @@ from flowgraph.graphs.benches.apriltag import (
     odd_reprojection,
     withheld,
 )
-from flowgraph.graphs.euler_flight import SingularityWarning
-from flowgraph.graphs.tag_pose import map_of, poses_of
+from flowgraph.graphs.tag_pose import poses_of
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
 ROOT = Path(__file__).resolve().parents[2]

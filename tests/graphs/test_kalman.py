@@ -11,10 +11,11 @@ import pytest
 from flowgraph import Case, DataError, Series, arrays, periodic, simulate
 from flowgraph.blocks.kalman.filters import predict_linear
 from flowgraph.blocks.kalman.smoothing import rauch_tung_striebel
-from flowgraph.blocks.metrics.consistency import chi_square_band, error_summary, nis_summary, state_error
-from flowgraph.blocks.models.point import PointReading, point_model, start_point
+from flowgraph.blocks.metrics import chi_square_band, error_summary, nis_summary, state_error
+from flowgraph.blocks.models.point import point_model, start_point
+from flowgraph.blocks.scoring.point import readings
+from flowgraph.blocks.signals import PointReading
 from flowgraph.graphs import kalman
-from flowgraph.graphs.kalman import readings
 from flowgraph.study import Study, read_table, run_study
 from tests.graphs.estimation import THESIS, engines_agree, is_lowered_and_drawn, thesis
 

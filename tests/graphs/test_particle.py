@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flowgraph import Case, DataError, DeclarationError, Flight, UnknownNameError, load_flight, simulate
-from flowgraph.blocks.particles.plane import exact, plane_errors
+from flowgraph.blocks.metrics.errors import plane_errors
+from flowgraph.blocks.models.plane import exact
 from flowgraph.graphs.particle import particle
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 

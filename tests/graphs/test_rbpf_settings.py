@@ -19,7 +19,8 @@ from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.particles.cloud import start_cloud
 from flowgraph.blocks.signals import Attitude, Imu, Position
-from flowgraph.engines.many import Runs, simulate_many
+from flowgraph.data.batch import Runs
+from flowgraph.engines.many import simulate_many
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 

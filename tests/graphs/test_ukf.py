@@ -12,9 +12,9 @@ import pytest
 from flowgraph import Case, DataError, DeclarationError, Flight, LoweringError, load_flight, lower, simulate
 from flowgraph import simulate_many as many
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, geodesic_angle, multiply
-from flowgraph.blocks.kalman.filters import Gaussian
-from flowgraph.blocks.metrics.consistency import chi_square_band, inside, state_nees
+from flowgraph.blocks.metrics import chi_square_band, inside, state_nees
 from flowgraph.blocks.models.unscented_pose import start_state
+from flowgraph.blocks.signals import Gaussian
 from flowgraph.graphs import ekf, ukf
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn, mean_nees, smooth, thesis
 

@@ -26,8 +26,7 @@ from flowgraph import (
     sink,
     when,
 )
-from flowgraph.blocks.signals import Imu
-from flowgraph.blocks.vision.tags import Tags
+from flowgraph.blocks.signals import Imu, Tags
 from flowgraph.data.inputs import clocks_of
 from flowgraph.engines.c.harness import write_events
 from flowgraph.engines.state import load_state, save_state

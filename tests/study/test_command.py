@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from flowgraph.study import Store, Study, read_table
-from tests.data import DATA, recordings
+from tests.recordings import DATA, recordings
 
 pytest.importorskip("pyarrow")
 

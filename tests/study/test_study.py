@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import math
 import os
@@ -99,8 +98,7 @@ def test_a_changed_parameter_graph_or_engine_is_another_key(monkeypatch):
     for other in ({"parameters": {"settle": 0.5}}, {"engine": "reference"}, {"seeds": [1]}):
         assert not keys(**other) & first
     assert not keys(parameters={"gyro.noise": 0.002}) & first
-    ekf = importlib.import_module("flowgraph.graphs.ekf")
-    monkeypatch.setattr(ekf, "gravity_of", lambda flight: (0.0, 0.0, -9.8))
+    monkeypatch.setattr("flowgraph.blocks.scoring.cases.GRAVITY", (0.0, 0.0, -9.8))
     assert not keys() & first
 
 
@@ -171,7 +169,7 @@ def test_vectorised_runs_are_those_of_one_at_a_time(tmp_path):
 
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
     pytest.importorskip("jax")
-    from flowgraph import xla
+    from flowgraph.engines.xla import scan as xla
 
     tasks._programs.clear()
     compiled: list[Any] = []

@@ -51,7 +51,7 @@ def test_runs_on_threads_are_those_of_one_at_a_time(tmp_path):
 
 
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
-    from flowgraph.engines.c import engine
+    from flowgraph.engines.c import library as engine
 
     tasks._programs.clear()
     compiled: list[Any] = []

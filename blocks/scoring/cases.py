@@ -1,0 +1,315 @@
+"""How a graph is made ready for a flight: with what is set, what the flight says, and a score.
+
+    @on_flight(ekf, "imu", "vicon")
+    def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
+        first = on.inputs["vicon"][0]
+        return on.case(filter.score(on, pose_errors), start=start_pose(first.position, first.attitude), ...)
+
+The settings that filters have in common are groups, declared here once. A filter of a pose by an IMU and
+something that measures the pose has those of `PoseAided`; what is added there is a setting of all of them.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from flowgraph import Case, Flight, Result, Series, clocks_of
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.scorer import Errors, Scorer
+from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
+from flowgraph.blocks.signals import GRAVITY
+from flowgraph.language.declare import GraphFunction
+
+__all__ = [
+    "Factors",
+    "Gated",
+    "OnFlight",
+    "Particles",
+    "PoseAided",
+    "PoseFilter",
+    "PoseNoises",
+    "Scored",
+    "Smoothed",
+    "SmoothedPoseFilter",
+    "on_capture",
+    "on_flight",
+]
+
+Score = Callable[[Result], dict[str, float]]
+
+
+@dataclass(frozen=True)
+class OnFlight:
+    """A graph and a flight that are about to become a case.
+
+    Args:
+        graph: who asks, in what is refused.
+        flight: as it was loaded, or as `told` has completed it.
+        inputs: the streams that were needed, by name.
+    """
+
+    graph: GraphFunction
+    flight: Flight
+    inputs: dict[str, Series]
+
+    @property
+    def name(self) -> str:
+        """The graph's."""
+        return self.graph.name
+
+    def need(self, *streams: str, fix: str = "choose another flight") -> dict[str, Series]:
+        """`Flight.need` of the graph."""
+        return self.flight.need(self.name, *streams, fix=fix)
+
+    def noise(self, name: str, setting: float | None, otherwise: float | None = None) -> float:
+        """A standard deviation or density: `noise_of` of the graph."""
+        return noise_of(self.name, self.flight, name, setting, otherwise)
+
+    def case(
+        self,
+        score: Score,
+        *,
+        inputs: Mapping[str, Series] | None = None,
+        estimate: str | None = None,
+        sizes: Mapping[str, int] | None = None,
+        **settings: Any,
+    ) -> Case:
+        """The graph, built on the clocks of its inputs.
+
+        Args:
+            score: of a result.
+            inputs: by source; those that were needed if left out.
+            estimate: the collected stream that it is of; the one that is scored if left out.
+            sizes, settings: as for `build`.
+        """
+        inputs = dict(self.inputs if inputs is None else inputs)
+        built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
+        return Case(built, inputs, score, given(estimate, getattr(score, "estimate", "belief")))
+
+
+def on_flight(
+    graph: GraphFunction,
+    *needs: str,
+    fix: str = "choose another flight",
+    told: Callable[[Flight], Flight] | None = None,
+) -> Callable[[Callable[..., Case]], Callable[..., Case]]:
+    """Decorator: registers `function(on, *, settings) -> Case` as that which makes a case of a flight.
+
+    Settings are checked first, by what their annotations say; then the streams are looked for.
+
+    Args:
+        graph: which is made ready.
+        needs: streams without which it is not, put into `on.inputs`.
+        fix: what to do where one is missing.
+        told: completes the flight by what follows from it.
+
+    Raises:
+        DataError: by what is registered, where a stream is missing or empty.
+        DeclarationError, UnknownNameError: by what is registered, for a setting that is out of range.
+    """
+
+    def register(function: Callable[..., Case]) -> Callable[..., Case]:
+        known = spliced(function)
+        flown = inspect.Parameter("flight", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Flight)
+        signature = inspect.Signature([flown, *known.parameters], return_annotation=Case)
+
+        @functools.wraps(function)
+        def prepare(*args: Any, **keywords: Any) -> Case:
+            try:
+                bound = signature.bind(*args, **keywords)
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}() {error}") from None
+            bound.apply_defaults()
+            values = dict(bound.arguments)
+            flight = values.pop("flight")
+            known.check(graph.name, values)
+            flight = flight if told is None else told(flight)
+            inputs = flight.need(graph.name, *needs, fix=fix)
+            return function(OnFlight(graph, flight, inputs), **known.grouped(values))
+
+        prepare.__signature__ = signature  # type: ignore[attr-defined]
+        prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
+        prepare.__doc__ = known.documentation
+        return graph.on_flight(prepare)
+
+    return register
+
+
+# -- settings that filters share -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scored(Settings):
+    """How a run is scored.
+
+    Args:
+        settle: seconds at the start that the errors leave out.
+    """
+
+    settle: NotNegative = 1.0
+
+    def score(
+        self,
+        on: OnFlight,
+        errors: Errors,
+        *,
+        estimate: str = "belief",
+        innovations: bool = True,
+        steps: Callable[[Result], Steps] | None = None,
+    ) -> Scorer:
+        """The score of a run on that flight; see `Scorer`."""
+        truth = on.flight.truth
+        return Scorer(truth, errors, estimate, self.settle, innovations, steps, *self._smoother())
+
+    def _smoother(self) -> tuple[str, float | None]:
+        return "none", None
+
+
+@dataclass(frozen=True)
+class Smoothed(Scored):
+    """How a run is scored that can be smoothed.
+
+    Args:
+        smooth: "rts" also scores the smoothed run.
+        lag: s; also scores the run smoothed with a fixed lag.
+    """
+
+    smooth: Annotated[str, one_of("none", "rts")] = "none"
+    lag: NotNegative | None = None
+
+    def _smoother(self) -> tuple[str, float | None]:
+        return self.smooth, self.lag
+
+
+@dataclass(frozen=True)
+class Gated(Settings):
+    """Which measurements are believed.
+
+    Args:
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
+    """
+
+    gate: Positive | None = None
+
+
+@dataclass(frozen=True)
+class Factors(Settings):
+    """How far the densities of an IMU are believed.
+
+    Args:
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
+    """
+
+    gyro_factor: Positive | None = None
+    accelerometer_factor: Positive | None = None
+
+    def imu_noise(self, on: OnFlight, otherwise: tuple[float, float] = (1.0, 1.0)) -> ImuNoise:
+        """The noise of the flight's IMU, times the factors, or those of `otherwise` that were left out.
+
+        Raises:
+            DataError: where the flight does not say it.
+        """
+        gyro, accelerometer = otherwise
+        return imu_noise_of(
+            on.name,
+            on.flight,
+            given(self.gyro_factor, gyro),
+            given(self.accelerometer_factor, accelerometer),
+        )
+
+
+@dataclass(frozen=True)
+class PoseNoises(Settings):
+    """How far a measured pose is believed.
+
+    Args:
+        position_noise, attitude_noise: standard deviations in m and rad; the flight's own if left out.
+    """
+
+    position_noise: Positive | None = None
+    attitude_noise: Positive | None = None
+
+    def measured(self, on: OnFlight) -> dict[str, Any]:
+        """Both, by name: the settings, or the flight's own, or 4 mm and 0.01 rad."""
+        return {
+            "position_noise": on.noise("position_noise", self.position_noise, 0.004),
+            "attitude_noise": on.noise("attitude_noise", self.attitude_noise, 0.01),
+        }
+
+
+@dataclass(frozen=True)
+class PoseAided(Factors, PoseNoises, Scored):
+    """What every filter has that is driven by an IMU and corrected by poses."""
+
+
+@dataclass(frozen=True)
+class PoseFilter(PoseAided, Gated):
+    """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
+
+
+@dataclass(frozen=True)
+class SmoothedPoseFilter(PoseFilter, Smoothed):
+    """A `PoseFilter` of which a run can be smoothed."""
+
+
+@dataclass(frozen=True)
+class Particles(Settings):
+    """A cloud of particles.
+
+    Args:
+        particles: how many.
+        seed: of the start's draws; that of the run is given to `simulate`.
+        resample_below: resample when the effective sample size is below this fraction of the particles.
+        scheme: systematic, stratified, residual or multinomial.
+    """
+
+    particles: Annotated[int, count(1, MOST_PARTICLES)] = 1000
+    seed: int = 0
+    resample_below: NotNegative = 0.5
+    scheme: str = "systematic"
+
+    def resampling(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {"resample_below": self.resample_below, "scheme": self.scheme}
+
+
+# -- filters on an IMU and a motion capture --------------------------------------------------------------
+
+
+def on_capture(
+    on: OnFlight,
+    filter: PoseFilter,
+    *,
+    start: Callable[..., Any],
+    steps: Callable[[Result], Steps] | None = None,
+    **settings: Any,
+) -> Case:
+    """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.
+
+    Args:
+        on: with both streams.
+        filter: its factors, where they are left out, are those of `unbiased_factors`.
+        start: `(position, attitude)`, makes what the graph starts from.
+        steps: what a smoother needs of a result.
+        settings: of the graph itself.
+    """
+    first, info = on.inputs["vicon"][0], on.flight.info
+    return on.case(
+        filter.score(on, pose_errors, steps=steps),
+        start=start(first.position, first.attitude),
+        noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
+        **filter.measured(on),
+        lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
+        reading=reading_of(on.flight),
+        gravity=info.get("gravity", GRAVITY),
+        gate=filter.gate,
+        **settings,
+    )

@@ -1,0 +1,86 @@
+"""Linear filters of a point on flights: told the attitude, they see accelerations and positions.
+
+Told the exact attitude and bias, such a filter is the bound that no filter on the same data can beat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from flowgraph import Case, DataError, Flight, Series, arrays
+from flowgraph.blocks.metrics.consistency import point_errors
+from flowgraph.blocks.models.point import point_model, point_steps, start_point
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Smoothed
+from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
+from flowgraph.blocks.signals import PointReading, Position
+
+__all__ = ["PointFilter", "on_point", "positions", "readings"]
+
+
+@dataclass(frozen=True)
+class PointFilter(Gated, Smoothed):
+    """What is set of a linear filter of a point.
+
+    Args:
+        position_noise: standard deviation, m; the flight's own if left out.
+        accelerometer_noise: density, m/s^2/sqrt(Hz); the flight's own if left out.
+    """
+
+    position_noise: Positive | None = None
+    accelerometer_noise: Positive | None = None
+
+
+def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) -> Case:
+    """The filter on such inputs, at the first position and at rest.
+
+    Args:
+        on: with the streams `imu` and `vicon`.
+
+    Raises:
+        DataError: where the flight does not say its noise.
+    """
+    density = given(filter.accelerometer_noise, imu_noise_of(on.name, on.flight).accelerometer)
+    return on.case(
+        filter.score(on, point_errors, steps=partial(point_steps, model=point_model(density))),
+        inputs=inputs,
+        start=start_point(on.inputs["vicon"]["position"][0]),
+        noise=density,
+        position_noise=on.noise("position_noise", filter.position_noise),
+        control=reading_of(on.flight),
+        gate=filter.gate,
+    )
+
+
+def positions(vicon: Series) -> Series:
+    """The positions of a motion capture."""
+    return Series(vicon.time, Position(position=vicon["position"]), name="position")
+
+
+def readings(flight: Flight) -> Series:
+    """The flight's accelerations, each with the position of its time, NaN where there was none.
+
+    Args:
+        flight: with the stream `vicon`, and what `told_acceleration` asks for.
+
+    Raises:
+        DataError: without an IMU or truth, or where a position comes between two IMU readings.
+    """
+    vicon, control = flight.streams["vicon"], told_acceleration(flight)
+    if not np.isin(vicon.time, control.time).all():
+        raise DataError(
+            "the positions do not come with the controls",
+            path=flight.name,
+            expected="a stream vicon, at times of the stream imu",
+            got="positions between two readings of the imu",
+            fix="use async_kalman, which takes each when it comes",
+        )
+    position = np.full((len(control), 3), np.nan)
+    position[np.searchsorted(control.time, vicon.time)] = vicon["position"]
+    values = PointReading(acceleration=control["acceleration"], position=position)
+    return arrays(control.time, values, not_finite="keep", name="reading")

@@ -1,0 +1,110 @@
+"""Consistency: bands, NEES and NIS of errors that are what they say, and of errors that are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowgraph import DataError, Series
+from flowgraph.blocks import metrics as c
+from flowgraph.blocks.geometry import from_rotation_vector, multiply
+from flowgraph.blocks.kalman import update_linear
+from flowgraph.blocks.metrics import gate_table
+from flowgraph.blocks.signals import Gaussian, Innovation, KalmanInnovation, NavigationState, PointBelief
+
+RNG = np.random.default_rng(8)
+TIME = np.arange(400) * 5_000_000
+
+
+def a_truth() -> Series:
+    n, none = len(TIME), np.zeros((len(TIME), 3))
+    line = TIME[:, None] * 1e-9 * np.array([1.0, -2.0, 0.5])
+    q = from_rotation_vector(np.full((n, 3), 0.3), xp=np)
+    return Series(TIME, NavigationState(line, none + np.array([1.0, -2.0, 0.5]), q, none, none), name="truth")
+
+
+def beliefs(scale: float = 1.0) -> Series:
+    """Beliefs whose errors are drawn from their covariance, times `scale`."""
+    root = RNG.normal(size=(6, 6)) * 0.1
+    error = RNG.normal(size=(len(TIME), 6)) @ root.T * scale
+    truth = a_truth()
+    P = np.broadcast_to(root @ root.T, (len(TIME), 6, 6))
+    return Series(TIME, PointBelief(truth["position"] + error[:, :3], truth["velocity"] + error[:, 3:], P))
+
+
+def test_bands_are_those_of_the_tables():
+    np.testing.assert_allclose(c.chi_square_band(2), (0.0506, 7.378), rtol=1e-3)
+    np.testing.assert_allclose(c.chi_square_band(4, runs=50), (3.2545, 4.8212), rtol=1e-3)  # 162.7, 241.1
+    np.testing.assert_allclose(c.chi_square_gate(3), 16.27, rtol=1e-3)
+    assert c.inside([0.0, 1.0, 2.0, 9.0], (0.5, 2.0)) == 0.5
+
+
+def test_nees_of_one_number_is_its_square_in_deviations():
+    np.testing.assert_allclose(c.nees([[3.0], [0.5]], [[[9.0]], [[0.25]]]), [1.0, 1.0])
+
+
+@pytest.mark.parametrize(("scale", "low", "high"), [(1.0, 5.6, 6.4), (1.5, 12.0, 15.0), (0.5, 1.3, 1.7)])
+def test_nees_tells_honest_beliefs_from_others(scale, low, high):
+    assert low < c.state_nees(beliefs(scale), a_truth()).mean() < high
+
+
+def test_an_attitude_error_is_taken_in_the_body():
+    truth, turn = a_truth(), np.array([0.01, -0.02, 0.03])
+    q = multiply(truth["attitude"], from_rotation_vector(-turn + np.zeros((len(TIME), 3)), xp=np), xp=np)
+    error = c.state_error(TIME, truth, truth["position"], truth["velocity"], q)
+    np.testing.assert_allclose(error, np.broadcast_to(np.r_[np.zeros(6), turn], error.shape), atol=1e-12)
+
+
+def test_errors_are_summed_up():
+    found = c.error_summary([[3.0, 4.0], [0.0, 1.0]])
+    assert found == {"rmse": pytest.approx(np.sqrt(13.0)), "mean": 3.0, "max": 5.0}
+
+
+def test_errors_of_a_point():
+    found = c.point_errors(beliefs(), a_truth(), settle=0.5)
+    assert found["compared_ticks"] == 300
+    assert found["position_mean_m"] < found["position_rmse_m"] < found["position_max_m"]
+    assert 5.0 < found["nees_mean"] < 7.0
+    with pytest.raises(DataError, match="no tick of the estimate lies within the truth"):
+        c.point_errors(beliefs(), a_truth(), settle=3.0)
+    with pytest.raises(DataError, match="no tick of the estimate lies within the truth"):
+        c.point_errors(beliefs(), a_truth()[:0])
+
+
+def innovations(scale: float) -> Series:
+    r = RNG.normal(size=(300, 3)) * scale
+    missing = RNG.uniform(size=(300, 3)) < 0.3
+    missing[:, 0] = False
+    r[missing] = 0.0
+    S = np.broadcast_to(np.eye(3), (300, 3, 3))
+    nis, parts = (r**2).sum(-1), (~missing).sum(-1).astype(float)
+    return Series(np.arange(300), KalmanInnovation(r, S, nis, parts, nis < 20.0))
+
+
+def test_nis_counts_the_entries_that_there_were():
+    found = c.nis_summary(innovations(1.0))
+    assert found["nis_low"] < found["nis_mean"] < found["nis_high"]
+    assert found["nis_inside"] > 0.9
+    assert found["nis_count"] == 300.0
+    too_large = c.nis_summary(innovations(1.6))
+    assert too_large["nis_mean"] > too_large["nis_high"]
+    assert too_large["nis_rejected"] > 0.0
+
+
+def test_nis_of_an_innovation_that_is_always_whole():
+    r = RNG.normal(size=(200, 3))
+    S = np.broadcast_to(np.eye(3), (200, 3, 3))
+    found = c.nis_summary(Series(np.arange(200), Innovation(r, S, (r**2).sum(-1))))
+    assert found["nis_low"] < found["nis_mean"] < found["nis_high"]
+    assert found["nis_rejected"] == 0.0
+
+
+@pytest.mark.parametrize("gate", [0.99, 11.345])
+def test_a_gate_is_as_strict_with_a_part_of_a_measurement(gate):
+    """11.345 is what three numbers stay below with a probability of 0.99."""
+    np.testing.assert_allclose(gate_table(gate, 3), [0.0, 6.635, 9.210, 11.345], atol=1e-3)
+    assert (gate_table(1e6, 3)[1:] == 1e6).all()
+    prior = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+    for z, passes in (([3.0, np.nan, np.nan], False), ([2.5, np.nan, np.nan], True), ([3.0, 0.0, 0.0], True)):
+        _, found = update_linear.step(prior, np.array(z), H=np.eye(3), R=np.eye(3), gate=gate, xp=np)
+        assert bool(found.value.accepted if hasattr(found, "value") else found.accepted) is passes
