@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from flowgraph.pipeline.optimise.elements import MOVES
-from flowgraph.recorder.ops import ELEMENTWISE, Spec
+from flowgraph.recorder.ops import ELEMENTWISE, FUNCTIONS, Spec
 from flowgraph.recorder.trace import Instruction
 
 KINDS = (
@@ -28,8 +28,6 @@ KINDS = (
 )
 """What is counted. Minimum, maximum and `where` compare, shifts and truth values are logic."""
 
-_FUNCTIONS = """
-exp expm1 log log1p log2 sin cos tan asin acos atan atan2 sinh cosh tanh pow"""
 _COMPARE = """
 maximum minimum equal not_equal less less_equal greater greater_equal isfinite isnan where sign"""
 _LOGIC = """
@@ -37,7 +35,7 @@ logical_and logical_or logical_xor logical_not bitwise_and bitwise_or bitwise_xo
 bitwise_left_shift bitwise_right_shift"""
 _ADD = "add subtract negative abs floor ceil round trunc positive copysign"
 _KIND = (
-    dict.fromkeys(_FUNCTIONS.split(), "function")
+    dict.fromkeys((*FUNCTIONS, "pow"), "function")
     | dict.fromkeys(_COMPARE.split(), "compare")
     | dict.fromkeys(_LOGIC.split(), "logic")
     | dict.fromkeys(_ADD.split(), "add")

@@ -33,8 +33,11 @@ from flowgraph.pipeline.costs.operations import depth, operations
 from flowgraph.pipeline.costs.timing import critical_path, interval, reach
 from flowgraph.pipeline.optimise import without
 from flowgraph.pipeline.program import specialise
-from flowgraph.recorder.ops import OPS
+from flowgraph.recorder.ops import Spec
+from flowgraph.types import dtype_name
 from tests.pipeline.optimise.programs import record
+from tests.recorder.test_symbolic import CASES
+from tests.recorder.test_symbolic import record as record_case
 
 
 def only(step, *shapes):
@@ -76,14 +79,16 @@ def test_moves_cost_nothing():
     assert all(not operations(i, program.specs) for i in program.instructions)
 
 
-def test_every_instruction_of_every_graph_can_be_counted():
-    """No operation of the table is unknown to the report."""
-    for name in ("ins_eskf", "rbpf_indoor", "ekf", "complementary"):
-        case = find_graph(name).case(load_flight("sim", settings={"duration": "1"}))
-        for i in lower(case.graph).instructions:
-            assert i.op in OPS
-            assert depth(i, lower(case.graph).specs) >= 0
-            assert min(operations(i, lower(case.graph).specs).values(), default=0) >= 0
+@pytest.mark.parametrize("name", CASES)
+def test_every_operation_can_be_counted(name):
+    for function, arrays in CASES[name]:
+        trace, numbers, _ = record_case(function, arrays)
+        known = {**trace.constants, **{n: arrays[k] for k, n in enumerate(numbers)}}
+        specs = {n: Spec(np.shape(a), dtype_name(a)) for n, a in known.items()}
+        for i in trace.instructions:
+            specs[i.out] = i.spec
+            assert depth(i, specs) >= 0
+            assert min(operations(i, specs).values(), default=0) >= 0
 
 
 def test_longest_chains():
