@@ -134,32 +134,35 @@ def toy(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(folder)}
 
 
-def python(toy: dict[str, str], *arguments: str) -> Any:
-    return subprocess.run([sys.executable, *arguments], env=toy, capture_output=True, text=True, timeout=120)
+def ran(toy: dict[str, str], *command: str) -> Any:
+    return subprocess.run(command, env=toy, capture_output=True, text=True, timeout=120)
+
+
+FLOWGRAPH = str(Path(sys.executable).with_name("flowgraph"))
 
 
 def test_a_package_brings_an_engine_for_runs_many_runs_and_studies(toy, tmp_path):
     program = tmp_path / "use.py"
     program.write_text(textwrap.dedent(USE))
-    done = python(toy, str(program), str(tmp_path / "study"))
+    done = ran(toy, sys.executable, str(program), str(tmp_path / "study"))
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "all of it"
 
 
 def test_the_command_runs_it(toy):
-    arguments = ["-m", "flowgraph", "run", "kalman", "--data", "sim", "--set", "duration=3", "--json"]
-    ours, theirs = (python(toy, *arguments, "--engine", e) for e in ("reference", "toy"))
+    arguments = [FLOWGRAPH, "run", "kalman", "--data", "sim", "--set", "duration=3", "--json"]
+    ours, theirs = (ran(toy, *arguments, "--engine", e) for e in ("reference", "toy"))
     assert theirs.returncode == 0, theirs.stderr
     a, b = (json.loads(r.stdout) for r in (ours, theirs))
     assert b["engine"] == "toy"
     assert a["position_rmse_m"] == b["position_rmse_m"]
-    refused = python(toy, *arguments, "--engine", "toy", "--dtype", "float32")
+    refused = ran(toy, *arguments, "--engine", "toy", "--dtype", "float32")
     assert refused.returncode == 2
     assert "the toy engine computes in float64" in refused.stderr
 
 
 def test_what_is_no_engine_is_refused_by_name(toy):
-    done = python(toy, "-m", "flowgraph", "run", "kalman", "--data", "sim", "--engine", "broken")
+    done = ran(toy, FLOWGRAPH, "run", "kalman", "--data", "sim", "--engine", "broken")
     assert done.returncode != 0
     assert "what is installed under this name is no engine" in done.stderr
 

@@ -1,5 +1,0 @@
-"""`python -m flowgraph` is the command `flowgraph`."""
-
-from flowgraph.cli import main
-
-main()
