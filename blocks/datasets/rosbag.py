@@ -143,7 +143,7 @@ class _Bag:
 
     def __init__(self, path: Path) -> None:
         try:
-            from rosbags import rosbag1, rosbag2
+            from rosbags import rosbag1, rosbag2  # optional, with what follows
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise MissingDependencyError(

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import block, when
-from flowgraph.blocks.geometry.rotations import skew
+from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.signals import PoseMeasurement, Tags
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.tags import TagMap
@@ -152,7 +152,7 @@ def body_measurement(solution: Solution, mount: Mount, tags: int) -> PoseMeasure
 
 def quaternion_of(R: npt.ArrayLike) -> np.ndarray:
     """The unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation  # half a second that the blocks alone need not pay
 
     return np.asarray(
         Rotation.from_matrix(np.asarray(R, dtype=float)).as_quat(canonical=True)[..., [3, 0, 1, 2]]
@@ -161,8 +161,6 @@ def quaternion_of(R: npt.ArrayLike) -> np.ndarray:
 
 def rotation_of(q: npt.ArrayLike) -> np.ndarray:
     """The rotation (..., 3, 3) of a unit quaternion (..., 4)."""
-    from flowgraph.blocks.geometry.rotations import to_matrix
-
     return np.asarray(to_matrix(np.asarray(q, dtype=float), xp=np))
 
 

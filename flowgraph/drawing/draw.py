@@ -91,11 +91,11 @@ def _render(source: str, kind: str) -> bytes:
     if kind == "png":
         source = source.replace("{", "{ dpi=144;", 1)
     if shutil.which("dot"):
-        import graphviz
+        import graphviz  # only where its program is
 
         return bytes(graphviz.Source(source).pipe(format=kind, encoding=None, quiet=True))
     try:
-        import pygraphviz
+        import pygraphviz  # may be absent
     except ImportError:
         raise MissingDependencyError(
             "nothing here can lay out a diagram",

@@ -134,7 +134,7 @@ def to_networkx(graph: Graph) -> networkx.MultiDiGraph:
     Edges: `type`, `clock` (None: held), `output` and `port` (names of the two ends), `optional`, and
     `feedback`: whether it writes what is read a tick later. Without the feedback edges there is no cycle.
     """
-    import networkx
+    import networkx  # slow to import, and only needed here
 
     made = networkx.MultiDiGraph(name=graph.name)
     for index, node in enumerate(graph.nodes):

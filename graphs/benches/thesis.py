@@ -329,7 +329,7 @@ def _listed(kind: str, text: str, valid: Any) -> list[str]:
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Bars of the errors with their intervals and the bound, and the thesis's metric beside its figures."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # a second that only pictures need
 
     codes, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("setting", "filter"))
     figure = Figure(figsize=(13, 8), layout="constrained")
