@@ -152,7 +152,7 @@ def body_measurement(solution: Solution, mount: Mount, tags: int) -> PoseMeasure
 
 def quaternion_of(R: npt.ArrayLike) -> np.ndarray:
     """The unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
-    from scipy.spatial.transform import Rotation  # slow to import, and only an image needs it
+    from scipy.spatial.transform import Rotation  # half a second that the blocks alone need not pay
 
     return np.asarray(
         Rotation.from_matrix(np.asarray(R, dtype=float)).as_quat(canonical=True)[..., [3, 0, 1, 2]]

@@ -158,7 +158,7 @@ def _recorded(case: Case) -> list[Series]:
 
 
 def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
-    # The other commands start without the plots.
+    # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
     from flowgraph.drawing.trajectory import plot_space

@@ -91,11 +91,11 @@ def _render(source: str, kind: str) -> bytes:
     if kind == "png":
         source = source.replace("{", "{ dpi=144;", 1)
     if shutil.which("dot"):
-        import graphviz  # only files need it, and its program beside it
+        import graphviz  # only where its program is
 
         return bytes(graphviz.Source(source).pipe(format=kind, encoding=None, quiet=True))
     try:
-        import pygraphviz  # one of the two is enough
+        import pygraphviz  # may be absent
     except ImportError:
         raise MissingDependencyError(
             "nothing here can lay out a diagram",

@@ -167,7 +167,7 @@ def plot_navigation(
 
 def _figure(width: float, height: float) -> Figure:
     try:
-        from matplotlib.figure import Figure  # a second that only pictures need
+        from matplotlib.figure import Figure  # may be absent
     except ImportError:
         raise MissingDependencyError(
             "plots need matplotlib", expected="the Python package matplotlib", got="it cannot be imported",

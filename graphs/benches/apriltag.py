@@ -122,7 +122,8 @@ def _posed(
 
 
 def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: Any) -> None:
-    from flowgraph.drawing.trajectory import plot_ins, plot_space  # slow, and only a picture needs it
+    # With them comes SciPy, which only pictures need.
+    from flowgraph.drawing.trajectory import plot_ins, plot_space
 
     belief, observed = result["belief"], flight.streams["pose"]
 

@@ -108,7 +108,7 @@ def readings(flight: Flight) -> tuple[Series, np.ndarray, np.ndarray, np.ndarray
 
 def madgwick(flight: Flight) -> Series:
     """Madgwick's filter. Its world has north on x; ours, as the trials', has it on y."""
-    from ahrs.filters import Madgwick  # optional: a peer
+    from ahrs.filters import Madgwick  # optional
 
     imu, gyro, force, field, step = readings(flight)
     q = Madgwick(gyr=gyro, acc=force, mag=field, frequency=1.0 / step, gain=0.12).Q
@@ -118,7 +118,7 @@ def madgwick(flight: Flight) -> Series:
 
 def vqf(flight: Flight) -> Series:
     """VQF with nine axes, as it comes; its world is east-north-up."""
-    from vqf import VQF  # optional: a peer
+    from vqf import VQF  # optional
 
     imu, gyro, force, field, step = readings(flight)
     q = VQF(step).updateBatch(gyro, force, field)["quat9D"]

@@ -130,7 +130,7 @@ def _rms(x: list[float]) -> float:
 
 
 def _draw(rows: list[dict[str, Any]], reference: str, path: Path) -> None:
-    from matplotlib.figure import Figure  # slow to import, and only a picture needs it
+    from matplotlib.figure import Figure  # a second that only pictures need
 
     n = [r["particles"] for r in rows]
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
