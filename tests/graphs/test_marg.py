@@ -20,8 +20,8 @@ from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.marg import RestRule, detect_rest
 from flowgraph.blocks.signals import Attitude, Imu, MagneticField
 from flowgraph.graphs import marg
-from tests.data import recordings
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+from tests.recordings import recordings
 
 RATE = 100
 EARTH = np.array([0.0, 20e-6, -40e-6])

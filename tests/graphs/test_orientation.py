@@ -33,8 +33,8 @@ from flowgraph.blocks.orientation.accelerometer import STATE, roll_pitch_attitud
 from flowgraph.blocks.signals import Attitude, Imu
 from flowgraph.graphs import gyro_integration, quaternion_ukf, roll_pitch
 from flowgraph.graphs.benches.ese650 import PUBLISHED
-from tests.data import recordings
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+from tests.recordings import recordings
 
 GRAPHS = {"quaternion_ukf": quaternion_ukf, "roll_pitch": roll_pitch, "gyro_integration": gyro_integration}
 SECOND = 1_000_000_000

@@ -23,7 +23,7 @@ from flowgraph.cli import app
 from flowgraph.study import trials
 from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
 from tests.blocks.datasets.test_datasets import course
-from tests.data import recordings
+from tests.recordings import recordings
 
 PERFECT: dict[str, Any] = {
     "gyro.walk": 0.0, "accelerometer.walk": 0.0, "gyro.bias": 0.0, "accelerometer.bias": 0.0,

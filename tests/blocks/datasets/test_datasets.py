@@ -17,7 +17,7 @@ from flowgraph.blocks.datasets import broad, csv_file, ese650, tum
 from flowgraph.blocks.datasets.matfile import read_mat
 from flowgraph.blocks.signals import Attitude, Imu, Pose
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
-from tests.data import recordings
+from tests.recordings import recordings
 
 MS = 1_000_000
 

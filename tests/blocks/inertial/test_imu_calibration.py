@@ -9,8 +9,8 @@ from flowgraph import DataError, DeclarationError, Flight, Series, find_graph, l
 from flowgraph.blocks.inertial import CountsCalibration, calibrated, fit_counts, windows_of
 from flowgraph.blocks.signals import Attitude, ImuCounts, Window
 from tests.blocks.datasets.test_datasets import course
-from tests.data import recordings
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
+from tests.recordings import recordings
 
 
 @pytest.fixture(scope="module")
