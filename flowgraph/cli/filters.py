@@ -85,10 +85,12 @@ def run(
     if out is not None:
         make_ready(out)
     case, flight = case_of(graph, data, settings, seed)
-    for note in flight.notes:
-        err_console.print(f"note: {note}", markup=False)
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
+    notes = dict.fromkeys((*flight.notes, *case.notes, *result.notes))
+    for note in notes:
+        err_console.print(f"note: {note}", markup=False)
     report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    report["notes"] = list(notes)
     if out is not None:
         _write_report(out, case, flight, result, report)
     if as_json:

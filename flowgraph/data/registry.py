@@ -40,12 +40,14 @@ class Case:
         score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
             the names of the streams that it looks at; then a study of many runs at once keeps only those.
         estimate: name of the collected stream that the score and the pictures are of.
+        notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
     """
 
     graph: Graph
     inputs: Inputs
     score: Callable[[Result], dict[str, float]]
     estimate: str = "belief"
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ class Result:
         stats: what joins discarded by definition.
         ticks: how many were run.
         wall_s: seconds spent in the engine's loop, without set-up.
+        notes: what the run has to say, a sentence each; see `flowgraph.data.notes`.
     """
 
     graph: str
@@ -48,6 +49,7 @@ class Result:
     stats: Mapping[str, int]
     ticks: int
     wall_s: float
+    notes: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Series:
         if name not in self.series:

@@ -30,9 +30,9 @@ from flowgraph.blocks.models.point import start_point
 from flowgraph.blocks.models.pose import start_pose
 from flowgraph.blocks.models.unscented_pose import start_state
 from flowgraph.blocks.particles.cloud import start_cloud
-from flowgraph.blocks.scoring.point import readings
+from flowgraph.blocks.scoring.point import positions, readings
 from flowgraph.blocks.scoring.tuning import WEIGHTLESS, with_imu
-from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate, Position
+from flowgraph.blocks.signals import Attitude, Imu, PoseEstimate
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
@@ -116,21 +116,38 @@ def fly(seed: int, noise: Noise, *, duration: float = 20.0) -> Flight:
 def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
     p, v, q = _at_first(flight)
     start = PoseEstimate(position=p, velocity=v, attitude=q)
-    build = lambda: augmented_complementary.build(**_clocks(flight), start=start, gravity=WEIGHTLESS)
+    build = lambda: augmented_complementary.build(
+        **clocks_of(flight.streams), start=start, gravity=WEIGHTLESS
+    )
     return Trial(build, flight.streams, {"previous": start})
 
 
 def _ekf(flight: Flight, noise: Noise, _: int) -> Trial:
-    return _pose_filter(ekf, start_pose, flight, noise)
+    return _told(ekf, flight, noise, _near(start_pose, flight))
 
 
 def _ukf(flight: Flight, noise: Noise, _: int) -> Trial:
-    return _pose_filter(ukf, start_state, flight, noise)
+    return _told(ukf, flight, noise, _near(start_state, flight))
 
 
-def _pose_filter(graph: Any, begin: Callable[..., Any], flight: Flight, noise: Noise) -> Trial:
+def _eskf(flight: Flight, noise: Noise, _: int) -> Trial:
     p, v, q = _at_first(flight)
-    start = begin(
+    start = start_belief(p, q, velocity=v, spread=NEAR)  # biases known: nine states are left
+    imu, vicon = (flight.streams[name] for name in ("imu", "vicon"))
+    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude")
+    inputs = {"imu": imu, "position": positions(vicon), "attitude": turns}
+    return _told(ins_eskf, flight, noise, start, inputs=inputs)
+
+
+def _rbpf(flight: Flight, noise: Noise, particles: int) -> Trial:
+    p, v, q = _at_first(flight)
+    start = start_cloud(particles, position=p, velocity=v, attitude=q, spread=NEAR)
+    return _told(rbpf_indoor, flight, noise, start, register="cloud")
+
+
+def _near(start: Callable[..., Any], flight: Flight) -> Any:
+    p, v, q = _at_first(flight)
+    return start(
         p,
         q,
         velocity=v,
@@ -138,27 +155,20 @@ def _pose_filter(graph: Any, begin: Callable[..., Any], flight: Flight, noise: N
         velocity_deviation=NEAR.velocity,
         attitude_deviation=NEAR.tilt,
     )
+
+
+def _told(
+    graph: Any,
+    flight: Flight,
+    noise: Noise,
+    start: Any,
+    *,
+    register: str = "belief",
+    inputs: Mapping[str, Series] | None = None,
+) -> Trial:
+    """A filter of a pose on the flight's streams, or on `inputs`."""
+    inputs = flight.streams if inputs is None else inputs
     build = lambda: graph.build(
-        **_clocks(flight),
-        start=start,
-        noise=noise.imu,
-        position_noise=noise.pose,
-        attitude_noise=noise.pose,
-        gravity=WEIGHTLESS,
-    )
-    return Trial(build, flight.streams, {"belief": start})
-
-
-def _eskf(flight: Flight, noise: Noise, _: int) -> Trial:
-    p, v, q = _at_first(flight)
-    start = start_belief(p, q, velocity=v, spread=NEAR)  # biases known: nine states are left
-    vicon = flight.streams["vicon"]
-    inputs = {
-        "imu": flight.streams["imu"],
-        "position": Series(vicon.time, Position(position=vicon["position"]), name="position"),
-        "attitude": Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude"),
-    }
-    build = lambda: ins_eskf.build(
         **clocks_of(inputs),
         start=start,
         noise=noise.imu,
@@ -166,21 +176,7 @@ def _eskf(flight: Flight, noise: Noise, _: int) -> Trial:
         attitude_noise=noise.pose,
         gravity=WEIGHTLESS,
     )
-    return Trial(build, inputs, {"belief": start})
-
-
-def _rbpf(flight: Flight, noise: Noise, particles: int) -> Trial:
-    p, v, q = _at_first(flight)
-    start = start_cloud(particles, position=p, velocity=v, attitude=q, spread=NEAR)
-    build = lambda: rbpf_indoor.build(
-        **_clocks(flight),
-        start=start,
-        noise=noise.imu,
-        position_noise=noise.pose,
-        attitude_noise=noise.pose,
-        gravity=WEIGHTLESS,
-    )
-    return Trial(build, flight.streams, {"cloud": start})
+    return Trial(build, inputs, {register: start})
 
 
 def _bound(flight: Flight, noise: Noise, _: int) -> Trial:
@@ -315,10 +311,6 @@ def _at_first(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return flight.truth["position"][0], flight.truth["velocity"][0], flight.truth["attitude"][0]
 
 
-def _clocks(flight: Flight) -> dict[str, Any]:
-    return clocks_of(flight.streams)
-
-
 def _listed(kind: str, text: str, valid: Any) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
@@ -329,7 +321,7 @@ def _listed(kind: str, text: str, valid: Any) -> list[str]:
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Bars of the errors with their intervals and the bound, and the thesis's metric beside its figures."""
-    from matplotlib.figure import Figure  # a second that only pictures need
+    from matplotlib.figure import Figure  # slow to import, and only a picture needs it
 
     codes, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("setting", "filter"))
     figure = Figure(figsize=(13, 8), layout="constrained")
