@@ -45,6 +45,11 @@ class Trace:
         self._interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
         self._count = 0
 
+    @property
+    def values(self) -> list[tuple[Any, int]]:
+        """The constants to the last bit, with their numbers, in the order met."""
+        return list(self._interned.items())
+
     def new(self) -> int:
         """A fresh value number."""
         self._count += 1
