@@ -8,9 +8,10 @@ finds the same thing in the same place each time.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 class FlowgraphError(Exception):
@@ -132,6 +133,12 @@ def naming_lines() -> Iterator[None]:
         raise
 
 
+def place(around: Mapping[str, Any], line: int) -> str:
+    """module:line of code with these globals; of a program that is run as a file, file:line."""
+    module, file = str(around.get("__name__", "?")), around.get("__file__")
+    return f"{Path(file).name if module == '__main__' and file else module}:{line}"
+
+
 def _declaring_line(error: BaseException) -> str | None:
     found, step = None, error.__traceback__
     while step is not None:
@@ -140,7 +147,7 @@ def _declaring_line(error: BaseException) -> str | None:
         if package not in ("numpy", "contextlib") and (
             package != "flowgraph" or rest.partition(".")[0] in ("blocks", "graphs")
         ):
-            found = f"{module}:{step.tb_lineno}"
+            found = place(step.tb_frame.f_globals, step.tb_lineno)
         step = step.tb_next
     return found
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, NoReturn
 
-from flowgraph.errors import DeclarationError, FlowgraphError
+from flowgraph.errors import DeclarationError, FlowgraphError, place
 from flowgraph.language.block import Block
 from flowgraph.language.freezing import Freezer
 from flowgraph.recorder.refusals import is_machinery
@@ -55,7 +55,7 @@ def refuse_write(path: str, what: str, line: str | None) -> NoReturn:
         fix=_REMEDY,
     )
     error.line = line
-    raise error
+    raise error from None
 
 
 def refuse_different(first: Trace, second: Trace, path: str) -> None:
@@ -86,7 +86,7 @@ def refuse_different(first: Trace, second: Trace, path: str) -> None:
 def line_of_step(block: Block[Any]) -> str | None:
     """module:line of a block's function."""
     code = getattr(block.step, "__code__", None)
-    return None if code is None else f"{block.step.__module__}:{code.co_firstlineno}"
+    return None if code is None else place(block.step.__globals__, code.co_firstlineno)  # type: ignore[attr-defined]
 
 
 def _writing_line(record: Callable[[Freezer], object]) -> str | None:
@@ -100,7 +100,7 @@ def _writing_line(record: Callable[[Freezer], object]) -> str | None:
             return watch
         if found is None and last is not None and freezer.written():
             found = last
-        last = f"{module}:{frame.f_lineno}"
+        last = place(frame.f_globals, frame.f_lineno)
         return watch
 
     before = sys.gettrace()

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
+from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError, place
 from flowgraph.language.block import Block, Port, When
 from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
 from flowgraph.language.purity import refuse_different, refuse_write
@@ -339,11 +339,11 @@ def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
 
 def _line_of(error: BaseException) -> str:
     """module:line of the last frame of the user's code in a traceback."""
-    place = "?"
+    found = "?"
     step = error.__traceback__
     while step is not None:
         module = step.tb_frame.f_globals.get("__name__", "?")
         if not is_machinery(module) and module != __name__:
-            place = f"{module}:{step.tb_lineno}"
+            found = place(step.tb_frame.f_globals, step.tb_lineno)
         step = step.tb_next
-    return place
+    return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from flowgraph.errors import LoweringError
+from flowgraph.errors import LoweringError, place
 
 
 def caller() -> str:
@@ -13,7 +13,7 @@ def caller() -> str:
     frame = sys._getframe(1)
     while frame.f_back and is_machinery(frame.f_globals.get("__name__", "?")):
         frame = frame.f_back
-    return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
+    return place(frame.f_globals, frame.f_lineno)
 
 
 MACHINERY = tuple(
