@@ -70,7 +70,8 @@ class CycleError(DeclarationError):
 class LoweringError(FlowgraphError):
     """A block's step does something that a fixed-size pipeline cannot hold; names the source line.
 
-    `in_every_engine` is true for what no engine allows, such as an in-place write: it is refused at build.
+    `in_every_engine` is true for what no engine allows, such as an in-place write or shapes that do not fit:
+    it is refused at build.
     """
 
     in_every_engine = False

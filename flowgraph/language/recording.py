@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError, place
 from flowgraph.language.block import Block, Port, When
 from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
+from flowgraph.language.mistakes import is_mistake
 from flowgraph.language.purity import refuse_different, refuse_write
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
@@ -186,13 +187,19 @@ def _record(
     except Exception as error:
         if isinstance(error, ValueError) and "read-only" in str(error):
             refuse_write(path, "an array that it reads", _line_of(error))
-        raise LoweringError(
+        refusal = LoweringError(
             f"the step cannot be traced: {type(error).__name__}: {error}",
             path=f"{path} ({_line_of(error)})",
             expected="array-API operations through xp on fixed shapes",
             got=f"{type(error).__name__}",
             fix="use functions of xp, or declare @block(host=True) with annotated outputs",
-        ) from error
+        )
+        if is_mistake(error):
+            refusal.in_every_engine = True
+            refusal.message = f"the step is wrong: {type(error).__name__}: {error}"
+            refusal.expected = "a step that runs on values of the types at its ports"
+            refusal.fix = "mend this line; a step that needs numbers is declared with @block(host=True)"
+        raise refusal from error
     next_state: tuple[int, ...] = ()
     if memory is not None and state is not None:
         new_state, result = _split(result, path)

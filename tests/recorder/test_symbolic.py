@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from flowgraph import (
     Array,
+    DeclarationError,
     LoweringError,
     Scalar,
     Signal,
