@@ -10,6 +10,7 @@ that a step reads from such a module or class. What cannot be copied is noted, a
 from __future__ import annotations
 
 import collections
+import contextlib
 import copy
 import functools
 from collections.abc import Callable, Iterable, Mapping
@@ -31,6 +32,7 @@ _KEPT = (
 )
 _OF_A_MODULE = ("__name__", "__builtins__", "__file__", "__package__", "__spec__", "__loader__")
 _OF_THE_LANGUAGE = ("flowgraph.language", "flowgraph.recorder")
+_VALUES = (bool, int, float, complex, str, bytes, np.ndarray, np.generic, list, dict, set, tuple)
 _WRITERS = (list, dict, set, collections.deque, bytearray)
 
 
@@ -138,7 +140,8 @@ class Freezer:
         house = kind.__module__.startswith("flowgraph.") or is_own(kind.__module__)
         if attributes is None or not house or hasattr(kind, "__deepcopy__"):
             return self._deep(value, name)
-        if _is_value(value):  # copied only where what it holds has to be
+        members = self._members(kind, attributes, name)
+        if _is_value(value) and not members:  # copied only where what it holds has to be
             parts = {k: self.value(v, f"{name}.{k}") for k, v in attributes.items()}
             if all(parts[k] is v for k, v in attributes.items()):
                 return value
@@ -151,6 +154,10 @@ class Freezer:
         self._done[id(value)] = value, made
         for key, item in attributes.items():
             object.__setattr__(made, key, self.value(item, f"{name}.{key}"))
+        if members:
+            like = {"__slots__": (), "__module__": kind.__module__, "__qualname__": kind.__qualname__}
+            with contextlib.suppress(TypeError):  # a class that may have no subclass stays as it is
+                object.__setattr__(made, "__class__", type(kind)(kind.__name__, (kind,), {**members, **like}))
         members = [pair for c in kind.__mro__ for pair in vars(c).items()]
         lazy = {k for k, v in members if isinstance(v, functools.cached_property)}
         if is_own(kind.__module__):
@@ -161,6 +168,21 @@ class Freezer:
                 ],
             )
         return made
+
+    def _members(self, kind: type, attributes: Mapping[str, Any], name: str) -> dict[str, Any]:
+        """What a class of the user's gives its instances, frozen: methods that read globals, and values."""
+        found: dict[str, Any] = {}
+        if "__init_subclass__" in {k for c in kind.__mro__[:-1] for k in vars(c)}:
+            return found  # such a class counts its subclasses
+        for key, item in [pair for c in reversed(kind.__mro__) for pair in vars(c).items()]:
+            found.pop(key, None)
+            inner = item.fget if isinstance(item, property) else getattr(item, "__func__", item)
+            if isinstance(inner, FunctionType) and is_own_function(inner) and _reads_changing(inner):
+                frozen = self.value(inner, f"{name}.{key}")
+                found[key] = frozen if inner is item else type(item)(frozen)
+            elif isinstance(item, _VALUES) and not key.startswith("__") and key not in attributes:
+                found[key] = self.value(item, f"{name}.{key}")
+        return found
 
     def _deep(self, value: Any, name: str) -> Any:
         try:
@@ -235,6 +257,20 @@ class Freezer:
             return
         self._done[id(kind)] = kind, kind
         self._hold(name, lambda: [v for k, v in list(vars(kind).items()) if not k.startswith("_")])
+
+
+def _reads_changing(function: FunctionType) -> bool:
+    """Whether a function reads globals that may change: more than modules, classes and functions of others."""
+    around = function.__globals__
+    named = [around[k] for k in names_read(function.__code__) if k in around]
+    return bool(function.__closure__) or any(
+        (
+            not isinstance(v, ModuleType | type | BuiltinFunctionType)
+            and not (isinstance(v, FunctionType) and not is_own_function(v))
+        )
+        or is_own_namespace(v)
+        for v in named
+    )
 
 
 def _is_empty(cell: CellType) -> bool:
