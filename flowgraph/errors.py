@@ -8,9 +8,12 @@ finds the same thing in the same place each time.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 
 class FlowgraphError(Exception):
@@ -69,7 +72,8 @@ class CycleError(DeclarationError):
 class LoweringError(FlowgraphError):
     """A block's step does something that a fixed-size pipeline cannot hold; names the source line.
 
-    `in_every_engine` is true for what no engine allows, such as an in-place write: it is refused at build.
+    `in_every_engine` is true for what no engine allows, such as an in-place write or shapes that do not fit:
+    it is refused at build.
     """
 
     in_every_engine = False
@@ -119,28 +123,45 @@ class PluginError(FlowgraphError):
 
 
 @contextmanager
-def naming_lines() -> Iterator[None]:
+def naming_lines(whole: str | None = None) -> Iterator[None]:
     """What is refused while a declaration runs gets the line of it that asked, the innermost of the user's.
 
-    A `LoweringError` names a line of the block's step already.
+    What is seen only at its end gets `whole`, where the declaration begins. A `LoweringError` names a line of the block's step already.
     """
     try:
         yield
     except FlowgraphError as error:
         if error.line is None and not isinstance(error, LoweringError):
-            error.line = _declaring_line(error)
+            error.line = _declaring_line(error) or whole
         raise
+
+
+def place(around: Mapping[str, Any], line: int) -> str:
+    """module:line of code with these globals; of a program that is run as a file, file:line."""
+    module, file = str(around.get("__name__", "?")), around.get("__file__")
+    return f"{Path(file).name if module == '__main__' and file else module}:{line}"
+
+
+def asking_line() -> str | None:
+    """The line of a declaration that is being run, the innermost of the user's."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and not _declares(frame):
+        frame = frame.f_back
+    return None if frame is None else place(frame.f_globals, frame.f_lineno)
+
+
+def _declares(frame: FrameType) -> bool:
+    package, _, rest = str(frame.f_globals.get("__name__", "?")).partition(".")
+    return package not in ("numpy", "contextlib", "functools") and (
+        package != "flowgraph" or rest.partition(".")[0] in ("blocks", "graphs")
+    )
 
 
 def _declaring_line(error: BaseException) -> str | None:
     found, step = None, error.__traceback__
     while step is not None:
-        module = step.tb_frame.f_globals.get("__name__", "?")
-        package, _, rest = module.partition(".")
-        if package not in ("numpy", "contextlib") and (
-            package != "flowgraph" or rest.partition(".")[0] in ("blocks", "graphs")
-        ):
-            found = f"{module}:{step.tb_lineno}"
+        if _declares(step.tb_frame):
+            found = place(step.tb_frame.f_globals, step.tb_lineno)
         step = step.tb_next
     return found
 

@@ -14,6 +14,7 @@ A block whose settings make it unfit for some kind of number says so with `@name
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import re
@@ -75,11 +76,15 @@ NUMBERS = ("float64", "float32", "fixed")
 
 
 class Port(NamedTuple):
-    """One end of a wire: name, type (None: any) and whether it may be absent."""
+    """One end of a wire: name, type (None: any) and whether it may be absent.
+
+    A port with a default other than None is a setting where nothing is wired to it.
+    """
 
     name: str
     type: Type | None
     optional: bool
+    default: Any = REQUIRED
 
 
 class Block(Generic[R]):
@@ -116,6 +121,7 @@ class Block(Generic[R]):
         self._init, self._local = init, local
         self._limits: Callable[..., Sequence[Limit]] | None = None
         self.clock_rule, self.output_rule, self.fault = clock, output, fault
+        self.declared: Block[R] = self
 
     def init(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Decorator: `function(*port_types, **settings)` is the initial state; the step takes it first."""
@@ -164,7 +170,10 @@ class Block(Generic[R]):
         for p in parameters:
             if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD):
                 annotation, optional = without_none(hints.get(p.name))
-                ports.append(Port(p.name, annotation_type(annotation), optional or p.default is None))
+                default = REQUIRED if p.default is None else p.default
+                ports.append(
+                    Port(p.name, annotation_type(annotation), optional or p.default is None, default)
+                )
             elif p.kind is p.KEYWORD_ONLY and p.name in HANDED_IN:
                 handed.add(p.name)
             elif p.kind is p.KEYWORD_ONLY and p.name in WIRING:
@@ -238,6 +247,25 @@ class Block(Generic[R]):
     def outputs(self) -> tuple[Port, ...] | None:
         """The output ports as annotated; None where the step is not annotated (then: one, inferred)."""
         return self._signature_parts[3]
+
+    def with_step(self, step: Callable[..., Any]) -> Block[R]:
+        """This block with another function of the same parameters; `declared` is the one it came from."""
+        made = self._like()
+        made.step = step
+        return made
+
+    def with_settings(self, names: Sequence[str]) -> Block[R]:
+        """This block with some of its ports, which have defaults, as settings."""
+        made = self._like()
+        ports, settings, handed, outputs = self._signature_parts
+        settings = settings | {p.name: p.default for p in ports if p.name in names}
+        kept = tuple(p for p in ports if p.name not in names)
+        made.__dict__["_signature_parts"] = kept, settings, handed, outputs
+        return made
+
+    def _like(self) -> Block[R]:
+        _ = self._signature_parts  # what the annotations name is looked up where the function was written
+        return copy.copy(self)
 
     def initial(self, types: Sequence[Type | None], settings: Mapping[str, Any]) -> Any:
         """The initial state for these argument types and settings."""

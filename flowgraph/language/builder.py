@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.errors import DeclarationError
+from flowgraph.errors import DeclarationError, asking_line
 from flowgraph.language import clock as clocks
 from flowgraph.language.clock import Clock
 from flowgraph.language.graph import (
@@ -47,6 +47,7 @@ class Builder:
         self._stamps: dict[Clock, int] = {}
         self._draws: dict[str, str] = {}
         self._sites: dict[int, str] = {}
+        self._lines: dict[int, str | None] = {}
 
     def path(self, name: str, *, given: bool = False) -> str:
         """A unique path in the current scope; a name that the user gave must be free."""
@@ -90,6 +91,8 @@ class Builder:
 
     def add(self, node: Node) -> int:
         self.nodes.append(node)
+        if isinstance(node, RegisterNode) and node.role in ("delay", "latest"):
+            self._lines[len(self.nodes) - 1] = asking_line()
         return len(self.nodes) - 1
 
     def stream(self, wire: Wire) -> Stream[Any]:
@@ -203,15 +206,25 @@ class Builder:
         self.collected[full] = Collected(full, stream.wire)
 
     def freeze(self, doc: str, settings: Mapping[str, Any]) -> Graph:
-        for node in self.nodes:
+        for index, node in enumerate(self.nodes):
             if isinstance(node, RegisterNode) and node.role in ("delay", "latest") and node.feed is None:
-                raise DeclarationError(
+                error = DeclarationError(
                     f"this {node.role} is never fed",
                     path=node.path,
                     expected="one call of .feed(stream)",
                     got="none",
                     fix="call .feed(...) on it before the graph function returns",
                 )
+                error.line = self._lines[index]
+                raise error
+        if not self.collected and not any(isinstance(n, CallNode) and n.block.host for n in self.nodes):
+            raise DeclarationError(
+                "this graph gives nothing",
+                path=self.name,
+                expected="a stream, a tuple of streams or a dict of them; or a sink",
+                got="None",
+                fix='return the stream, or several: return {"belief": belief}',
+            )
         sources = [n.path for n in self.nodes if isinstance(n, SourceNode)]
         if len(sources) > _MOST_SOURCES:
             raise DeclarationError(
@@ -221,7 +234,7 @@ class Builder:
                 got=str(len(sources)),
                 fix="pack several sensors of one clock into one signal",
             )
-        order = firing_order(self.nodes)
+        order = firing_order(self.nodes, self._lines)
         used = {w.node for w in self._wires()} | self._clocked()
         for index, source in enumerate(self.nodes):
             if isinstance(source, SourceNode) and index not in used:

@@ -15,7 +15,7 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from flowgraph.errors import DeclarationError, UnknownNameError, naming_lines
+from flowgraph.errors import DeclarationError, UnknownNameError, asking_line, naming_lines, place
 from flowgraph.language.block import REQUIRED
 from flowgraph.language.builder import Builder, builder, building
 from flowgraph.language.clock import Source, Timing
@@ -156,7 +156,9 @@ class GraphFunction:
                 fix=f"write {self.name}.build(..., {missing[0]}=...)",
             )
         build = Builder(self.name)
-        with building(build), naming_lines():
+        code = getattr(inspect.unwrap(self.function), "__code__", None)
+        whole = None if code is None else place(self.function.__globals__, code.co_firstlineno)
+        with building(build), naming_lines(whole):
             streams = {
                 name: self._source(build, name, type_, optional, declared.get(name), sizes or {})
                 for name, (type_, optional) in sources.items()
@@ -203,6 +205,19 @@ class GraphFunction:
                 fix="build the graph yourself and call simulate(graph, inputs)",
             )
         return self.prepare(flight, **settings)
+
+    def __getattr__(self, name: str) -> typing.NoReturn:
+        if name.startswith("_") or not (name in Graph.__dataclass_fields__ or hasattr(Graph, name)):
+            raise AttributeError(f"a @graph function has no attribute {name!r}")
+        error = DeclarationError(
+            "this graph is declared, but not built",
+            path=self.name,
+            expected="a built graph",
+            got=f"the function {self.name}",
+            fix=f"build it first: {self.name}.build(...)",
+        )
+        error.line = asking_line()
+        raise error
 
     def __repr__(self) -> str:
         return f"<@graph {self.name}>"

@@ -194,11 +194,15 @@ class Graph:
         return f"<graph {self.name}: {len(self.sources)} sources, {len(self.calls)} blocks>"
 
 
-def firing_order(nodes: list[Node]) -> tuple[int, ...]:
+def firing_order(nodes: list[Node], lines: Mapping[int, str | None] | None = None) -> tuple[int, ...]:
     """Sources and calls such that each comes after what it reads in the same tick.
 
     A delay adds no edge: it is read before it is written. A latest does: it is written before it is read. A
     block that fires at a clock known only at run time comes after the block that decides it.
+
+    Args:
+        nodes: of the graph.
+        lines: where registers were declared, by node.
 
     Raises:
         CycleError: with the whole chain of ports.
@@ -238,13 +242,15 @@ def firing_order(nodes: list[Node]) -> tuple[int, ...]:
             chain = " -> ".join(
                 f"{nodes[i].path}.{port}" if port else nodes[i].path for i, port in reversed(loop)
             )
-            raise CycleError(
+            error = CycleError(
                 "a cycle passes through no delay",
                 path=nodes[index].path,
                 expected="at least one delay in each cycle",
                 got=chain,
                 fix="read the value of the tick before: delay(init) in place of latest(init=...)",
             )
+            error.line = next((lines[i] for i, _ in loop if lines and i in lines), None)
+            raise error
         for port, needed in needs(index):
             trail.append((index, port))
             visit(needed)

@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import typing
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields, is_dataclass, replace
-from types import FunctionType
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError
+from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError, place
 from flowgraph.language.block import Block, Port, When
+from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
+from flowgraph.language.mistakes import is_mistake
+from flowgraph.language.purity import refuse_different, refuse_write
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
-from flowgraph.recorder.refusals import MACHINERY
+from flowgraph.recorder.refusals import is_machinery
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.trace import Trace
@@ -92,8 +92,8 @@ class SymbolicDraw:
 def remembering(memory: OrderedDict[Any, Any]) -> Iterator[None]:
     """Within it, a step recorded before with the same settings and types is not recorded again.
 
-    For those who build the same graph many times over. Only steps whose settings are plain values, arrays,
-    dataclasses of these, hashable objects that compare by value and functions without a closure are
+    For those who build the same graph many times over. Only steps that read and are set by plain values,
+    arrays, dataclasses of these, hashable objects that compare by value and functions of these are
     remembered; the oldest are forgotten beyond a few hundred.
     """
     token = _memory.set(memory)
@@ -107,30 +107,6 @@ _memory: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("recorded steps",
 _REMEMBERED = 512
 
 
-class _NotPlainError(Exception):
-    """A setting whose value cannot be told from another's."""
-
-
-def _fingerprint(value: Any) -> Any:
-    """What tells plain values apart, to the last bit."""
-    if value is None or isinstance(value, bool | int | str):
-        return type(value), value
-    if isinstance(value, float):
-        return float, value.hex()
-    if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
-        return np.ndarray, value.dtype.str, value.shape, value.tobytes()
-    if type(value) in (tuple, list):
-        return type(value), *map(_fingerprint, value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return type(value), *(_fingerprint(getattr(value, f.name)) for f in fields(value))
-    if isinstance(value, FunctionType) and value.__closure__ is None:
-        return FunctionType, value  # as itself; the rule for ties of a `merge` is one
-    kind = type(value)
-    if isinstance(kind.__eq__, FunctionType) and isinstance(value, Hashable):
-        return kind, value  # an immutable value, such as a state space
-    raise _NotPlainError
-
-
 def record(
     block: Block[Any],
     types: Sequence[Type | None],
@@ -138,22 +114,36 @@ def record(
     state: Type | None,
     path: str,
     draws: str = "",
+    *,
+    freezer: Freezer | None = None,
 ) -> StepTrace:
     """Run the step on symbolic arguments (None: absent) and return what it did.
 
+    Args:
+        freezer: that froze the step; where functions of the user's are in it, it is run a second time.
+
     Raises:
         LoweringError: where it does something a pipeline cannot hold; names the line.
+        DeclarationError: where it is not a step of this type, or not the same each time.
     """
+
+    def recorded() -> StepTrace:
+        made = _record(block, types, settings, state, path, draws)
+        if freezer is not None and freezer.own and not freezer.written():
+            refuse_different(made.trace, _record(block, types, settings, state, path, draws).trace, path)
+        return made
+
     memory = _memory.get()
     if memory is None:
-        return _record(block, types, settings, state, path, draws)
+        return recorded()
     try:
-        plain = tuple((n, _fingerprint(v)) for n, v in settings.items())
-    except _NotPlainError:
-        return _record(block, types, settings, state, path, draws)
-    which = (id(block), tuple(types), plain, state, path, draws)
+        plain = tuple((n, fingerprint(v)) for n, v in settings.items())
+        step = None if block.step is block.declared.step else fingerprint(block.step)
+    except NotPlainError:
+        return recorded()
+    which = (id(block.declared), step, tuple(types), plain, state, path, draws)
     if which not in memory:
-        memory[which] = block, _record(block, types, settings, state, path, draws)  # id is of what is alive
+        memory[which] = block, recorded()  # id is of what is alive
         while len(memory) > _REMEMBERED:
             memory.popitem(last=False)
     memory.move_to_end(which)
@@ -195,13 +185,21 @@ def _record(
         error.path = f"{path} ({error.path})" if error.path else path
         raise
     except Exception as error:
-        raise LoweringError(
+        if isinstance(error, ValueError) and "read-only" in str(error):
+            refuse_write(path, "an array that it reads", _line_of(error))
+        refusal = LoweringError(
             f"the step cannot be traced: {type(error).__name__}: {error}",
             path=f"{path} ({_line_of(error)})",
             expected="array-API operations through xp on fixed shapes",
             got=f"{type(error).__name__}",
             fix="use functions of xp, or declare @block(host=True) with annotated outputs",
-        ) from error
+        )
+        if is_mistake(error):
+            refusal.in_every_engine = True
+            refusal.message = f"the step is wrong: {type(error).__name__}: {error}"
+            refusal.expected = "a step that runs on values of the types at its ports"
+            refusal.fix = "mend this line; a step that needs numbers is declared with @block(host=True)"
+        raise refusal from error
     next_state: tuple[int, ...] = ()
     if memory is not None and state is not None:
         new_state, result = _split(result, path)
@@ -348,11 +346,11 @@ def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
 
 def _line_of(error: BaseException) -> str:
     """module:line of the last frame of the user's code in a traceback."""
-    place = "?"
+    found = "?"
     step = error.__traceback__
     while step is not None:
         module = step.tb_frame.f_globals.get("__name__", "?")
-        if module not in (__name__, *MACHINERY):
-            place = f"{module}:{step.tb_lineno}"
+        if not is_machinery(module) and module != __name__:
+            found = place(step.tb_frame.f_globals, step.tb_lineno)
         step = step.tb_next
-    return place
+    return found

@@ -15,7 +15,9 @@ from flowgraph.language import clock as clocks
 from flowgraph.language.block import REQUIRED, WIRING, Block, line_of
 from flowgraph.language.builder import Builder, builder
 from flowgraph.language.clock import Clock, Condition, both, clock_of, either, within
+from flowgraph.language.freezing import Freezer
 from flowgraph.language.graph import Argument, CallNode, OutputPort, RegisterNode, Wire
+from flowgraph.language.purity import refuse_impure
 from flowgraph.language.recording import StepTrace, record
 from flowgraph.language.stream import Held, Stream
 from flowgraph.types import Type, check_fits
@@ -26,8 +28,12 @@ def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) 
     build = builder(block.name)
     at, name, draws = (keywords.pop(k, None) for k in WIRING)
     path = build.path(name or block.name, given=name is not None)
+    block = _with_defaults(block, path, streams, keywords)
     given = _match_ports(block, path, streams, keywords)
     settings = _match_settings(block, path, keywords)
+    as_given, freezer = (block, settings), Freezer()
+    if not block.host:
+        block, settings = _frozen(freezer, *as_given)
     arguments = tuple(_argument(build, path, port.name, port.optional, value) for port, value in given)
     types = [None if v is None else v.type for _, v in given]
     sizes: dict[str, int] = {}
@@ -46,7 +52,16 @@ def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) 
     state_type = None if state is None else typing.cast(RegisterNode, build.nodes[state]).type
     if "draw" in block.handed:
         draws = build.random_streams(draws or block.name, path)
-    variants = _variants(block, path, clocked, given, firing, settings, state_type, draws or "")
+    variants = _variants(block, path, clocked, given, firing, settings, state_type, draws or "", freezer)
+    if any(not isinstance(v, StepTrace) for v in variants.values()):
+        block, settings = as_given  # it runs in Python only, with what it reads as it is then
+    else:
+
+        def again(other: Freezer) -> None:
+            step, values = _frozen(other, *as_given)
+            _variants(step, path, clocked, given, firing, values, state_type, draws or "")
+
+        refuse_impure(freezer, again, block, path)
     for variant in variants.values():
         if isinstance(variant, StepTrace):
             for site, _ in variant.sites:
@@ -60,6 +75,38 @@ def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) 
     )
     made = tuple(build.stream(Wire(index, k)) for k in range(len(outputs)))
     return made[0] if len(made) == 1 else made or None
+
+
+def _frozen(
+    freezer: Freezer, block: Block[Any], settings: dict[str, Any]
+) -> tuple[Block[Any], dict[str, Any]]:
+    return freezer.block(block), {k: freezer.value(v, k) for k, v in settings.items()}
+
+
+def _with_defaults(
+    block: Block[Any], path: str, streams: tuple[Any, ...], keywords: dict[str, Any]
+) -> Block[Any]:
+    """The block with those of its ports as settings that have a default and are not wired."""
+    fixed = [
+        p.name
+        for k, p in enumerate(block.ports)
+        if p.default is not REQUIRED
+        and k >= len(streams)
+        and not isinstance(keywords.get(p.name), Stream | Held)
+    ]
+    if not fixed:
+        return block
+    names = [p.name for p in block.ports]
+    behind = [n for n in names[names.index(fixed[0]) :] if n not in fixed]
+    if behind:
+        raise DeclarationError(
+            f"{fixed[0]!r}, which has a default, stands before the port {behind[0]!r}",
+            path=path,
+            expected="ports first, then what has a default and is not wired",
+            got=f"{block.name}({', '.join(names)})",
+            fix=f"move it behind the ports, or make it a setting: *, {fixed[0]}=...",
+        )
+    return block.with_settings(fixed)
 
 
 def _match_ports(
@@ -205,6 +252,7 @@ def _variants(
     settings: dict[str, Any],
     state: Type | None,
     draws: str,
+    freezer: Freezer | None = None,
 ) -> dict[tuple[bool, ...], StepTrace | LoweringError]:
     """Record the step once for each possible presence of its optional streams."""
     options = [s for p, s in clocked if p.optional]
@@ -228,7 +276,7 @@ def _variants(
             )
             continue
         try:
-            found[choice] = record(block, types, settings, state, path, draws)
+            found[choice] = record(block, types, settings, state, path, draws, freezer=freezer)
         except LoweringError as error:
             if error.in_every_engine:
                 raise

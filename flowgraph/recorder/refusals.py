@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from flowgraph.errors import LoweringError
+from flowgraph.errors import LoweringError, place
 
 
 def caller() -> str:
     """module:line of the nearest frame outside the recording machinery."""
     frame = sys._getframe(1)
-    while frame.f_back and _is_machinery(frame.f_globals.get("__name__", "?")):
+    while frame.f_back and is_machinery(frame.f_globals.get("__name__", "?")):
         frame = frame.f_back
-    return f"{frame.f_globals.get('__name__', '?')}:{frame.f_lineno}"
+    return place(frame.f_globals, frame.f_lineno)
 
 
 MACHINERY = tuple(
@@ -22,7 +22,8 @@ MACHINERY = tuple(
 """Modules whose frames are not the user's code."""
 
 
-def _is_machinery(module: str) -> bool:
+def is_machinery(module: str) -> bool:
+    """Whether a module records steps, and has no lines of the user's."""
     return module in MACHINERY or module.partition(".")[0] == "numpy"
 
 

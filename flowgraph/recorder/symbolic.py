@@ -126,7 +126,13 @@ class Symbolic:
 
     def __iter__(self) -> Iterator[Symbolic]:
         if not self.shape:
-            refuse("iteration over a scalar", "an array with an axis", "a scalar", "do not unpack it")
+            refuse(
+                "iteration over a scalar",
+                "an array with an axis",
+                "a scalar",
+                "do not unpack it",
+                in_every_engine=True,
+            )
         return (self[i] for i in range(self.shape[0]))
 
     def __getattr__(self, name: str) -> NoReturn:
@@ -138,6 +144,7 @@ class Symbolic:
             "the standard's attributes",
             f".{name}",
             hint,
+            in_every_engine=not hasattr(np.ndarray, name) and not hasattr(np.float64, name),
         )
 
     def __repr__(self) -> str:
@@ -150,7 +157,13 @@ def _getitem(x: Symbolic, entries: list[Any]) -> Symbolic:
     """Basic indexing by whole numbers, slices, None and Ellipsis."""
     used = sum(e is not None and e is not Ellipsis for e in entries)
     if used > x.ndim:
-        refuse(f"too many indices for shape {x.shape}", f"at most {x.ndim}", str(used), "drop some")
+        refuse(
+            f"too many indices for shape {x.shape}",
+            f"at most {x.ndim}",
+            str(used),
+            "drop some",
+            in_every_engine=True,
+        )
     if Ellipsis in [e for e in entries if e is Ellipsis]:
         at = next(i for i, e in enumerate(entries) if e is Ellipsis)
         entries[at : at + 1] = [slice(None)] * (x.ndim - used)

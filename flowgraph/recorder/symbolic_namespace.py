@@ -46,13 +46,15 @@ class _Linalg:
 
 def _not_listed(name: str) -> LoweringError:
     valid = ", ".join(sorted(set(OPS) - {"getitem"} | set(_CREATION) | set(_COMPOSED)))
-    return LoweringError(
+    error = LoweringError(
         f"xp.{name} is not among the operations of a pipeline",
         path=caller(),
         expected=valid,
         got=f"xp.{name}",
         fix="write it with the operations above, or mark the block as a host block",
     )
+    error.in_every_engine = not hasattr(np, name) and not hasattr(np.linalg, name.removeprefix("linalg."))
+    return error
 
 
 def _recorder(name: str, plain: Any = np) -> Callable[..., Any]:

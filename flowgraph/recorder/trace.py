@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph.errors import LoweringError
-from flowgraph.recorder.ops import OPS, ShapeError, Spec, promote
+from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.ops import OPS, Op, ShapeError, Spec, bound_attrs, promote
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
@@ -45,6 +46,11 @@ class Trace:
         self._interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
         self._count = 0
 
+    @property
+    def values(self) -> list[tuple[Any, int]]:
+        """The constants to the last bit, with their numbers, in the order met."""
+        return list(self._interned.items())
+
     def new(self) -> int:
         """A fresh value number."""
         self._count += 1
@@ -73,13 +79,15 @@ class Trace:
         try:
             spec = rule.rule(*(a.spec for a in operands), **attrs)
         except ShapeError as error:
-            raise LoweringError(
+            refusal = LoweringError(
                 f"{op}: {error}",
                 path=caller(),
                 expected="shapes that fit",
                 got=str([a.shape for a in operands]),
                 fix="reshape or transpose one side",
-            ) from None
+            )
+            refusal.in_every_engine = not _numpy_can(rule, operands, attrs)
+            raise refusal from None
         out = Symbolic(self, self.new(), spec)
         numbers = tuple(a.number for a in operands)
         self.instructions.append(Instruction(op, numbers, attrs, out.number, spec, caller()))
@@ -121,3 +129,14 @@ class Trace:
         if kind == "int" and any(a.dtype_name == "real" for a in lifted):
             refuse(f"{op} of real numbers", "integers", "real", "convert with xp.astype first")
         return lifted
+
+
+def _numpy_can(op: Op, operands: Sequence[Symbolic], attrs: dict[str, Any]) -> bool:
+    """Whether NumPy has a result where the rule of an operation has none."""
+    zeros = [np.zeros(a.shape, DTYPES[a.dtype_name]) for a in operands]
+    try:
+        with np.errstate(all="ignore"):
+            op.run(NUMPY, *zeros, **bound_attrs(op.name, attrs, np.float64))
+    except Exception:  # whatever it has against them
+        return False
+    return True

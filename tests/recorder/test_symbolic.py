@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from flowgraph import (
     Array,
+    DeclarationError,
     LoweringError,
     Scalar,
     Signal,
@@ -586,8 +587,9 @@ def test_values_of_another_step_are_refused():
     def g(x: Stream[Scalar]):
         return use(keep(x))
 
-    with pytest.raises(LoweringError, match="this mixes values of two blocks"):
+    with pytest.raises(DeclarationError, match="the step writes what outlives it") as error:
         g.build()
+    assert error.value.line == f"{__name__}:{keep.step.__code__.co_firstlineno + 2}"
 
 
 def test_a_signal_passes_through_a_step_leaf_by_leaf():
