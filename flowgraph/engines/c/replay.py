@@ -199,7 +199,7 @@ static int ended(int status)
 static void refuse(const char *what, const char *text)
 {
     ended(1);
-    fprintf(stderr, "%s, line %ld: %s%s", filename, row, what, text[0] != 0 ? " '" : "");
+    fprintf(stderr, "%s, line %ld: %s%s", filename, row, what, text[0] != 0 ? " " : "");
     for (int i = 0; text[i] != 0; i++) {
         if (i == 40) {
             fprintf(stderr, "...");
@@ -207,7 +207,7 @@ static void refuse(const char *what, const char *text)
         }
         fputc(text[i] >= ' ' && text[i] <= '~' ? text[i] : '?', stderr);
     }
-    fprintf(stderr, "%s\n", text[0] != 0 ? "'" : "");
+    fputc('\n', stderr);
     exit(1);
 }
 
