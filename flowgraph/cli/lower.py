@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,11 +13,12 @@ from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, graph_of
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.engines.registry import writers
-from flowgraph.errors import UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.block import NUMBERS
 from flowgraph.pipeline.lowering import lower as lower_graph
 from flowgraph.pipeline.optimise import DEFAULT, PASSES
 from flowgraph.pipeline.optimise import without as passes_without
+from flowgraph.pipeline.pipeline import Pipeline
 
 
 @app.command()
@@ -29,6 +32,9 @@ def lower(
     target: Annotated[
         str, typer.Option(metavar="TARGET", help="description, or c for C99 too.")
     ] = "description",
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the filter in what is written; that of the graph.")
+    ] = None,
     dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed.")] = "float64",
     events: Annotated[
         Path | None, typer.Option(metavar="FILE", help="For c: write the data as the csv that it replays.")
@@ -55,6 +61,8 @@ def lower(
     passes = passes_without(*(without or ()), passes=DEFAULT if engine is None else engine.passes)
     built, inputs = graph_of(graph, data, settings, seed)
     pipeline = lower_graph(built, dtype=dtype)
+    if name is not None:
+        pipeline = renamed(pipeline, name)
     pipeline.save(output)
     if engine is not None:
         for file in engine.write(pipeline, output, dtype, passes).values():
@@ -79,3 +87,20 @@ def lower(
     for row in (cost or {}).get("Ticks", ()):
         out_console.print(", ".join(f"{k} {v}" for k, v in row.items()), highlight=False, markup=False)
     err_console.print(f"wrote {output / 'pipeline.json'} and {output / 'pipeline.txt'}", markup=False)
+
+
+def renamed(pipeline: Pipeline, name: str) -> Pipeline:
+    """The pipeline under another name: two variants of one graph in one program need one each.
+
+    Raises:
+        DeclarationError: where that is no name in C.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,58}[A-Za-z0-9]|[A-Za-z]", name):
+        raise DeclarationError(
+            "a filter cannot be called this",
+            path="--name",
+            expected="letters, digits and underscores, 60 at most, with a letter first",
+            got=repr(name),
+            fix="write a name as of a function in C, such as --name ekf_rear",
+        )
+    return replace(pipeline, name=name)

@@ -9,5 +9,8 @@ the host, `parts` does so between two runs of blocks. `many` is the same for man
 engine takes many. `simulate` is the door to all of it.
 
 The engines themselves stand apart from one another: `reference` plays the instructions in NumPy and is the
-definition of the others, `xla` in one compiled scan, `c` as generated C.
+definition of the others, `xla` in one compiled scan, `c` as generated C. `forks` watches, from the first
+import on, for processes in which JAX could only wait.
 """
+
+from flowgraph.engines import forks as forks

@@ -51,11 +51,11 @@ class Builder:
 
     def path(self, name: str, *, given: bool = False) -> str:
         """A unique path in the current scope; a name that the user gave must be free."""
-        if given and (not isinstance(name, str) or not name or "/" in name):
+        if given and (not _is_text(name) or "/" in name):
             raise DeclarationError(
                 "a node cannot be called this",
                 path="/".join(self._scope) or self.name,
-                expected="a text without /, which joins names to paths",
+                expected="a text of characters, without /, which joins names to paths",
                 got=repr(name),
                 fix='give another name, such as name="gate_2"',
             )
@@ -186,11 +186,11 @@ class Builder:
                 got=repr(stream),
                 fix="sample a held value with .at(clock)",
             )
-        if not isinstance(name, str) or not name:
+        if not _is_text(name):
             raise DeclarationError(
                 "an output cannot be called this",
                 path=self.name,
-                expected="a text",
+                expected="a text of characters",
                 got=repr(name),
                 fix='give it a name: {"belief": stream}, or collect(stream, "belief")',
             )
@@ -273,6 +273,17 @@ def _sizes_of(type_: Type, found: Type, path: str) -> dict[str, int]:
     sizes: dict[str, int] = {}
     check_fits(found, type_, given_at=f"the initial value of {path}", wanted_at=path, sizes=sizes)
     return sizes
+
+
+def _is_text(name: Any) -> bool:
+    """Whether a name is one that files can hold: Unicode has numbers that are no characters."""
+    return (
+        isinstance(name, str)
+        and name != ""
+        and not any(
+            "\ud800" <= c <= "\udfff" or "\ufdd0" <= c <= "\ufdef" or ord(c) & 0xFFFE == 0xFFFE for c in name
+        )
+    )
 
 
 _current: ContextVar[Builder | None] = ContextVar("flowgraph_builder", default=None)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
+from flowgraph.engines.c.names import Names, given, made
 from flowgraph.engines.c.syntax import comment, ctype
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
-if TYPE_CHECKING:
-    from flowgraph.engines.c.names import Names
+OVERFLOW, NOT_FINITE = 63, 62
+"""Bits of what `react` returns that say what went wrong; the outputs have those below."""
 
 
 def header(
@@ -19,10 +19,11 @@ def header(
     real: str,
     patterns: Sequence[int] | None,
     pool: Mapping[str, Sequence[int]],
+    number: str,
 ) -> str:
-    """The text of the header."""
+    """The text of the header; `number` (8 hexadecimal digits) is this filter's and no other's."""
     m = names.module
-    guard = f"FLOWGRAPH_{m.upper()}_H"
+    guard = f"FLOWGRAPH_{m.upper()}_H_"
     doc = [f" * {comment(line)}".rstrip() for line in pipeline.doc.splitlines()]
     lines = [
         "/*",
@@ -35,22 +36,28 @@ def header(
         " * Matrices are row by row. Units are SI, angles radians; a frame behind the unit says where to.",
         " */",
         f"#ifndef {guard}",
-        f"#define {guard}",
+        f"#define {guard} 0x{number}",
         "",
         "#include <stdbool.h>",
         "#include <stdint.h>",
         "",
         "#ifdef __cplusplus",
         'extern "C" {',
-        "#define restrict",
+        "#endif",
+        "",
+        "/* The linker sees names with the number of this very filter: another that is called alike, with",
+        " * other settings, cannot take its place. Define FLOWGRAPH_PLAIN_NAMES, and they are plain. */",
+        "#ifndef FLOWGRAPH_PLAIN_NAMES",
+        f"#define {m}_reset {m}_reset_{number}",
+        f"#define {m}_react {m}_react_{number}",
         "#endif",
         "",
     ]
-    for title, ports, made, leaves in (
+    for title, ports, called, leaves in (
         ("input", pipeline.inputs, names.inputs, names.input_leaves),
         ("output", pipeline.outputs, names.outputs, names.output_leaves),
     ):
-        for k, (port, name, members) in enumerate(zip(ports, made, leaves, strict=True)):
+        for k, (port, name, members) in enumerate(zip(ports, called, leaves, strict=True)):
             lines.append(
                 f"/* {title} {k}: {comment(port.name)}, a {comment(port.type)}; {comment(port.clock)} */"
             )
@@ -68,7 +75,7 @@ def header(
     sizes = [(d, k, n) for d, slots in sorted(pool.items()) for k, n in enumerate(slots)]
     if sizes:
         lines.append("    /* room to work in during a call; nothing in it lasts */")
-        lines += [f"    {ctype(d, real)} work_{d}_{k}[{n}];" for d, k, n in sizes]
+        lines += [f"    {ctype(d, real)} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
     lines += [f"}} {m}_state;", ""]
     lines += [
         "/* Start anew, with the initial values of the graph. */",
@@ -83,30 +90,36 @@ def header(
     if patterns is not None:
         lines.append(f" *            (one of {', '.join(map(str, patterns))}; others do nothing)")
     lines += [
-        " * then a pointer for each input (NULL where it is absent) and for each output, to be written.",
-        " * Returns the bits of the outputs that are there; others hold nothing of use.",
+        " * then a pointer for each input (NULL where it is absent) and for each output, to be written;",
+        " * no two of them to the same memory.",
+        " * Returns the bits of the outputs that are there; others hold nothing of use. And what went wrong:",
+        f" *   {m.upper()}_OVERFLOW    a queue was full, now or before: leave the outputs, and reset",
+        f" *   {m.upper()}_NOT_FINITE  a number of an output that is there is NaN or infinite",
         " */",
-        react_signature(pipeline, names, None) + ";",
+        f"#define {m.upper()}_OVERFLOW (UINT64_C(1) << {OVERFLOW})",
+        f"#define {m.upper()}_NOT_FINITE (UINT64_C(1) << {NOT_FINITE})",
+        react_signature(names) + ";",
         "",
         "#ifdef __cplusplus",
-        "#undef restrict",
         "}",
         "#endif",
+        f"#elif {guard} != 0x{number}",
+        f'#error "two different filters are called {m}: give one another name (flowgraph lower --name)"',
         "#endif",
     ]
     return "\n".join(lines) + "\n"
 
 
-def react_signature(pipeline: Pipeline, names: Names, key: int | None) -> str:
-    """The declaration of the entry."""
+def react_signature(names: Names, restrict: str = "") -> str:
+    """The head of the entry, as it is declared, or with `restrict` before each name as it is defined."""
     m = names.module
-    given = [f"{m}_state *restrict s", "int64_t time", "uint64_t present"]
-    given += [f"const {m}_{n} *restrict {n}" for n in names.inputs]
-    given += [f"{m}_{n} *restrict {n}" for n in names.outputs]
+    parts = [f"{m}_state *{restrict}s", "int64_t time", "uint64_t present"]
+    parts += [f"const {m}_{n} *{restrict}{p}" for n, p in zip(names.inputs, given(names), strict=True)]
+    parts += [f"{m}_{n} *{restrict}{p}" for n, p in zip(names.outputs, made(names), strict=True)]
     lines = [f"uint64_t {m}_react("]
     text = lines[0]
-    for k, part in enumerate(given):
-        piece = part + (")" if k == len(given) - 1 else ",")
+    for k, part in enumerate(parts):
+        piece = part + (")" if k == len(parts) - 1 else ",")
         if len(text) + len(piece) > 100:
             text = "    " + piece
             lines.append(text)

@@ -96,19 +96,20 @@ class Compiled:
             self.real.name,
             patterns=None if every else keys,
             program=lambda p, key: optimise(specialise(p, key), passes),
+            checked=False,  # faults and what is not finite are looked for by whoever plays
         )
         m = self.source.names.module
         files = {
             f"{m}.h": self.source.header,
             f"{m}.c": self.source.source,
-            "loop.c": loop_text(pipeline, self.source),
+            "fg_loop.c": loop_text(pipeline, self.source),
         }
         self._library = ctypes.CDLL(str(build(files, flags)))
-        self._play = self._library.flowgraph_play
+        self._play = self._library.fg_play
         self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self._play.restype = None
-        self._library.flowgraph_size.restype = ctypes.c_size_t
-        self.size = int(self._library.flowgraph_size())
+        self._library.fg_size.restype = ctypes.c_size_t
+        self.size = int(self._library.fg_size())
         names = self.source.names
         self._inputs = [
             self._struct(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)

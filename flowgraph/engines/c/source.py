@@ -6,6 +6,7 @@ folded away. Beyond `MOST_PATTERNS` there is one reaction in which presence is d
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.engines.c.entry import entry_text, reaction_name
 from flowgraph.engines.c.expand import Expander
 from flowgraph.engines.c.expressions import Expressions
-from flowgraph.engines.c.header import header, react_signature
+from flowgraph.engines.c.header import NOT_FINITE, header
 from flowgraph.engines.c.helpers import helper_text
-from flowgraph.engines.c.names import Names, names_of
+from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
@@ -64,6 +66,7 @@ def generate(
     *,
     patterns: Sequence[int] | None = None,
     program: Callable[[Pipeline, int | None], Program] = specialise,
+    checked: bool = True,
 ) -> Source:
     """The C of a pipeline.
 
@@ -72,15 +75,16 @@ def generate(
         dtype: "float64" or "float32", what `real` is.
         patterns: the patterns of present inputs that can come; all if left out.
         program: makes the program of a pattern, or with None that of all patterns.
+        checked: whether what the entry returns says that a queue was full or an output is not finite.
 
     Raises:
         LoweringError: for an operation that C has no rule for, or more ports than a word has bits.
     """
-    if max(len(pipeline.inputs), len(pipeline.outputs)) > 64:
+    if len(pipeline.inputs) > 64 or len(pipeline.outputs) > NOT_FINITE:
         raise LoweringError(
             "too many ports for C",
             path=pipeline.name,
-            expected="at most 64 inputs and 64 outputs",
+            expected=f"at most 64 inputs and {NOT_FINITE} outputs",
             got=f"{len(pipeline.inputs)} and {len(pipeline.outputs)}",
             fix="join signals that come together into one struct",
         )
@@ -89,12 +93,16 @@ def generate(
         chosen = list(range(1, 2 ** len(pipeline.inputs)))
     if chosen is not None and len(chosen) > MOST_PATTERNS:
         chosen = None
-    return _File(pipeline, "double" if dtype == "float64" else "float", chosen, program).source()
+    real = "double" if dtype == "float64" else "float"
+    return _File(pipeline, real, chosen, program, checked).source()
 
 
 class _File:
-    def __init__(self, pipeline: Pipeline, real: str, patterns: list[int] | None, program: Any) -> None:
+    def __init__(
+        self, pipeline: Pipeline, real: str, patterns: list[int] | None, program: Any, checked: bool
+    ) -> None:
         self.pipeline, self.real, self.patterns, self.program = pipeline, real, patterns, program
+        self.checked = checked
         self.names = names_of(pipeline)
         self.expressions = Expressions(real)
         self.constants: dict[Any, tuple[str, Buffer]] = {}
@@ -111,19 +119,22 @@ class _File:
             "#include <math.h>",
             "#include <stddef.h>",
             "",
+            _REFUSED,
             _MACROS,
             helper_text(self.expressions.helpers, self.real),
             *(text for _, text in self.expressions.functions.values()),
             *(self._constant(name, b) for name, b in self.constants.values()),
             reset,
             *reactions,
-            self._dispatch(),
+            entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
         ]
         text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
+        parts = [self.pipeline, self.names, self.real, self.patterns, self.pool]
+        said = hashlib.sha256(f"{header(*parts, '')}{text}".encode()).hexdigest()[:8]
         return Source(
             self.names,
             self.real,
-            header(self.pipeline, self.names, self.real, self.patterns, self.pool),
+            header(*parts, said),
             text,
             None if self.patterns is None else tuple(self.patterns),
             self.presence,
@@ -150,7 +161,7 @@ class _File:
             if flag is None:
                 continue
             for name, leaf, n in zip(self.names.output_leaves[k], port.leaves, leaves, strict=True):
-                buffer = self._place(f"{self.names.outputs[k]}->{name}", "output", leaf)
+                buffer = self._place(f"{made(self.names)[k]}->{name}", "output", leaf)
                 roots += self._write(expander, buffer, values[n])
             present = expander.form.elements(values[flag]).item()
             flags.append((k, present))
@@ -178,21 +189,21 @@ class _File:
         return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
 
     def signature(self, key: int | None) -> str:
-        return f"static uint64_t {_reaction_name(key)}({self._typed(key)})"
+        return f"static uint64_t {reaction_name(key)}({self._typed(key)})"
 
     def _parameters(self, key: int | None) -> list[str]:
-        inputs = [n for k, n in enumerate(self.names.inputs) if key is None or key >> k & 1]
-        return ["s", "time", *(["present"] if key is None else []), *inputs, *self.names.outputs]
+        inputs = [n for k, n in enumerate(given(self.names)) if key is None or key >> k & 1]
+        return ["s", "time", *(["present"] if key is None else []), *inputs, *made(self.names)]
 
     def _typed(self, key: int | None) -> str:
         m = self.names.module
-        given = [f"{m}_state *restrict s", "int64_t time"] + (["uint64_t present"] if key is None else [])
-        given += [
-            f"const {m}_{n} *restrict {n}"
+        parts = [f"{m}_state *restrict s", "int64_t time"] + (["uint64_t present"] if key is None else [])
+        parts += [
+            f"const {m}_{n} *restrict in_{n}"
             for k, n in enumerate(self.names.inputs)
             if key is None or key >> k & 1
         ]
-        return ", ".join(given + [f"{m}_{n} *restrict {n}" for n in self.names.outputs])
+        return ", ".join(parts + [f"{m}_{n} *restrict out_{n}" for n in self.names.outputs])
 
     def _cell_names(self) -> list[str]:
         return [n for names in self.names.registers for n in names]
@@ -224,7 +235,7 @@ class _File:
             for name, leaf in zip(self.names.input_leaves[k], port.leaves, strict=True):
                 if here:
                     values[leaf.value] = _whole(
-                        self._place(f"{self.names.inputs[k]}->{name}", "input", leaf), leaf.shape
+                        self._place(f"{given(self.names)[k]}->{name}", "input", leaf), leaf.shape
                     )
                 else:
                     zeros = np.zeros(leaf.shape, _HOST.get(leaf.dtype, leaf.dtype))
@@ -298,7 +309,7 @@ class _File:
                 slots.append(0)
                 busy.append(0)
             slots[k], busy[k] = max(slots[k], buffer.size), last
-            names[buffer] = f"s->work_{buffer.dtype}_{k}"
+            names[buffer] = f"s->fg_work_{buffer.dtype}_{k}"
         for dtype, slots in pool.items():
             mine = self.pool.setdefault(dtype, [])
             mine += [0] * (len(slots) - len(mine))
@@ -340,30 +351,6 @@ class _File:
         lines += ["    s->seed[0] = (uint32_t)seed;", "    s->seed[1] = (uint32_t)(seed >> 32);", "}", ""]
         return "\n".join(lines)
 
-    def _dispatch(self) -> str:
-        lines = [react_signature(self.pipeline, self.names, None), "{"]
-        outputs = ", ".join(self.names.outputs)
-        if self.patterns is None:
-            m = self.names.module
-            pointers = []
-            for k, n in enumerate(self.names.inputs):
-                lines.append(f"    static const {m}_{n} no_{n};")
-                pointers.append(f"((present >> {k}) & 1u) ? {n} : &no_{n}")
-            call = ", ".join(["s", "time", "present", *pointers, *([outputs] if outputs else [])])
-            lines += [f"    return {_reaction_name(None)}({call});", "}", ""]
-            return "\n".join(lines)
-        lines.append("    switch (present) {")
-        for key in self.patterns:
-            inputs = [n for k, n in enumerate(self.names.inputs) if key >> k & 1]
-            call = ", ".join(["s", "time", *inputs, *([outputs] if outputs else [])])
-            lines.append(f"    case {key}: return {_reaction_name(key)}({call});")
-        lines += ["    default: return 0;", "    }", "}", ""]
-        return "\n".join(lines)
-
-
-def _reaction_name(key: int | None) -> str:
-    return "fg_react" if key is None else f"fg_react_{key}"
-
 
 def _names_it(text: str, name: str) -> bool:
     import re
@@ -377,7 +364,20 @@ def _whole(buffer: Buffer, shape: tuple[int, ...]) -> Value:
 
 _HOST = {"real": np.float64, "bool": np.bool_}
 
-_MACROS = """#if defined(__GNUC__)
+_REFUSED = """/* NaN and infinity mean something here, and sums are made in this order */
+#if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || defined(_M_FP_FAST) \\
+    || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "a filter needs IEEE arithmetic: compile without -ffast-math, -Ofast and what they stand for"
+#endif
+"""
+
+_MACROS = """#ifdef __cplusplus
+#define restrict __restrict
+#define FG_ZERO {}
+#else
+#define FG_ZERO {0}
+#endif
+#if defined(__GNUC__)
 #define FG_INLINE inline __attribute__((always_inline))
 #define FG_APART __attribute__((noinline))
 #else

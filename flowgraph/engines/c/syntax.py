@@ -109,9 +109,28 @@ KEYWORDS = frozenset(
         "wchar_t",
         "xor",
         "xor_eq",
+        "char8_t",
+        "char16_t",
+        "char32_t",
+        "co_await",
+        "co_return",
+        "co_yield",
+        "consteval",
+        "constinit",
+        "typeof_unqual",
+        "complex",
+        "imaginary",
+        "stdin",
+        "stdout",
+        "stderr",
+        "linux",
+        "unix",
+        "i386",
+        "near",
+        "far",
     ]
 )
-"""Words that cannot be names in C, or in C++ where the header is included."""
+"""Words that cannot be names in C or in C++, or that compilers and their headers define as macros."""
 
 CTYPES = {
     "bool": "bool",
@@ -160,7 +179,9 @@ def string(text: str) -> str:
     plain = frozenset(
         b" _-.,:;()[]|&<>=+@" + bytes(range(48, 58)) + bytes(range(65, 91)) + bytes(range(97, 123))
     )
-    return '"' + "".join(chr(b) if b in plain else f"\\{b:03o}" for b in text.encode()) + '"'
+    return (
+        '"' + "".join(chr(b) if b in plain else f"\\{b:03o}" for b in text.encode("utf-8", "replace")) + '"'
+    )
 
 
 def number(value: Any, dtype: str, real: str) -> str:

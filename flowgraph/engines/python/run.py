@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
+from threading import Lock, get_ident
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -55,6 +57,7 @@ class Run:
         self._last = dict.fromkeys(graph.sources, NEVER)
         self._key = seed_words(seed)
         self._stopped: int | None = None
+        self._busy, self._thread = Lock(), 0
         check_start(init, state, path=graph.name)
         if state is not None:
             self.state = state
@@ -88,15 +91,24 @@ class Run:
 
     def step(self) -> bool:
         """Advance one tick; False when the inputs have ended."""
-        self._refuse_if_stopped()
-        tick = next(self._ticks, None)
-        if tick is None:
-            return False
-        self._advance([tick])
-        return True
+        with self._alone("step"):
+            self._refuse_if_stopped()
+            tick = next(self._ticks, None)
+            if tick is None:
+                return False
+            self._advance([tick])
+            return True
 
     def push(self, time: int, /, **values: Any) -> None:
-        """One tick at `time` (int ns) in which the named sources have these values."""
+        """One tick at `time` (int ns) in which the named sources have these values.
+
+        Raises:
+            DataError: for an event that does not fit, or while another thread, or a block, is in this run.
+        """
+        with self._alone("push"):
+            self._push(time, values)
+
+    def _push(self, time: int, values: dict[str, Any]) -> None:
         if self._pushed is None:
             raise DataError(
                 "this run reads recorded inputs",
@@ -143,12 +155,40 @@ class Run:
 
     def to_end(self, meter: Meter | None = None) -> Run:
         """Run until the inputs end, telling `meter` now and then."""
-        self._refuse_if_stopped()
-        for batch in batches(self._ticks, _BATCH if self._recorded else 1):
-            self._advance(batch)
-            if meter is not None:
-                meter.update(self.ticks, self.time)
+        with self._alone("to_end"):
+            self._refuse_if_stopped()
+            for batch in batches(self._ticks, _BATCH if self._recorded else 1):
+                self._advance(batch)
+                if meter is not None:
+                    meter.update(self.ticks, self.time)
         return self
+
+    @contextmanager
+    def _alone(self, what: str) -> Iterator[None]:
+        """A run is for one thread: entering it again while it is in a tick would lose updates."""
+        if not self._busy.acquire(blocking=False):
+            raise self._entered_twice(what)
+        self._thread = get_ident()
+        try:
+            yield
+        finally:
+            self._thread = 0
+            self._busy.release()
+
+    def _entered_twice(self, what: str) -> DataError:
+        inside = "a block of this run calls it" if self._thread == get_ident() else "another thread is in it"
+        return DataError(
+            f"Run.{what} while this run is in a tick",
+            path=self.graph.name,
+            expected="one call after the other: a run is for one thread",
+            got=inside,
+            fix="let one thread push, and hand it the events of others through a queue.Queue",
+        )
+
+    def _refuse_others(self, what: str) -> None:
+        """In the middle of a tick of another thread some registers are new and some old."""
+        if self._busy.locked() and self._thread != get_ident():
+            raise self._entered_twice(what)
 
     def _advance(self, batch: list[tuple[int, int]]) -> None:
         start = perf_counter()
@@ -211,10 +251,12 @@ class Run:
     @property
     def state(self) -> dict[str, Any]:
         """All registers by path, and the last time of each source: a tree of arrays."""
+        self._refuse_others("state")
         return state_tree(self.graph, self._registers, self._last, self.seed)
 
     @state.setter
     def state(self, tree: Mapping[str, Any]) -> None:
+        self._refuse_others("state")
         self._registers[:], self._last, seed = load_registers(self.graph, tree)
         self._key[:] = seed_words(seed)
         self.time = max(self._last.values(), default=NEVER)
@@ -231,6 +273,7 @@ class Run:
 
     def result(self) -> Result:
         """The collected streams so far."""
+        self._refuse_others("result")
         series = {
             c.name: stack(times, values, self.graph.port(c.wire).type, c.name)
             for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)

@@ -18,6 +18,7 @@ from flowgraph.engines.contract import (
     dense,
     real_leaves,
 )
+from flowgraph.engines.forks import refuse_lost_threads
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.stretches import joined
 from flowgraph.engines.xla.batch import vectorised
@@ -60,6 +61,7 @@ class XlaEngine(PipelineEngine):
     takes_many = True
 
     def need(self) -> None:
+        refuse_lost_threads()
         import_jax()
 
     def prepare(
