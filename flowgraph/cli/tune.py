@@ -89,8 +89,8 @@ def tune(
         out_console.print(f"after, without fold {k}: {_said(part.parameters)}", markup=False)
     whole = "of all: " if found.folds else "after: "
     out_console.print(whole + " ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()))
-    for one in _notes(found):
-        err_console.print(f"note: {one}", markup=False)
+    for said in _notes(found):
+        err_console.print(f"note: {said}", markup=False)
     bounds = {f.name: {"low": f.low, "high": f.high} for f in fits}
     for label, one in _searches(found):
         for name, side in one.at_bound.items():
