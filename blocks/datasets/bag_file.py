@@ -56,7 +56,7 @@ class Bag:
             self.files, kinds = _files(path)
             first = kinds == {".bag"}
             plugins = rosbag2.Reader.STORAGE_PLUGINS
-            opened = [rosbag1.Reader if first else plugins[_container(f)] for f in self.files]
+            opened = [rosbag1.Reader if first else plugins[str(_container(f))] for f in self.files]
         with self._damage():
             self.readers = [make(file) for make, file in zip(opened, self.files, strict=True)]
         self.store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
