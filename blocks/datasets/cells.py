@@ -23,9 +23,11 @@ __all__ = ["BLANKS", "MISSING", "decimal_mark", "is_datum", "numbers", "stamps"]
 BLANKS = ("", "-", "--")
 """Cells that may hold nothing in rows of names, of units and of numbers alike."""
 
-MISSING = frozenset(
-    ["na", "n/a", "#n/a", "#na", "<na>", "nan", "+nan", "-nan", "nan(ind)", "-nan(ind)", "nan(snan)", "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "1.#nan", "null", "none", "nil", "nat", "missing", "undefined", "#num!", "#value!", "#div/0!", "#ref!", "#name?", "#null!", "?", "."]
-) | set(BLANKS)
+_ABSENT = (
+    "na n/a #n/a #na <na> nan +nan -nan nan(ind) -nan(ind) nan(snan) 1.#qnan -1.#qnan 1.#ind -1.#ind 1.#nan"
+    " null none nil nat missing undefined #num! #value! #div/0! #ref! #name? #null! ? ."
+)
+MISSING = frozenset((*_ABSENT.split(" "), *BLANKS))
 """Words for what was not measured, in small letters."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?", re.ASCII)
@@ -47,7 +49,7 @@ _SPAN = re.compile(
     re.ASCII,
 )
 _UNCLEAR = re.compile(r"\d{1,2}[./-]\d{1,2}[./-]\d{2,4}\b.*", re.ASCII)
-_MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
 from flowgraph.blocks.datasets.dialect import Sheet, lines_of, read_sheet, text_of
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["POLICIES", "in_order", "nanoseconds", "read_table", "strictly_later"]
@@ -46,9 +47,10 @@ def read_table(
     bad_time: str = "raise",
     delimiter: str | None = ",",
     seconds: bool = False,
-    unit: str | None = None,
+    unit: str = "ns",
     quaternion: int | None = None,
     gaps: bool = False,
+    lines: list[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Read rows of a stamp and `columns` numbers. Empty lines and comments are passed over.
 
@@ -60,10 +62,12 @@ def read_table(
         columns: how many numbers follow the stamp.
         bad_time: one of `POLICIES`.
         delimiter: between columns, where nothing speaks against it; None for white space.
-        seconds: whether a stamp is decimal seconds instead of integer nanoseconds.
-        unit: of the stamps, of `units.TIME`; in its place, and stamps are decimal numbers or dates.
+        seconds: whether a stamp is decimal seconds: unit="s".
+        unit: of the stamps, of `units.TIME`: whole numbers of ns; of others decimal numbers, or dates.
         quaternion: the first of four columns that must have a norm within 1 % of 1; they are normalised.
         gaps: whether a NaN is data, a number that was not measured; otherwise it is refused.
+        lines: to be filled with the line of each row, from 1; then rows stay as they are in the file, and
+            their order is left to the caller.
 
     Returns:
         Times (n,) int64 ns, increasing; numbers (n, columns) float64; and notes on what was left out or
@@ -72,22 +76,26 @@ def read_table(
     Raises:
         DataError: the file has no rows, or a row is malformed or out of order; names the file and the line.
     """
+    unit = "s" if seconds else unit
     text, said = text_of(file)
     held = [(i, line) for i, line in enumerate(lines_of(text), start=1) if line.strip() and line[0] != "#"]
     try:
-        lines, rows = [i for i, _ in held], [line for _, line in held]
-        if not rows or unit is not None:
+        at, rows = [i for i, _ in held], [line for _, line in held]
+        if not rows:
             raise ValueError
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a stamp like 1e9 is parsed through a float, with a warning
-            dtype = np.dtype([("time", "U40" if seconds else "i8"), ("x", "f8", (columns,))])
+            dtype = np.dtype([("time", "i8" if unit == "ns" else "U40"), ("x", "f8", (columns,))])
             table = np.loadtxt(rows, delimiter=delimiter, dtype=dtype, comments=None, ndmin=1)
-        time = np.array([nanoseconds(t) for t in table["time"]] if seconds else table["time"], dtype=np.int64)
+        time = table["time"]
+        if unit != "ns":
+            time, clock = stamps(table["time"].tolist(), lambda k: f"{file}, line {at[k]}", unit=unit)
+            said = [*said, *filter(None, [clock])]
         x = np.ascontiguousarray(table["x"])
         if np.isinf(x).any() or (not gaps and np.isnan(x).any()):
             raise ValueError
     except (ValueError, OverflowError, Warning):
-        lines, time, x, more = _in_dialect(file, columns, delimiter, "s" if seconds else unit, gaps)
+        at, time, x, more = _in_dialect(file, columns, delimiter, unit, gaps)
         said = [*said, *more]
     if quaternion is not None:
         part = x[:, quaternion : quaternion + 4]
@@ -96,19 +104,22 @@ def read_table(
         if len(off):
             raise DataError(
                 "an attitude is not a unit quaternion",
-                path=f"{file}, line {lines[off[0]]}",
+                path=f"{file}, line {at[off[0]]}",
                 expected="a norm within 1 % of 1",
                 got=f"{norm[off[0], 0]:.6g}",
                 fix="mend or delete the row",
             )
         x[:, quaternion : quaternion + 4] = part / norm
+    if lines is not None:
+        lines.extend(at)
+        return time, x, said
     where = "/".join(file.parts[-2:])
-    time, x, moved = in_order(where, lambda k: f"{file}, line {lines[k]}", time, x, bad_time)
+    time, x, moved = in_order(where, lambda k: f"{file}, line {at[k]}", time, x, bad_time)
     return time, x, [*said, *moved]
 
 
 def _in_dialect(
-    file: Path, columns: int, delimiter: str | None, unit: str | None, gaps: bool
+    file: Path, columns: int, delimiter: str | None, unit: str, gaps: bool
 ) -> tuple[list[int], np.ndarray, np.ndarray, list[str]]:
     """Lines, times, numbers and notes of a table that is not plain.
 
@@ -130,7 +141,7 @@ def _in_dialect(
     cells = [sheet.cells(k) for k in range(columns + 1)]
     decimal, said = decimal_mark(cells, sheet.where, None)
     clock = ""
-    if unit is None:
+    if unit == "ns" and not any(c in cells[0][0] for c in ":T/"):
         time = _whole(cells[0], sheet)
     else:
         time, clock = stamps(cells[0], sheet.where, unit=unit, decimal=decimal)
@@ -146,8 +157,9 @@ def _in_dialect(
                 got=repr(cells[k + 1][absent[0]]),
                 fix="mend or delete the row",
             )
-    notes = [f"{n.rstrip('.')}" for n in (*sheet.notes, said, clock) if n]
-    return sheet.lines, time, x, notes
+    passed = note("skipped", f"{file.name}: ")  # what a plain table may have, and is not said of it
+    notes = [n for n in sheet.notes if not (n.startswith(passed) and n.endswith("of comment"))]
+    return sheet.lines, time, x, [*notes, *filter(None, [said, clock])]
 
 
 def _whole(cells: list[str], sheet: Sheet) -> np.ndarray:

@@ -61,7 +61,7 @@ _SPELLINGS: Mapping[str, str] = {
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A name and the unit in brackets after it: `("wx", "deg/s")` of `wx [deg/s]`; "" where there is no unit."""
+    """A name and the unit in brackets after it: `("wx", "deg/s")` of `wx [deg/s]`; "" where none is."""
     found = re.fullmatch(r"(.*?\S)\s*(?:\[([^\]]*)\]|\(([^)]*)\))", name)
     return (found[1], found[2] or found[3] or "") if found else (name, "")
 
