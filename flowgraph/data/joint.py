@@ -194,7 +194,8 @@ def _together(specs: Sequence[str], owner: Mapping[str, int], series: Mapping[st
             f"no sample of {name} lies within the span of the {first}",
             path=f"{specs[owner[name]]}: {name}",
             expected=f"stamps from {against.time[0]} to {against.time[-1]} ns, as in {specs[owner[first]]}",
-            got=f"{one.time[0]} to {one.time[-1]} ns, {_words(abs(apart))} {'early' if apart > 0 else 'late'}",
+            got=f"{one.time[0]} to {one.time[-1]} ns, {_words(abs(apart))} "
+            + ("earlier" if apart > 0 else "later"),
             fix=f"check the unit of the stamps, for one part by {part}.time.unit=..., or shift it where"
             f" the clocks differ: {part}.{name}.time_offset",
         )
