@@ -266,6 +266,7 @@ def _remark(line: str, marks: Sequence[str]) -> bool:
 
 def split(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line."""
+    line = line.replace("\n", " ")
     if '"' not in line:
         return line.split() if delimiter is None else [c.strip() for c in line.split(delimiter)]
     if delimiter is None:
@@ -372,8 +373,8 @@ def _head(rows: list[list[str]], wide: int) -> tuple[list[int], int]:
     for k, row in enumerate(rows[:_LONGEST_HEAD]):
         follows = any(_is_head(r) and wide - 1 <= len(r) <= wide + 1 for r in rows[k + 1 : _LONGEST_HEAD])
         if _is_head(row):
-            if wide - 1 <= len(row) <= wide + 1:
-                head.append(k)
+            if wide - 1 <= len(row) <= wide + 1 or (len(row) > 1 and not follows and not head):
+                head.append(k)  # names that do not fit the rows are refused later
             elif not follows:
                 return head, k
         elif k == 0 and _numbered(row):

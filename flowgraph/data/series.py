@@ -134,9 +134,8 @@ class Series:
         Args:
             frame: with a row a sample.
             signal: the class of the signal; without it, the values are an array.
-            columns: by field of the signal, `{"gyro": ["wx", "wy", "wz"]}`, or those of the array; if left out,
-                the
-                names that `to_pandas` gives, or all columns.
+            columns: by field of the signal, `{"gyro": ["wx", "wy", "wz"]}`, or of the array; if left out,
+                the names that `to_pandas` gives, or all columns.
             time: the column of the stamps; the index if left out, which must not only count rows.
             unit: "s", "ms", "us" or "ns" of stamps that are numbers; whole numbers are ns if left out.
             more: `name`, `gaps` or `type`, as of `Series`.
