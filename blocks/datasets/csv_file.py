@@ -196,19 +196,16 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
 
 def claims(argument: str, settings: Mapping[str, str]) -> set[str]:
-    """Which of the settings of a flight of several parts are for this file: columns that it has, with their
-    units, and all that are not about a column."""
+    """Which of the settings of a flight of several parts are for this file: those of streams all of whose
+    columns it has, and all that are not of a stream."""
     given = {n: v for n, v in settings.items() if n in SETTINGS}
     mapped = {n: _listed(v) for n, v in given.items() if n.count(".") == 1 and n.split(".")[0] in STREAMS}
     mapped = {n: columns for n, columns in mapped.items() if n.split(".")[1] in STREAMS[n.split(".")[0]]}
     file = the_file(argument, kind="csv", what="table")
     wanted = [c for columns in mapped.values() for c in columns]
     sheet = read_sheet(file, delimiter=_delimiter(given), comment=given.get("comment"), wanted=wanted)
-    absent = {n for n, columns in mapped.items() if not all(map(sheet.matches, columns))}
-    without = {n.split(".")[0] for n in absent}
-    with_all = {n.split(".")[0] for n in mapped if n not in absent}
-    lost = {n for n in given if n.split(".")[0] in without - with_all and n.split(".")[0] in STREAMS}
-    lost |= {n for n in given if any(n == a or n.startswith(a + ".") for a in absent)}
+    elsewhere = {n.split(".")[0] for n, columns in mapped.items() if not all(map(sheet.matches, columns))}
+    lost = {n for n in given if n.split(".")[0] in elsewhere}
     if "time" in given and not sheet.matches(given["time"]):
         lost.add("time")
     return set(given) - lost

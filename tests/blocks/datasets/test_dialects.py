@@ -1,4 +1,4 @@
-"""Tables in the dialects that pandas, R, MATLAB, spreadsheets and loggers write: the same numbers, or a reason."""
+"""Tables as pandas, R, MATLAB, spreadsheets and loggers write them: the same numbers, or a reason."""
 
 from __future__ import annotations
 
@@ -143,7 +143,10 @@ BAD: dict[str, tuple[str | bytes, type[FlowgraphError], list[str]]] = {
         text([[*row[:1], "0,5", *row[2:]] for row in ROWS], ";", ";".join(NAMES)),
         DataError, ["decimal comma or a decimal point", "'0,5'"],
     ),
-    "commas in all": (text([[c.replace(".", ",") for c in row] for row in ROWS]), DataError, ["decimal comma"]),
+    "commas in all": (
+        text([[c.replace(".", ",") for c in row] for row in ROWS]),
+        DataError, ["decimal comma"],
+    ),
     "twice": (
         text(head=",".join([*NAMES[:2], "wx", *NAMES[3:]])),
         DataError, ["'wx' is ambiguous", "columns 1, 2"],
@@ -164,7 +167,10 @@ BAD: dict[str, tuple[str | bytes, type[FlowgraphError], list[str]]] = {
         text(head="t,wx [m],wy [m],wz [m],ax,ay,az"),
         DataError, ["cannot be those of imu.gyro", "rad/s, deg/s"],
     ),
-    "a wide row": (text([*ROWS[:2], [*ROWS[2], "7"], *ROWS[3:]]), DataError, ["line 4", "wrong number of columns"]),
+    "a wide row": (
+        text([*ROWS[:2], [*ROWS[2], "7"], *ROWS[3:]]),
+        DataError, ["line 4", "wrong number of columns"],
+    ),
     "hexadecimal": (text([[*row[:1], "0x1p3", *row[2:]] for row in ROWS]), DataError, ["line 2", "'0x1p3'"]),
     "endless": (text([*ROWS[:1], [ROWS[1][0], "inf", *ROWS[1][2:]]]), DataError, ["line 3", "finite number"]),
     "gzip": (gzip.compress(text().encode()), DataError, ["no text table", "gzip", "unpack"]),
@@ -313,7 +319,8 @@ def test_a_wrong_number_of_columns_names_the_setting_that_fits(tmp_path):
         (["19000.5"], "day", [1641643200000000000]),
         (["2014-05-13T16:53:20.123456789Z"], "s", [1400000000123456789]),
         (["2014-05-13 16:53:20,123456789"], "s", [1400000000123456789]),
-        (["2014-05-13T18:53:20.5+02:00", "2014-05-13T11:53:20.6-0500"], "s", [14 * 10**17 + 5 * 10**8, 14 * 10**17 + 6 * 10**8]),
+        (["2014-05-13T18:53:20.5+02:00"], "s", [1400000000500000000]),
+        (["2014-05-13T11:53:20.6-0500"], "s", [1400000000600000000]),
         (["20140513T165320.25Z"], "s", [1400000000250000000]),
         (["2014/05/13 16:53:20"], "s", [1400000000 * 10**9]),
         (["13-May-2014 16:53:20"], "s", [1400000000 * 10**9]),
