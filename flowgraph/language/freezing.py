@@ -260,7 +260,7 @@ class Freezer:
 
 
 def _reads_changing(function: FunctionType) -> bool:
-    """Whether a function reads globals that may change: more than modules, classes and functions of others."""
+    """Whether a function reads globals that may change, more than modules, classes and others' functions."""
     around = function.__globals__
     named = [around[k] for k in names_read(function.__code__) if k in around]
     return bool(function.__closure__) or any(

@@ -14,14 +14,19 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError, place
+from flowgraph.errors import (
+    DeclarationError,
+    FlowgraphError,
+    LoweringError,
+    TypeMismatchError,
+    declaring_line,
+)
 from flowgraph.language.block import Block, Port, When
 from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
 from flowgraph.language.mistakes import is_mistake
 from flowgraph.language.purity import refuse_different, refuse_write
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
-from flowgraph.recorder.refusals import is_machinery
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.trace import Trace
@@ -186,10 +191,10 @@ def _record(
         raise
     except Exception as error:
         if isinstance(error, ValueError) and "read-only" in str(error):
-            refuse_write(path, "an array that it reads", _line_of(error))
+            refuse_write(path, "an array that it reads", declaring_line(error))
         refusal = LoweringError(
             f"the step cannot be traced: {type(error).__name__}: {error}",
-            path=f"{path} ({_line_of(error)})",
+            path=f"{path} ({declaring_line(error)})",
             expected="array-API operations through xp on fixed shapes",
             got=f"{type(error).__name__}",
             fix="use functions of xp, or declare @block(host=True) with annotated outputs",
@@ -342,15 +347,3 @@ def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
             fix=f"give it to build: build(sizes={{{unbound[0]!r}: ...}})",
         )
     return typing.cast(tuple[int, ...], leaf.shape)
-
-
-def _line_of(error: BaseException) -> str:
-    """module:line of the last frame of the user's code in a traceback."""
-    found = "?"
-    step = error.__traceback__
-    while step is not None:
-        module = step.tb_frame.f_globals.get("__name__", "?")
-        if not is_machinery(module) and module != __name__:
-            found = place(step.tb_frame.f_globals, step.tb_lineno)
-        step = step.tb_next
-    return found
