@@ -30,6 +30,7 @@ from flowgraph.recorder.random import Site, site
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.trace import Trace
+from flowgraph.recorder.units import Unit, parsed, written
 from flowgraph.types import (
     ArrayType,
     StructType,
@@ -168,9 +169,15 @@ def _record(
 
     def symbolic(type_: Type) -> tuple[Any, tuple[int, ...]]:
         leaves = [trace.input(Spec(_sizes(t, path), t.dtype)) for _, t in leaves_of(type_)]
+        trace.units |= {
+            leaf.number: unit
+            for leaf, (_, t) in zip(leaves, leaves_of(type_), strict=True)
+            if (unit := parsed(t.unit)) is not None
+        }
         return unflatten(type_, iter(leaves)), tuple(leaf.number for leaf in leaves)
 
     time, dt = trace.input(Spec((), "int64")), trace.input(Spec((), "real"))
+    trace.units[dt.number] = typing.cast(Unit, parsed("s"))
     args = [None if t is None else symbolic(t) for t in types]
     known = {
         number: leaf
@@ -296,7 +303,26 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
             error.fix = "return what the annotation promises, or mend the annotation"
             raise
         given = _with_units(wanted, bind(port.type, sizes))
+    _check_units(trace, value, given, f"{path}.{port.name}")
     return StepOutput(presence, given, _numbers(trace, value, given))
+
+
+def _check_units(trace: Trace, value: Any, type_: Type, path: str) -> None:
+    """Refuse a result whose unit is known and is not the one that its type states."""
+    for leaf, (name, wanted) in zip(flatten(value, type_), leaves_of(type_), strict=True):
+        stated = parsed(wanted.unit)
+        found = trace.units.get(leaf.number) if isinstance(leaf, Symbolic) else None
+        if None in (stated, found) or stated == found:
+            continue
+        error = TypeMismatchError(
+            f"the unit of {name!r} is not the one that is declared",
+            path=path,
+            expected=wanted.unit,
+            got=written(found),
+            fix=f"compute it in {wanted.unit}, or mend the unit of the declaration",
+        )
+        error.line = trace.line(leaf.number)
+        raise error
 
 
 def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
