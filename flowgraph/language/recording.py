@@ -24,7 +24,7 @@ from flowgraph.errors import (
 from flowgraph.language.block import Block, Port, When
 from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
 from flowgraph.language.mistakes import is_mistake
-from flowgraph.language.purity import refuse_different, refuse_write
+from flowgraph.language.purity import line_of_step, refuse_different, refuse_write
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
 from flowgraph.recorder.symbolic import Symbolic
@@ -218,7 +218,7 @@ def _record(
         _fits_state(new_state, state, path)
         next_state = _numbers(trace, new_state, state)
     outputs = tuple(
-        _output(trace, value, port, known, path)
+        _output(trace, value, port, known, path, line_of_step(block))
         for value, port in zip(
             _outputs(block, result, path), block.outputs or [Port("out", None, False)], strict=True
         )
@@ -275,7 +275,9 @@ def _numbers(trace: Trace, value: Any, type_: Type) -> tuple[int, ...]:
     return tuple(leaf.cast(kind).number for leaf, kind in zip(lifted, kinds, strict=True))
 
 
-def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str) -> StepOutput:
+def _output(
+    trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str, line: str | None
+) -> StepOutput:
     if value is None:
         return StepOutput("never", None, ())
     presence: str | int = "always"
@@ -291,7 +293,7 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
             )
         presence = (flag if isinstance(flag, Symbolic) else trace.constant(bool(flag))).cast("bool").number
         value = value.value
-    given = _typed(value, known)
+    given = _typed(value, known, trace)
     if port.type is not None:
         sizes: dict[str, int] = {}
         wanted = _reals(port.type, given)
@@ -303,16 +305,17 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
             error.fix = "return what the annotation promises, or mend the annotation"
             raise
         given = _with_units(wanted, bind(port.type, sizes))
-    _check_units(trace, value, given, f"{path}.{port.name}")
-    return StepOutput(presence, given, _numbers(trace, value, given))
+    numbers = _numbers(trace, value, given)
+    check_units(trace, numbers, given, f"{path}.{port.name}", line)
+    return StepOutput(presence, given, numbers)
 
 
-def _check_units(trace: Trace, value: Any, type_: Type, path: str) -> None:
-    """Refuse a result whose unit is known and is not the one that its type states."""
-    for leaf, (name, wanted) in zip(flatten(value, type_), leaves_of(type_), strict=True):
-        stated = parsed(wanted.unit)
-        found = trace.units.get(leaf.number) if isinstance(leaf, Symbolic) else None
-        if None in (stated, found) or stated == found:
+def check_units(trace: Trace, numbers: Sequence[int], type_: Type, path: str, line: str | None) -> None:
+    """Refuse a result whose unit is known and is not the one that its type states; `line` is the step's."""
+    leaves = leaves_of(type_)
+    for number, (name, wanted) in zip(numbers, leaves, strict=len(numbers) == len(leaves)):
+        stated, found = parsed(wanted.unit), trace.units.get(number)
+        if stated is None or found is None or stated == found:
             continue
         error = TypeMismatchError(
             f"the unit of {name!r} is not the one that is declared",
@@ -321,12 +324,12 @@ def _check_units(trace: Trace, value: Any, type_: Type, path: str) -> None:
             got=written(found),
             fix=f"compute it in {wanted.unit}, or mend the unit of the declaration",
         )
-        error.line = trace.line(leaf.number)
+        error.line = trace.line(number) or line
         raise error
 
 
-def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
-    """The type of a result; a leaf passed through unchanged keeps its unit and frame."""
+def _typed(value: Any, known: dict[int, ArrayType], trace: Trace) -> Type:
+    """The type of a result; a leaf passed through unchanged keeps its frame too, one computed its unit."""
     if isinstance(value, list):
         raise DeclarationError(
             "a step returns a list",
@@ -337,7 +340,10 @@ def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
     if isinstance(value, Symbolic) and value.number in known:
         return known[value.number]
     if isinstance(value, tuple):
-        return tuple_type([_typed(v, known) for v in value])
+        return tuple_type([_typed(v, known, trace) for v in value])
+    if isinstance(value, Symbolic) and value.dtype_name == "real":
+        given = [leaf.unit for leaf in known.values() if leaf.unit is not None]
+        return ArrayType(value.shape, "real", trace.unit(value.number, given))
     return type_of(value)
 
 

@@ -115,6 +115,11 @@ class Trace:
         if unit is not None:
             self.units[out] = unit
 
+    def unit(self, number: int, given: Sequence[str]) -> str | None:
+        """The unit of a value, spelled as in `given`, the units at the ports; None where it is not known."""
+        found = self.units.get(number)
+        return None if found is None else units.spelled(found, given)
+
     def line(self, number: int) -> str | None:
         """The line that computed a value; None for one from outside."""
         return next((i.line for i in self.instructions if i.out == number), None)

@@ -83,6 +83,22 @@ def written(unit: Unit) -> str:
     return "*".join(above or ["1"]) + "".join(f"/{b}" for b in below)
 
 
+def spelled(unit: Unit, given: Sequence[str]) -> str | None:
+    """A unit as those write it who wrote the units it comes from; None where that cannot be said.
+
+    Radians are pure numbers here and none to those who state them, so nothing is said in their company.
+    """
+    plain = all("rad" not in text for text in given)
+    for text in given:
+        if parsed(text) == unit and "rad" not in text:
+            return text
+    known = [parsed(text) for text in given]
+    own_way = any(u is None or (u and written(u) != text) for u, text in zip(known, given, strict=True))
+    if not unit or not plain or own_way or any(unit == parsed(base) for base in _DERIVED.values()):
+        return None
+    return written(unit)
+
+
 def _power(name: str, power: Fraction) -> str:
     return name if power == 1 else f"{name}^{power}"
 
