@@ -126,13 +126,14 @@ class PluginError(FlowgraphError):
 def naming_lines(whole: str | None = None) -> Iterator[None]:
     """What is refused while a declaration runs gets the line of it that asked, the innermost of the user's.
 
-    What is seen only at its end gets `whole`, where the declaration begins. A `LoweringError` names a line of the block's step already.
+    What is seen only at its end gets `whole`, where the declaration begins. A `LoweringError` names a line
+    of the block's step already.
     """
     try:
         yield
     except FlowgraphError as error:
         if error.line is None and not isinstance(error, LoweringError):
-            error.line = _declaring_line(error) or whole
+            error.line = declaring_line(error) or whole
         raise
 
 
@@ -157,7 +158,8 @@ def _declares(frame: FrameType) -> bool:
     )
 
 
-def _declaring_line(error: BaseException) -> str | None:
+def declaring_line(error: BaseException) -> str | None:
+    """The innermost line of the user's in an error's traceback."""
     found, step = None, error.__traceback__
     while step is not None:
         if _declares(step.tb_frame):

@@ -205,7 +205,9 @@ class Freezer:
             return function
         scope = {k: around[k] for k in _OF_A_MODULE if k in around} if own and named else around
         cells = tuple(CellType() for _ in held)
-        made = FunctionType(function.__code__, scope, function.__name__, None, cells)
+        # what the interpreter learns of globals is kept with the code, so each scope has a copy of its own
+        code = function.__code__ if scope is around else function.__code__.replace()
+        made = FunctionType(code, scope, function.__name__, None, cells)
         made.__dict__.update(function.__dict__)
         made.__annotations__, made.__doc__ = function.__annotations__, function.__doc__
         made.__qualname__, made.__module__ = function.__qualname__, function.__module__
@@ -260,7 +262,7 @@ class Freezer:
 
 
 def _reads_changing(function: FunctionType) -> bool:
-    """Whether a function reads globals that may change: more than modules, classes and functions of others."""
+    """Whether a function reads globals that may change, more than modules, classes and others' functions."""
     around = function.__globals__
     named = [around[k] for k in names_read(function.__code__) if k in around]
     return bool(function.__closure__) or any(

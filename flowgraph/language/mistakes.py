@@ -15,7 +15,7 @@ from flowgraph.language.capturing import is_own
 from flowgraph.recorder.refusals import is_machinery
 
 _ARGUMENTS = re.compile(r"^([\w.<>]+)\(\) (missing \d+ |got (an unexpected|multiple values)|takes )")
-_OF_XP = re.compile(r"^_\w+(\.<locals>\.call)?$")
+_OF_XP = re.compile(r"^_[a-z]\w*(\.<locals>\.call)?$")
 
 
 def is_mistake(error: Exception) -> bool:

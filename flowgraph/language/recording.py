@@ -14,17 +14,23 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from flowgraph.errors import DeclarationError, FlowgraphError, LoweringError, TypeMismatchError, place
+from flowgraph.errors import (
+    DeclarationError,
+    FlowgraphError,
+    LoweringError,
+    TypeMismatchError,
+    declaring_line,
+)
 from flowgraph.language.block import Block, Port, When
 from flowgraph.language.freezing import Freezer, NotPlainError, fingerprint
 from flowgraph.language.mistakes import is_mistake
-from flowgraph.language.purity import refuse_different, refuse_write
+from flowgraph.language.purity import line_of_step, refuse_different, refuse_write
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import Site, site
-from flowgraph.recorder.refusals import is_machinery
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.trace import Trace
+from flowgraph.recorder.units import Unit, parsed, written
 from flowgraph.types import (
     ArrayType,
     StructType,
@@ -163,9 +169,15 @@ def _record(
 
     def symbolic(type_: Type) -> tuple[Any, tuple[int, ...]]:
         leaves = [trace.input(Spec(_sizes(t, path), t.dtype)) for _, t in leaves_of(type_)]
+        trace.units |= {
+            leaf.number: unit
+            for leaf, (_, t) in zip(leaves, leaves_of(type_), strict=True)
+            if (unit := parsed(t.unit)) is not None
+        }
         return unflatten(type_, iter(leaves)), tuple(leaf.number for leaf in leaves)
 
     time, dt = trace.input(Spec((), "int64")), trace.input(Spec((), "real"))
+    trace.units[dt.number] = typing.cast(Unit, parsed("s"))
     args = [None if t is None else symbolic(t) for t in types]
     known = {
         number: leaf
@@ -186,10 +198,10 @@ def _record(
         raise
     except Exception as error:
         if isinstance(error, ValueError) and "read-only" in str(error):
-            refuse_write(path, "an array that it reads", _line_of(error))
+            refuse_write(path, "an array that it reads", declaring_line(error))
         refusal = LoweringError(
             f"the step cannot be traced: {type(error).__name__}: {error}",
-            path=f"{path} ({_line_of(error)})",
+            path=f"{path} ({declaring_line(error)})",
             expected="array-API operations through xp on fixed shapes",
             got=f"{type(error).__name__}",
             fix="use functions of xp, or declare @block(host=True) with annotated outputs",
@@ -206,7 +218,7 @@ def _record(
         _fits_state(new_state, state, path)
         next_state = _numbers(trace, new_state, state)
     outputs = tuple(
-        _output(trace, value, port, known, path)
+        _output(trace, value, port, known, path, line_of_step(block))
         for value, port in zip(
             _outputs(block, result, path), block.outputs or [Port("out", None, False)], strict=True
         )
@@ -263,7 +275,9 @@ def _numbers(trace: Trace, value: Any, type_: Type) -> tuple[int, ...]:
     return tuple(leaf.cast(kind).number for leaf, kind in zip(lifted, kinds, strict=True))
 
 
-def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str) -> StepOutput:
+def _output(
+    trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], path: str, line: str | None
+) -> StepOutput:
     if value is None:
         return StepOutput("never", None, ())
     presence: str | int = "always"
@@ -279,7 +293,7 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
             )
         presence = (flag if isinstance(flag, Symbolic) else trace.constant(bool(flag))).cast("bool").number
         value = value.value
-    given = _typed(value, known)
+    given = _typed(value, known, trace)
     if port.type is not None:
         sizes: dict[str, int] = {}
         wanted = _reals(port.type, given)
@@ -291,11 +305,31 @@ def _output(trace: Trace, value: Any, port: Port, known: dict[int, ArrayType], p
             error.fix = "return what the annotation promises, or mend the annotation"
             raise
         given = _with_units(wanted, bind(port.type, sizes))
-    return StepOutput(presence, given, _numbers(trace, value, given))
+    numbers = _numbers(trace, value, given)
+    check_units(trace, numbers, given, f"{path}.{port.name}", line)
+    return StepOutput(presence, given, numbers)
 
 
-def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
-    """The type of a result; a leaf passed through unchanged keeps its unit and frame."""
+def check_units(trace: Trace, numbers: Sequence[int], type_: Type, path: str, line: str | None) -> None:
+    """Refuse a result whose unit is known and is not the one that its type states; `line` is the step's."""
+    leaves = leaves_of(type_)
+    for number, (name, wanted) in zip(numbers, leaves, strict=len(numbers) == len(leaves)):
+        stated, found = parsed(wanted.unit), trace.units.get(number)
+        if stated is None or found is None or stated == found:
+            continue
+        error = TypeMismatchError(
+            f"the unit of {name!r} is not the one that is declared",
+            path=path,
+            expected=wanted.unit,
+            got=written(found),
+            fix=f"compute it in {wanted.unit}, or mend the unit of the declaration",
+        )
+        error.line = trace.line(number) or line
+        raise error
+
+
+def _typed(value: Any, known: dict[int, ArrayType], trace: Trace) -> Type:
+    """The type of a result; a leaf passed through unchanged keeps its frame too, one computed its unit."""
     if isinstance(value, list):
         raise DeclarationError(
             "a step returns a list",
@@ -306,7 +340,10 @@ def _typed(value: Any, known: dict[int, ArrayType]) -> Type:
     if isinstance(value, Symbolic) and value.number in known:
         return known[value.number]
     if isinstance(value, tuple):
-        return tuple_type([_typed(v, known) for v in value])
+        return tuple_type([_typed(v, known, trace) for v in value])
+    if isinstance(value, Symbolic) and value.dtype_name == "real":
+        given = [leaf.unit for leaf in known.values() if leaf.unit is not None]
+        return ArrayType(value.shape, "real", trace.unit(value.number, given))
     return type_of(value)
 
 
@@ -342,15 +379,3 @@ def _sizes(leaf: ArrayType, path: str) -> tuple[int, ...]:
             fix=f"give it to build: build(sizes={{{unbound[0]!r}: ...}})",
         )
     return typing.cast(tuple[int, ...], leaf.shape)
-
-
-def _line_of(error: BaseException) -> str:
-    """module:line of the last frame of the user's code in a traceback."""
-    found = "?"
-    step = error.__traceback__
-    while step is not None:
-        module = step.tb_frame.f_globals.get("__name__", "?")
-        if not is_machinery(module) and module != __name__:
-            found = place(step.tb_frame.f_globals, step.tb_lineno)
-        step = step.tb_next
-    return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import typing
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from flowgraph.errors import ClockError, DeclarationError, LoweringError, TypeMismatchError, UnknownNameError
@@ -17,10 +18,10 @@ from flowgraph.language.builder import Builder, builder
 from flowgraph.language.clock import Clock, Condition, both, clock_of, either, within
 from flowgraph.language.freezing import Freezer
 from flowgraph.language.graph import Argument, CallNode, OutputPort, RegisterNode, Wire
-from flowgraph.language.purity import refuse_impure
-from flowgraph.language.recording import StepTrace, record
+from flowgraph.language.purity import line_of_step, refuse_impure
+from flowgraph.language.recording import StepTrace, check_units, record
 from flowgraph.language.stream import Held, Stream
-from flowgraph.types import Type, check_fits
+from flowgraph.types import ArrayType, StructType, Type, check_fits
 
 
 def wire(block: Block[Any], streams: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
@@ -288,6 +289,20 @@ def _literals(options: list[Stream[Any]], choice: tuple[bool, ...]) -> list[Cloc
     return [s.clock if here else clocks.Not(s.clock) for s, here in zip(options, choice, strict=True)]
 
 
+def _agreed(a: Type, b: Type) -> Type | None:
+    """What two types have in common that differ at most in a unit or frame which one leaves open."""
+    if isinstance(a, StructType) and isinstance(b, StructType):
+        pairs = [(n, _agreed(f, g)) for (n, f), (_, g) in zip(a.fields, b.fields, strict=False)]
+        whole = replace(a, fields=tuple((n, t) for n, t in pairs if t is not None))
+        names = [n for n, _ in b.fields]
+        return whole if a.cls is b.cls and [n for n, _ in whole.fields] == names else None
+    if isinstance(a, StructType) or isinstance(b, StructType) or (a.shape, a.dtype) != (b.shape, b.dtype):
+        return None
+    if not all(x == y or None in (x, y) for x, y in ((a.unit, b.unit), (a.frame, b.frame))):
+        return None
+    return replace(a, unit=a.unit and b.unit, frame=a.frame and b.frame)
+
+
 def _outputs(
     block: Block[Any],
     path: str,
@@ -308,6 +323,10 @@ def _outputs(
         type_ = next((s.type for s in steps.values() if s.type is not None), None)
         if block.output_rule is not None and k == 0:
             type_ = block.output_rule(types, settings)
+            if isinstance(type_, ArrayType | StructType):
+                for choice, step in steps.items():
+                    if step.type is not None:
+                        check_units(recorded[choice].trace, step.leaves, type_, path, line_of_step(block))
         if type_ is None and declared is not None:
             type_ = declared[k].type
         if type_ is None:
@@ -322,7 +341,12 @@ def _outputs(
                 fix="return a value, or drop the output",
             )
         for step in steps.values():
-            if step.type is not None and step.type != type_ and block.output_rule is None:
+            if step.type is None or block.output_rule is not None:
+                continue
+            agreed = _agreed(step.type, type_)
+            if agreed is not None:
+                type_ = agreed
+            else:
                 raise TypeMismatchError(
                     f"output {name!r} changes its type with the presence of an option",
                     path=path,

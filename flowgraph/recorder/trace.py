@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.errors import LoweringError
+from flowgraph.errors import LoweringError, TypeMismatchError
+from flowgraph.recorder import units
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS, Op, ShapeError, Spec, bound_attrs, promote
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic import Symbolic
 from flowgraph.recorder.symbolic_namespace import namespace
+from flowgraph.recorder.units import Unit
 from flowgraph.types import DTYPES, dtype_name
 
 
@@ -43,6 +45,7 @@ class Trace:
     def __init__(self) -> None:
         self.instructions: list[Instruction] = []
         self.constants: dict[int, np.ndarray] = {}
+        self.units: dict[int, Unit] = {}
         self._interned: dict[tuple[bytes, tuple[int, ...], str], int] = {}
         self._count = 0
 
@@ -90,8 +93,36 @@ class Trace:
             raise refusal from None
         out = Symbolic(self, self.new(), spec)
         numbers = tuple(a.number for a in operands)
+        if self.units:
+            self._measure(op, numbers, out.number)
         self.instructions.append(Instruction(op, numbers, attrs, out.number, spec, caller()))
         return out
+
+    def _measure(self, op: str, numbers: tuple[int, ...], out: int) -> None:
+        """Note the unit of a result where it is known."""
+        power = self.constants.get(numbers[1]) if op == "pow" else None
+        exponent = None if power is None or power.shape else float(power)
+        try:
+            unit = units.result(op, [self.units.get(n) for n in numbers], exponent)
+        except units.UnitsDifferError as error:
+            raise TypeMismatchError(
+                f"{op} of different units",
+                path=caller(),
+                expected="one unit",
+                got=str(error),
+                fix="convert one of them first; a product with a constant has no unit and fits any",
+            ) from None
+        if unit is not None:
+            self.units[out] = unit
+
+    def unit(self, number: int, given: Sequence[str]) -> str | None:
+        """The unit of a value, spelled as in `given`, the units at the ports; None where it is not known."""
+        found = self.units.get(number)
+        return None if found is None else units.spelled(found, given)
+
+    def line(self, number: int) -> str | None:
+        """The line that computed a value; None for one from outside."""
+        return next((i.line for i in self.instructions if i.out == number), None)
 
     def _operands(self, kind: str, op: str, args: Sequence[Any]) -> list[Symbolic]:
         peers = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Symbolic)]
