@@ -133,4 +133,4 @@ def test_a_constant_below_the_normal_numbers_is_refused() -> None:
     with pytest.raises(LoweringError) as error:
         one.build()
     assert "a constant is smaller than the normal numbers" in str(error.value)
-    assert str(error.value.path).startswith(__name__)
+    assert __name__ in str(error.value.path)
