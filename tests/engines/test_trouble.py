@@ -1,4 +1,4 @@
-"""What ends a run, alike in all engines: the first full queue in time, numbers that are not finite any more."""
+"""What ends a run, alike in all engines: the first full queue in time, numbers that are no longer finite."""
 
 from __future__ import annotations
 
