@@ -91,8 +91,30 @@ class OutputError(FlowgraphError):
     """A file cannot be written; names it."""
 
 
-class FifoOverflowError(FlowgraphError):
+class RunError(FlowgraphError):
+    """A run cannot go on.
+
+    Attributes:
+        time: of the tick that is to blame, in ns.
+        result: the `Result` of the ticks before it, where a whole run was asked for.
+    """
+
+    time: int | None = None
+    result: Any = None
+
+
+class FifoOverflowError(RunError):
     """A bounded queue of a join was full when a value arrived; names the join, its bound and the time."""
+
+
+class DivergedError(RunError):
+    """A number that was finite is not any more; names the block, the time and the last good tick.
+
+    Attributes:
+        last: the time of the last good tick in ns, or None.
+    """
+
+    last: int | None = None
 
 
 class UnknownNameError(FlowgraphError):

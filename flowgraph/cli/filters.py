@@ -93,6 +93,9 @@ def run(
     seed: Seed = 0,
     settings: Settings = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
+    diverged: Annotated[
+        str, typer.Option(help="Numbers that are no longer finite: raise or count.")
+    ] = "raise",
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
@@ -100,7 +103,7 @@ def run(
         make_ready(out)
     spec = one_flight(data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth)
-    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
+    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged)
     notes = dict.fromkeys((*flight.notes, *case.notes, *result.notes))
     for note in notes:
         err_console.print(f"note: {note}", markup=False)
@@ -144,7 +147,7 @@ def demo(
 
 
 def _measure(
-    case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool
+    case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool, diverged: str = "raise"
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -153,7 +156,9 @@ def _measure(
         if hidden
         else ProgressBar(f"{name} ({engine})", total=case.inputs, console=err_console) as meter
     ):
-        result = simulate(case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter)
+        result = simulate(
+            case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter, diverged=diverged
+        )
     total = perf_counter() - start
     row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
     row.update({"setup_s": total - result.wall_s, **case.score(result), **result.stats})

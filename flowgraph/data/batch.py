@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,8 @@ class Batch:
         series: the collected streams by name.
         ticks: of one run.
         wall_s: seconds spent in the engine's loop, without set-up.
+        diverged: the places of runs in which numbers are not finite any more, and which; looked at are what
+            is kept, and the registers at the end.
     """
 
     graph: str
@@ -71,6 +73,7 @@ class Batch:
     series: Mapping[str, Runs]
     ticks: int
     wall_s: float
+    diverged: Mapping[int, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Runs:
         if name not in self.series:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph.data.series import Flight, Series, unmasked
+from flowgraph.data.tape import need_near
 from flowgraph.errors import ClockError, DataError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.language.graph import NEVER, Graph
@@ -229,6 +230,7 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
     least, most = int(steps.min(initial=2**63 - 1)), int(steps.max(initial=0))
     if least <= 0:
         row = int(np.flatnonzero(steps <= 0)[0])
+        need_near(int(stamps[row]), int(stamps[row + 1]))  # a step beyond int64 comes out negative
         twice = steps[row] == 0
         raise DataError(
             "two events at one time" if twice else "time goes backwards",

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.series import Series
+from flowgraph.errors import DataError
 from flowgraph.language.graph import Graph
 from flowgraph.types import DTYPES, StructType, Type, flatten, leaves_of, unflatten
 
@@ -37,16 +38,40 @@ class Tape:
             time.sort(kind="stable")  # merges runs that are sorted already
             time = time[np.concatenate([[True], time[1:] != time[:-1]])]
             rows = [np.searchsorted(time, s.time) for s in series]
+        if len(time):
+            need_near(int(time[0]), int(time[-1]))
         key = np.zeros(len(time), np.int64)
         for k, r in enumerate(rows):
             key[... if r is None else r] |= 1 << k
         return cls(time, key, series)
+
+    def first(self, ticks: int) -> Tape:
+        """The tape of the first ticks alone."""
+        key = self.key[:ticks]
+        series = tuple(s[: int((key >> k & 1).sum())] for k, s in enumerate(self.series))
+        return Tape(self.time[:ticks], key, series)
 
     @property
     def patterns(self) -> tuple[int, ...]:
         """The keys that occur, in order."""
         few = len(self.series) <= 16
         return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
+
+
+def need_near(first: int, time: int) -> None:
+    """Refuse a tick whose distance from the first of a run is none that int64 nanoseconds hold.
+
+    Raises:
+        DataError: naming both times.
+    """
+    if time - first >= 2**63:
+        raise DataError(
+            "two ticks of a run are too far apart",
+            path=f"t = {time} ns",
+            expected="less than 2^63 ns, 292 years, between the first and the last",
+            got=f"{time - first} ns",
+            fix="check the unit and the origin of the stamps: one source may count from another time",
+        )
 
 
 def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
@@ -127,8 +152,11 @@ def merged(
 
     def ticks() -> Iterator[tuple[int, int]]:
         heads = [next(f, None) for f in feeds]
+        first: int | None = None
         while any(h is not None for h in heads):
             now = min(h[0] for h in heads if h is not None)
+            first = now if first is None else first
+            need_near(first, now)
             key = 0
             for k, head in enumerate(heads):
                 if head is not None and head[0] == now:

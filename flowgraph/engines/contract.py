@@ -61,7 +61,7 @@ class ManyRuns:
         started: the register cells from which all runs start; None where each has its own.
         tape: the ticks of the n-th run, checked.
         cells: the register cells from which the n-th run starts.
-        finish: to be called with the cells of a run that has ended, for the errors that lie in them.
+        finish: to be called with the place of a run that has ended and its cells, for what lies in them.
     """
 
     name: str
@@ -73,7 +73,7 @@ class ManyRuns:
     started: list[np.ndarray] | None
     tape: Callable[[int], Tape]
     cells: Callable[[int], list[np.ndarray]]
-    finish: Callable[[list[Any]], None]
+    finish: Callable[[int, list[Any]], None]
 
 
 @dataclass(frozen=True)

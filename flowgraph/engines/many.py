@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from flowgraph.data.batch import Batch, joined
 from flowgraph.data.inputs import Inputs, prepare
+from flowgraph.data.notes import note
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.contract import ManyRuns, PipelineEngine
 from flowgraph.engines.options import RUNS_AT_ONCE, Meter, PerSeed, RunOptions
 from flowgraph.engines.parts import run_graph
-from flowgraph.engines.playback import check_faults, chosen_passes
+from flowgraph.engines.playback import chosen_passes
 from flowgraph.engines.registry import find_engine
 from flowgraph.engines.subject import LoweredGraph
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.engines.trouble import ManyTroubles
+from flowgraph.errors import DeclarationError, RunError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.optimise import RELYING, without
 from flowgraph.recorder.random import seed_words
 from flowgraph.types import leaves_of
+
+DIVERGED = note("diverged", "")
 
 ManyInputs = Inputs | PerSeed | Sequence[Inputs]
 
@@ -39,6 +44,7 @@ def simulate_many(
     runs_at_once: int = RUNS_AT_ONCE,
     progress: Meter | None = None,
     passes: Collection[str] | None = None,
+    diverged: str = "raise",
 ) -> Batch:
     """Run a graph once for each seed.
 
@@ -54,14 +60,16 @@ def simulate_many(
             is bounded and the result of a run does not depend on how many others are asked for.
         progress: told the number of finished runs.
         passes: of the optimiser, as for `simulate`.
+        diverged: as for `simulate`; "count" lists the runs in `Batch.diverged`.
 
     Raises:
         DeclarationError: without a seed, or where one is none; for a list that is not one a run.
+        FifoOverflowError, DivergedError: of the first such run in the order of seeds; a note names the seed.
         DataError: where, in XLA, two runs have events at different times.
     """
     options = RunOptions(
         engine=engine, dtype=dtype, init=init, keep=keep, runs_at_once=runs_at_once, progress=progress,
-        passes=passes,
+        passes=passes, diverged=diverged,
     )  # fmt: skip
     return run_many(graph, inputs, seeds, options)
 
@@ -76,7 +84,7 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
         return _one_by_one(graph, inputs, seeds, keep, options)
     assert isinstance(engine, PipelineEngine)
     engine.need()
-    runs = _together(graph, inputs, seeds, keep, options)
+    runs, troubles = _together(graph, inputs, seeds, keep, options)
     passes = chosen_passes(engine, options)
     if options.init is not None:
         passes = without(*RELYING, passes=passes)  # they rely on the values at reset
@@ -84,7 +92,30 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
         return _one_by_one(graph, inputs, seeds, keep, options)
     found = engine.play_many(runs, passes, options)
     series = {name: found.series[name] for name in keep}
-    return Batch(graph.name, options.engine, seeds, series, found.ticks, found.wall_s)
+    astray = troubles.astray(series)
+    worst = min([*troubles.full, *(astray if options.diverged == "raise" else ())], default=None)
+    if worst is not None:
+        _alone(graph, runs, worst, options)
+        raise troubles.error(worst)
+    return Batch(graph.name, options.engine, seeds, series, found.ticks, found.wall_s, astray)
+
+
+def _alone(graph: Graph, runs: ManyRuns, n: int, options: RunOptions) -> None:
+    """Run one of many by itself, for the error that it ends in."""
+    given = dict(zip(graph.sources, runs.tape(n).series, strict=True))
+    seed = runs.seeds[n]
+    single = options.but(seed=seed, init=_of_run(options.init, n, seed), progress=None, keep=None)
+    with _naming_seed(seed):
+        run_graph(graph, given, single)
+
+
+@contextmanager
+def _naming_seed(seed: int) -> Iterator[None]:
+    try:
+        yield
+    except RunError as error:
+        error.add_note(f"in the run of seed {seed}")
+        raise
 
 
 def _checked_seeds(graph: Graph, inputs: Any, seeds: Any, options: RunOptions) -> tuple[int, ...]:
@@ -157,21 +188,26 @@ def _one_by_one(
         inputs = dict(zip(graph.sources, tape(prepare(graph, inputs), graph).series, strict=True))
     parts: dict[str, list[Series]] = {name: [] for name in keep}
     wall, ticks = 0.0, 0
+    astray: dict[int, str] = {}
     for n, seed in enumerate(seeds):
         single = options.but(seed=seed, init=_of_run(options.init, n, seed), progress=None)
-        result = run_graph(graph, _of_run(inputs, n, seed), single)
+        with _naming_seed(seed):
+            result = run_graph(graph, _of_run(inputs, n, seed), single)
+        said = [text.removeprefix(DIVERGED) for text in result.notes if text.startswith(DIVERGED)]
+        if said:
+            astray[n] = "; ".join(said)
         wall, ticks = wall + result.wall_s, result.ticks
         for name in keep:
             parts[name].append(result[name])
         if options.progress is not None:
             options.progress.update(n + 1, 0)
     series = {name: joined(name, part, keep[name]) for name, part in parts.items()}
-    return Batch(graph.name, options.engine, seeds, series, ticks, wall)
+    return Batch(graph.name, options.engine, seeds, series, ticks, wall, astray)
 
 
 def _together(
     graph: Graph, inputs: Any, seeds: tuple[int, ...], keep: dict[str, list[str]], options: RunOptions
-) -> ManyRuns:
+) -> tuple[ManyRuns, ManyTroubles]:
     subject = LoweredGraph(graph, dtype=options.dtype)
     first = subject.tape(_of_run(inputs, 0, seeds[0]))
     shared = _is_shared(inputs)
@@ -185,10 +221,12 @@ def _together(
 
     started = cells_of(0) if _is_shared(options.init) else None
 
-    def finish(cells: list[Any]) -> None:
-        check_faults(subject.pipeline, cells)
+    def cells_at(n: int) -> list[np.ndarray]:
+        return started if started is not None else cells_of(n)
 
-    return ManyRuns(
-        graph.name, subject.pipeline, seeds, keep, first, shared, started,
-        tape_of, lambda n: started if started is not None else cells_of(n), finish,
+    troubles = ManyTroubles(subject.pipeline, cells_at, tape_of)
+    runs = ManyRuns(
+        graph.name, subject.pipeline, seeds, keep, first, shared, started, tape_of, cells_at,
+        troubles.finish,
     )  # fmt: skip
+    return runs, troubles

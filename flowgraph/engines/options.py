@@ -12,6 +12,7 @@ from flowgraph.recorder.random import seed_words
 
 DTYPES = ("float64", "float32")
 RUNS_AT_ONCE = 64
+DIVERGED = ("raise", "count")
 
 PerSeed = Callable[[int], Any]
 
@@ -37,9 +38,10 @@ class RunOptions:
         passes: of the optimiser; None: those that suit the engine.
         keep: of many runs, what to keep of the outputs; None: everything.
         runs_at_once: of many runs, how many go in one call where the engine does them in chunks.
+        diverged: what an output or register that is no longer finite does: "raise", or "count" it and go on.
 
     Raises:
-        UnknownNameError: for another dtype or pass.
+        UnknownNameError: for another dtype, pass or way of `diverged`.
         DeclarationError: for a seed that is none.
     """
 
@@ -52,10 +54,13 @@ class RunOptions:
     passes: Collection[str] | None = None
     keep: Sequence[str] | None = None
     runs_at_once: int = RUNS_AT_ONCE
+    diverged: str = "raise"
 
     def __post_init__(self) -> None:
         if self.dtype not in DTYPES:
             raise UnknownNameError("dtype", self.dtype, DTYPES)
+        if self.diverged not in DIVERGED:
+            raise UnknownNameError("way of diverged", self.diverged, DIVERGED)
         if self.passes is not None:
             check_passes(self.passes)
         seed_words(self.seed)

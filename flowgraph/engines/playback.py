@@ -10,12 +10,12 @@ import numpy as np
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
-from flowgraph.engines.contract import PipelineEngine
-from flowgraph.engines.options import RunOptions
+from flowgraph.data.tape import Tape
+from flowgraph.engines.contract import Outcome, PipelineEngine
+from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.registry import find_pipeline_engine
-from flowgraph.engines.subject import LoadedPipeline, Subject
-from flowgraph.errors import FifoOverflowError
-from flowgraph.language.graph import NEVER
+from flowgraph.engines.subject import LoadedPipeline, Start, Subject
+from flowgraph.engines.trouble import Playback, cells_of, gaps_of, overflow, settled
 from flowgraph.pipeline.optimise import check_passes, usable
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.random import seed_words
@@ -38,8 +38,28 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     engine.need()
     passes = usable(pipeline, chosen_passes(engine, options), start.cells)
     player = engine.prepare(pipeline, events.patterns, len(events.time), options.dtype, passes)
-    outcome = player.play(events, start.cells, seed_words(start.seed), options.progress)
-    check_faults(pipeline, outcome.cells)
+    words = seed_words(start.seed)
+
+    def played(tape: Tape, progress: Meter | None = None) -> Result:
+        outcome = player.play(tape, start.cells, words, progress)
+        return _result(subject, outcome, tape, start, options.engine)
+
+    result = played(events, options.progress)
+    run = Playback(
+        pipeline,
+        start.cells,
+        gaps_of(events, [p.name for p in pipeline.inputs]),
+        lambda: events,
+        lambda ticks: played(events.first(ticks)),
+    )
+    error = overflow(pipeline, cells_of(pipeline, result.state))
+    if error is not None:
+        result = played(events.first(int(np.searchsorted(events.time, error.time or 0))))
+    return settled(result, run, options.diverged, error)
+
+
+def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engine: str) -> Result:
+    pipeline = subject.pipeline
     series = {
         port.name: Series(times, unflatten(type_, iter(leaves)), type=type_, name=port.name)
         for port, type_, (times, leaves) in zip(pipeline.outputs, subject.types, outcome.outputs, strict=True)
@@ -55,32 +75,12 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
         for name, count in state["registers"][f.register].items()
         if name.startswith("expired")
     }
-    return Result(pipeline.name, options.engine, series, state, stats, len(events.time), outcome.wall_s)
+    return Result(pipeline.name, engine, series, state, stats, len(events.time), outcome.wall_s)
 
 
 def chosen_passes(engine: PipelineEngine, options: RunOptions) -> tuple[str, ...]:
     """The passes that were asked for, or those that suit the engine, in order."""
     return check_passes(engine.passes if options.passes is None else options.passes)
-
-
-def check_faults(pipeline: Pipeline, cells: list[Any]) -> None:
-    """Refuse register cells that hold the time at which a queue overflowed.
-
-    Raises:
-        FifoOverflowError: naming the join, its bound and the time.
-    """
-    values = iter(cells)
-    found = {(r.path, c.name): next(values) for r in pipeline.registers for c in r.cells}
-    for fault in pipeline.faults:
-        time = int(found[fault.register, fault.cell])
-        if time != NEVER:
-            raise FifoOverflowError(
-                fault.message,
-                path=fault.path,
-                expected=f"at most {fault.bound} waiting values of one stream",
-                got=f"one more at t = {time} ns",
-                fix="raise size=, or look why the other stream is silent",
-            )
 
 
 def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:

@@ -16,10 +16,10 @@ import numpy as np
 from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import Outcome, PipelineEngine, Player, real_leaves
 from flowgraph.engines.options import Meter
-from flowgraph.pipeline.evaluate import TOTAL_NUMPY
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS, bound_attrs
 from flowgraph.types import DTYPES
 
@@ -51,6 +51,15 @@ class Interpreter:
 
     def tick(self, time: int, key: int, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...] | None]:
         """One tick: `values` are the leaves of the present inputs; returns those of each output, or None."""
+        program, env = self.values(time, key, values)
+        self.cells = [env[n] for n in program.writes]
+        return [
+            None if flag is None or not env.get(flag, True) else tuple(env[n] for n in leaves)
+            for flag, leaves in program.outputs
+        ]
+
+    def values(self, time: int, key: int, values: list[tuple[Any, ...]]) -> tuple[Program, dict[int, Any]]:
+        """The program of a tick, and every value in it by number; the registers stay as they are."""
         if key not in self._programs:
             program = specialise(self.pipeline, key)
             if self._passes:
@@ -68,11 +77,7 @@ class Interpreter:
                 env.update(zip(numbers, next(present), strict=True))
         for run, args, out in steps:
             env[out] = run(*[env[a] for a in args])
-        self.cells = [env[n] for n in program.writes]
-        return [
-            None if flag is None or not env.get(flag, True) else tuple(env[n] for n in leaves)
-            for flag, leaves in program.outputs
-        ]
+        return program, env
 
     def _blanks(self, key: int) -> dict[int, Any]:
         """Zeros for the leaves of absent inputs, which a selection may name without taking."""
@@ -85,7 +90,7 @@ class Interpreter:
 
 
 def _bind(i: Any, real: Any) -> tuple[Callable[..., Any], tuple[int, ...], int]:
-    return partial(OPS[i.op].run, TOTAL_NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
+    return partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, real)), i.args, i.out
 
 
 def _as(array: Any, real: Any) -> Any:

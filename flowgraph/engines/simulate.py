@@ -29,6 +29,7 @@ def simulate(
     seeds: None = ...,
     progress: Meter | None = ...,
     passes: Collection[str] | None = ...,
+    diverged: str = ...,
 ) -> Result: ...
 @typing.overload
 def simulate(
@@ -43,6 +44,7 @@ def simulate(
     seeds: Sequence[int],
     progress: Meter | None = ...,
     passes: Collection[str] | None = ...,
+    diverged: str = ...,
 ) -> Batch: ...
 def simulate(
     graph: Graph,
@@ -56,6 +58,7 @@ def simulate(
     seeds: Sequence[int] | None = None,
     progress: Meter | None = None,
     passes: Collection[str] | None = None,
+    diverged: str = "raise",
 ) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
@@ -74,15 +77,19 @@ def simulate(
         progress: an object that is told how far the run is.
         passes: of the optimiser, from `flowgraph.pipeline.optimise.PASSES`; None: those
             that suit the engine. The Python engine has no list to optimise.
+        diverged: where an operation makes an output or a register that is not finite, "raise", or "count"
+            it in the result's `stats` and `notes` and go on.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
         FifoOverflowError: where a queue of a join overflows.
+        DivergedError: where a number is not finite any more.
         MissingDependencyError: for "xla" without JAX, for "c" without a C compiler.
     """
     options = RunOptions(
-        engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes
-    )
+        engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes,
+        diverged=diverged,
+    )  # fmt: skip
     if seeds is None:
         need_inputs(graph, inputs)
         return run_graph(graph, inputs, options)

@@ -12,8 +12,9 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 
 from flowgraph.errors import ClockError, DeclarationError
@@ -218,22 +219,33 @@ def every(n: int, parent: Clock, *, phase: int = 0) -> Clock:
     if n == 1:
         return parent
     if isinstance(parent, Counted):  # count within the parent's own count: one pattern over the grandparent
-        span = parent.period * n
-        hits = [i for i in range(span) if i % parent.period in parent.offsets]
-        return counted(parent.parent, span, [t for k, t in enumerate(hits) if k % n == phase % n])
+        size = len(parent.offsets)
+        rounds = [divmod(phase % n + k * n, size) for k in range(size)]
+        hits = [turn * parent.period + parent.offsets[place] for turn, place in rounds]
+        return counted(parent.parent, parent.period * n, hits)
     return counted(parent, n, [phase % n])
 
 
 def counted(parent: Clock, period: int, offsets: list[int]) -> Clock:
     """The clock with the shortest equal pattern: `offsets` of each `period` ticks of `parent`."""
     hits = set(offsets)
-    for shorter in range(1, period):
-        if period % shorter == 0 and hits == {
-            i for i in range(period) if i % shorter in hits and i % shorter < shorter
-        }:
-            period, hits = shorter, {i for i in hits if i < shorter}
-            break
+    for factor in _prime_factors(math.gcd(period, len(hits))):  # a pattern in so many equal parts
+        part = period // factor
+        if all((i + part) % period in hits for i in hits):
+            period, hits = part, {i for i in hits if i < part}
     return parent if len(hits) == period else Counted(parent, period, tuple(sorted(hits)))
+
+
+def _prime_factors(n: int) -> Iterator[int]:
+    """As often as they are in it."""
+    factor = 2
+    while factor * factor <= n:
+        while n % factor == 0:
+            yield factor
+            n //= factor
+        factor += 1
+    if n > 1:
+        yield n
 
 
 def clock_of(thing: object) -> Clock:
@@ -316,8 +328,9 @@ def _allowed(atom: Clock, value: bool, chosen: dict[Clock, bool]) -> bool:
         return False
     if isinstance(atom, Counted) and evaluate(atom.parent, chosen):
         siblings = [a for a in chosen if isinstance(a, Counted) and a.parent == atom.parent]
-        span = math.lcm(*(a.period for a in siblings))
-        return any(all((i % a.period in a.offsets) == chosen[a] for a in siblings) for i in range(span))
+        inside = [(a.period, a.offsets) for a in siblings if chosen[a]]
+        outside = [(a.period, frozenset(a.offsets)) for a in siblings if not chosen[a]]
+        return any(_some_outside(*place, outside) for place in _places(0, 1, inside))
     if isinstance(atom, Source):
         return all(
             _coincide(atom.timing, value, other.timing, present)
@@ -325,6 +338,45 @@ def _allowed(atom: Clock, value: bool, chosen: dict[Clock, bool]) -> bool:
             if isinstance(other, Source) and other != atom
         )
     return True
+
+
+_Pattern = tuple[int, tuple[int, ...]]
+
+
+def _places(rest: int, span: int, patterns: Sequence[_Pattern]) -> Iterator[tuple[int, int]]:
+    """The numbers that are `rest` modulo `span` and in all patterns, as (rest, span)."""
+    if not patterns:
+        yield rest, span
+        return
+    (period, offsets), *more = patterns
+    common = math.gcd(span, period)
+    for offset in offsets:
+        if (offset - rest) % common == 0:
+            steps = (offset - rest) // common * pow(span // common, -1, period // common)
+            yield from _places(rest + span * (steps % (period // common)), math.lcm(span, period), more)
+
+
+def _some_outside(rest: int, span: int, patterns: Sequence[tuple[int, frozenset[int]]]) -> bool:
+    """Whether some number that is `rest` modulo `span` is in none of the patterns."""
+    left = []
+    covered = Fraction(0)
+    for period, offsets in patterns:
+        common = math.gcd(span, period)
+        share = Fraction(sum((o - rest) % common == 0 for o in offsets) * common, period)
+        if share == 1:
+            return False
+        if share:
+            left.append((period, offsets))
+            covered += share
+    if covered < 1:
+        return True
+    (period, offsets), *more = sorted(left, key=lambda pattern: pattern[0])
+    step = math.lcm(span, period)
+    return any(
+        _some_outside(number, step, more)
+        for number in range(rest, rest + step, span)
+        if number % period not in offsets
+    )
 
 
 def _coincide(a: Timing, a_present: bool, b: Timing, b_present: bool) -> bool:

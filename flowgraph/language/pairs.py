@@ -11,6 +11,7 @@ from __future__ import annotations
 import builtins
 import math
 import typing
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -27,18 +28,26 @@ from flowgraph.language.stream import Stream
 from flowgraph.types import ArrayType, Type, flatten, tuple_type, unflatten
 
 
-def _ranks(clock: Clock, root: Clock, ticks: int) -> list[bool]:
-    """Which of the first `ticks` ticks of `root` belong to `clock`."""
+def _ranks(clock: Clock, root: Clock, ticks: int) -> list[int]:
+    """Which of the first `ticks` ticks of `root` belong to `clock`, by number."""
     if clock == root:
-        return [True] * ticks
+        return list(range(ticks))
     assert isinstance(clock, Counted)
+    if clock.parent == root:
+        return [
+            start + o for start in range(0, ticks, clock.period) for o in clock.offsets if start + o < ticks
+        ]
     inner = _ranks(clock.parent, root, ticks)
-    number = -1
-    hits = []
-    for here in inner:
-        number += here
-        hits.append(here and number % clock.period in clock.offsets)
-    return hits
+    return [tick for number, tick in enumerate(inner) if number % clock.period in clock.offsets]
+
+
+def _rate(clock: Clock) -> Fraction:
+    """How many of the ticks of its root a clock has."""
+    return (
+        Fraction(len(clock.offsets), clock.period) * _rate(clock.parent)
+        if isinstance(clock, Counted)
+        else Fraction(1)
+    )
 
 
 def _root(clock: Clock) -> Clock:
@@ -71,19 +80,21 @@ def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
             + ("" if same else ", or hold one with latest(b, init=...)"),
         )
     span = math.lcm(_span(a), _span(b))
-    in_a, in_b = _ranks(a, root, 2 * span), _ranks(b, root, 2 * span)
-    if sum(in_a) != sum(in_b):
+    of_a, of_b = (_rate(clock) * 2 * span for clock in (a, b))
+    if of_a != of_b:
         raise ClockError(
             "the rates are unequal, so a queue would grow without bound",
             path=label,
             expected="equal rates",
-            got=f"{a}: {sum(in_a)} of {2 * span}, {b}: {sum(in_b)} of {2 * span} ticks of {root}",
+            got=f"{a}: {of_a} of {2 * span}, {b}: {of_b} of {2 * span} ticks of {root}",
             fix="hold the slower one: latest(slow, init=...)",
         )
+    in_a, in_b = set(_ranks(a, root, 2 * span)), set(_ranks(b, root, 2 * span))
     depth, ahead, pairs = 1, 0, []
-    for i, (x, y) in enumerate(builtins.zip(in_a, in_b, strict=True)):
+    for i in sorted(in_a | in_b):
+        x, y = i in in_a, i in in_b
         before = ahead
-        ahead += int(x) - int(y)
+        ahead += x - y
         depth = max(depth, abs(ahead))
         if (y and before > 0) or (x and before < 0) or (x and y):
             pairs.append(i)

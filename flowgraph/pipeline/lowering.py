@@ -238,17 +238,22 @@ class _Lowering(StageList):
         }
         for k in range(len(call.outputs)):
             leaves = {c: outs[k][1] for c, (outs, _) in played.items() if outs[k][1]}
-            self.leaves[Wire(index, k)] = self.choose(options, leaves)
+            self.leaves[Wire(index, k)] = self.choose(options, leaves) or self.blanks(call.outputs[k].type)
             if call.dynamic[k]:
-                flag = self.choose(options, {c: [outs[k][0]] for c, (outs, _) in played.items()})[0]
+                flags = self.choose(options, {c: [outs[k][0]] for c, (outs, _) in played.items()})
+                flag = flags[0] if flags else self.constant(np.False_)
                 self.flags[Wire(index, k)] = self.emit("logical_and", firing, flag)
         if call.state is not None:
-            new = self.choose(options, {c: state for c, (_, state) in played.items()})
+            new = self.choose(options, {c: state for c, (_, state) in played.items()}) or memory
             self.writes[call.state] = [self.select(firing, n, o) for n, o in zip(new, memory, strict=True)]
         registers = [a.register for a in call.arguments if a.register is not None]
         memory_of = [] if call.state is None else [self.graph.nodes[call.state].path]
         reads = [self.graph.nodes[i].path for i in registers] + memory_of
         self.close(call.path, call.block.name, firing, reads, memory_of, self.axis(call))
+
+    def blanks(self, type_: Type) -> list[int]:
+        """What stands for an output that is never present."""
+        return [self.constant(np.zeros(fixed(t.shape), DTYPES[t.dtype])) for _, t in leaves_of(type_)]
 
     def axis(self, call: CallNode) -> str | None:
         given = [self.graph.port(a.wire).type for a in call.arguments if a.wire is not None]

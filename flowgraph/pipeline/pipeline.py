@@ -197,8 +197,8 @@ class Pipeline:
         Args:
             inputs: a `Flight`, or for each input a `Series`, `(times, {leaf: array})` with int64 ns and a
                 leading axis, or an iterable of `(time, value)`.
-            **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress`, `passes` as in
-                `simulate`.
+            **options: `engine` ("reference" or "xla"), `dtype`, `init`, `state`, `progress`, `passes` and
+                `diverged` as in `simulate`.
         """
         result: Result = verb("Pipeline.run")(self, inputs, **options)
         return result

@@ -2,20 +2,53 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
+from flowgraph.recorder import ranges
+
 
 class _LinearAlgebra:
-    """`numpy.linalg`; `vecdot` is the ufunc itself, not its wrapper in Python."""
+    """`numpy.linalg`, where a singular matrix gives NaN; `vecdot` is the ufunc itself, not its wrapper."""
 
     vecdot = staticmethod(np.vecdot)
+
+    @staticmethod
+    def cholesky(x: Any, /) -> Any:
+        """`numpy.linalg.cholesky`; NaN where a matrix is not positive definite."""
+        try:
+            return np.linalg.cholesky(x)
+        except np.linalg.LinAlgError:
+            return _one_by_one(np.linalg.cholesky, np.shape(x), x)
+
+    @staticmethod
+    def solve(a: Any, b: Any, /) -> Any:
+        """`numpy.linalg.solve`; NaN where a matrix is singular."""
+        try:
+            return np.linalg.solve(a, b)
+        except np.linalg.LinAlgError:
+            if np.ndim(b) == 1:
+                return _LinearAlgebra.solve(a, np.asarray(b)[:, None])[..., 0]
+            lead = np.broadcast_shapes(np.shape(a)[:-2], np.shape(b)[:-2])
+            return _one_by_one(np.linalg.solve, lead + np.shape(b)[-2:], a, b)
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(np.linalg, name)
         setattr(self, name, found)
         return found
+
+
+def _one_by_one(function: Any, shape: tuple[int, ...], *matrices: Any) -> Any:
+    """`function` of stacks of matrices, with NaN for those that it refuses."""
+    found = np.full(shape, np.nan, np.result_type(*matrices))
+    lead = shape[:-2]
+    stacks = [np.broadcast_to(x, lead + np.shape(x)[-2:]) for x in matrices]
+    for at in np.ndindex(lead) if lead else ():
+        with suppress(np.linalg.LinAlgError):  # then it stays NaN
+            found[at] = function(*(x[at] for x in stacks))
+    return found
 
 
 class NumpyNamespace:
@@ -31,6 +64,19 @@ class NumpyNamespace:
     def reshape(x: Any, /, shape: Any, *, copy: bool | None = None) -> Any:
         """`numpy.reshape`."""
         return x.reshape(shape) if type(x) is np.ndarray and copy is None else np.reshape(x, shape, copy=copy)
+
+    @staticmethod
+    def astype(x: Any, dtype: Any, /, *, copy: bool = True) -> Any:
+        """`numpy.astype`, by the rule of pipelines for what does not fit; see `ranges`."""
+        return ranges.cast(np, x, dtype)
+
+    @staticmethod
+    def asarray(x: Any, /, *, dtype: Any = None, copy: bool | None = None) -> Any:
+        """`numpy.asarray`; what becomes a whole number does so as in `astype`."""
+        if dtype is None:
+            return np.asarray(x, copy=copy)
+        found = np.asarray(x)
+        return ranges.cast(np, found, dtype) if found.dtype != dtype else np.asarray(found, copy=copy)
 
     @staticmethod
     def argsort(x: Any, /, *, axis: int = -1) -> Any:

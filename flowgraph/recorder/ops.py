@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from flowgraph.recorder import ranges
 from flowgraph.types import DTYPES
 
 
@@ -292,7 +293,7 @@ def _run_int64(name: str) -> Callable[..., Any]:
 
 
 def _run_astype(xp: Any, x: Any, *, dtype: Any) -> Any:
-    return xp.asarray(x).astype(dtype)
+    return ranges.cast(xp, xp.asarray(x), dtype)
 
 
 def _run_shape(name: str) -> Callable[..., Any]:

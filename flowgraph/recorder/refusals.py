@@ -17,7 +17,8 @@ def caller() -> str:
 
 
 MACHINERY = tuple(
-    f"{__package__}.{name}" for name in ("ops", "refusals", "symbolic", "symbolic_namespace", "trace")
+    f"{__package__}.{name}"
+    for name in ("namespaces", "ops", "ranges", "refusals", "symbolic", "symbolic_namespace", "trace")
 )
 """Modules whose frames are not the user's code."""
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from flowgraph.recorder import ranges
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.refusals import refuse
 from flowgraph.types import DTYPES
@@ -56,7 +57,7 @@ class Symbolic:
             return self
         known = self.trace.constants.get(self.number)
         if known is not None:
-            return self.trace.constant(known.astype(DTYPES[dtype]))
+            return self.trace.constant(ranges.cast(np, known, DTYPES[dtype]))
         return self.trace.apply("astype", self, dtype=dtype)
 
     def __array_namespace__(self, *, api_version: str | None = None) -> Any:

@@ -40,7 +40,9 @@ class _Linalg:
         if name not in ("cholesky", "solve", "cross", "vecdot", "outer", "matmul", "matrix_transpose"):
             raise _not_listed(f"linalg.{name}")
         return (
-            getattr(namespace, name) if name in ("matmul", "matrix_transpose") else _recorder(name, np.linalg)
+            getattr(namespace, name)
+            if name in ("matmul", "matrix_transpose")
+            else _recorder(name, NUMPY.linalg)
         )
 
 
@@ -99,7 +101,7 @@ def _shaped(name: str, attr: str) -> Callable[..., Any]:
 
 
 def _astype(x: Any, dtype: Any, /) -> Any:
-    return x.cast(_kind(dtype)) if isinstance(x, Symbolic) else np.asarray(x).astype(dtype)
+    return x.cast(_kind(dtype)) if isinstance(x, Symbolic) else NUMPY.astype(x, dtype)
 
 
 def _kind(dtype: Any) -> str:
@@ -117,7 +119,7 @@ def _asarray(value: Any, /, *, dtype: Any = None) -> Any:
         refuse(
             "an array from a list of traced values", "xp.stack", "xp.asarray([...])", "write xp.stack([...])"
         )
-    return np.asarray(value, dtype=dtype)
+    return NUMPY.asarray(value, dtype=dtype)
 
 
 def _expand_dims(x: Any, /, *, axis: int = 0) -> Any:

@@ -23,6 +23,8 @@ from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.units import Unit
 from flowgraph.types import DTYPES, dtype_name
 
+_LEAST_NORMAL = float(np.finfo(np.float64).tiny)
+
 
 @dataclass(frozen=True)
 class Instruction:
@@ -34,6 +36,20 @@ class Instruction:
     out: int
     spec: Spec
     line: str
+
+
+def _need_normal(array: np.ndarray) -> None:
+    """Refuse subnormal constants: one engine keeps them where another takes them for 0."""
+    small = np.abs(array)
+    below = small[(small < _LEAST_NORMAL) & (small > 0)]
+    if below.size:
+        refuse(
+            "a constant is smaller than the normal numbers",
+            f"0, or {_LEAST_NORMAL:.3g} and more in size",
+            f"{below.min():g}",
+            "write 1e-300, or scale the quantity: compiled engines take such numbers for 0",
+            in_every_engine=True,
+        )
 
 
 class Trace:
@@ -68,6 +84,8 @@ class Trace:
         array = np.asarray(value)
         dtype = dtype_name(array)
         array = array.astype(DTYPES[dtype])
+        if array.dtype.kind == "f":
+            _need_normal(array)
         key = (array.tobytes(), array.shape, dtype)
         number = self._interned.get(key)
         if number is None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.batch import Batch
+from flowgraph.data.notes import note
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
@@ -192,7 +193,8 @@ def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...
     try:
         start = perf_counter()
         cases, seeds = [lane.case for lane in lanes], [lane.run.seed for lane in lanes]
-        results = simulate_together(cases, seeds, program, task.options.but(keep=keep))
+        options = task.options.but(keep=keep, diverged="count")  # one that diverges leaves the others be
+        results = simulate_together(cases, seeds, program, options)
         share = (perf_counter() - start) / len(lanes)
     except Exception as error:
         if len(lanes) == 1:
@@ -201,6 +203,9 @@ def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...
     found = []
     for lane, result in zip(lanes, results, strict=True):
         lane.times["run_s"] = share
+        if result.notes and task.options.diverged == "raise":
+            found.append(Done(lane.run.key, {**_named(lane.run), "error": "; ".join(result.notes)}))
+            continue
         try:
             found.append(_scored(task, lane, result))
         except Exception as error:
@@ -271,7 +276,8 @@ def _result(graph: Graph, batch: Batch, k: int) -> Result:
         leaves = iter([leaf[k] if whole else leaf[k][here] for leaf in runs.leaves.values()])
         time = runs.time if whole else runs.time[here]
         series[collected.name] = Series(time, unflatten(type_, leaves), type=type_, name=collected.name)
-    return Result(batch.graph, batch.engine, series, {}, {}, batch.ticks, 0.0)
+    notes = (note("diverged", batch.diverged[k]),) if k in batch.diverged else ()
+    return Result(batch.graph, batch.engine, series, {}, {}, batch.ticks, 0.0, notes)
 
 
 def _scored(task: Task, lane: _Lane, result: Result) -> Done:

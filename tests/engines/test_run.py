@@ -426,8 +426,10 @@ def test_an_error_in_a_graph_that_was_lowered_keeps_its_message():
     """Regression: the pipeline that is kept with the graph was taken for a plan."""
 
     @block
-    def root(x, *, xp):
-        return xp.linalg.cholesky(xp.reshape(x, (1, 1)))[0, 0]
+    def root(x):
+        if isinstance(x, np.generic):
+            raise RuntimeError("not while it is recorded")
+        return x
 
     @graph
     def g(x: Stream[Scalar]):
@@ -435,7 +437,7 @@ def test_an_error_in_a_graph_that_was_lowered_keeps_its_message():
 
     built = g.build()
     lower(built)
-    with pytest.raises(np.linalg.LinAlgError) as error:
+    with pytest.raises(RuntimeError) as error:
         simulate(built, {"x": scalars([0], [-1.0])})
     assert error.value.__notes__ == ["in g, at root, t = 0 ns"]
 

@@ -43,8 +43,7 @@ def threaded(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> Ma
         given = rows if rows is not None else _rows(c, events)
         rooms = [output.room(n, c, events) for output in outputs]
         counts, made = c.advance(state, events.time, events.key, given, rooms)
-        if pipeline.faults:
-            runs.finish(state.after())
+        runs.finish(n, state.after())
         for output, room, count in zip(outputs, rooms, counts, strict=False):
             output.came(n, events, room, count, made)
         return len(events.time)

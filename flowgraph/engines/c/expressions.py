@@ -129,8 +129,7 @@ class Expressions:
         if dtype == "bool":
             return f"{arg} != 0"
         if kind == "real" and dtype != "real":
-            whole = f"{self.helper('fg_whole')}({arg})"
-            return f"({ctype(dtype, self.real)}){whole}"
+            return f"{self.helper('fg_whole_' + dtype)}({arg})"
         return f"({ctype(dtype, self.real)}){arg}"
 
     def _extreme(self, op: str, dtype: str, args: Sequence[str]) -> str:

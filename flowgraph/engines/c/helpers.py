@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from flowgraph.engines.c.syntax import number
 from flowgraph.engines.c.vector_math import vector_texts
 from flowgraph.recorder.random import ROUNDS, segments
@@ -23,17 +25,9 @@ def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
     """Helper -> (what it needs, text)."""
     start, slope = segments()
     f = "" if real == "double" else "f"
-    least, unit, step = (number(x, "real", real) for x in (-(2.0**63), 2.0**-22, 2.0**-24))
+    unit, step, half = (number(x, "real", real) for x in (2.0**-22, 2.0**-24, 0.5))
     found: dict[str, tuple[tuple[str, ...], str]] = {
         **vector_texts(real),
-        "fg_whole": (
-            (),
-            f"""/* a whole number from a real one, without undefined behaviour outside the range */
-static inline int64_t fg_whole({real} x) {{
-    return (x >= {least} && x < -{least}) ? (int64_t)x : INT64_MIN;
-}}
-""",
-        ),
         "fg_clip": (
             (),
             """static inline int32_t fg_clip(int64_t at, int32_t size) {
@@ -51,9 +45,14 @@ static inline int64_t fg_whole({real} x) {{
 """,
         ),
         "fg_floor_divide": (
-            ("fg_remainder",),
-            f"""static inline {real} fg_floor_divide({real} a, {real} b) {{
-    return b == 0 ? a / b : rint{f}((a - fg_remainder(a, b)) / b);
+            (),
+            f"""/* the quotient rounded down */
+static inline {real} fg_floor_divide({real} a, {real} b) {{
+    const {real} r = fmod{f}(a, b);
+    const {real} q = (a - r) / b - (r != 0 && (r < 0) != (b < 0));
+    const {real} down = floor{f}(q);
+    if (b == 0) return a / b;
+    return q != 0 ? (q - down > {half} ? down + 1 : down) : copysign{f}(0, a / b);
 }}
 """,
         ),
@@ -198,6 +197,19 @@ static FG_INLINE void fg_philox(uint32_t even[2], uint32_t odd[2], uint32_t key0
 """,
         ),
     }
+    for kind in ("int32", "int64", "uint32", "uint64"):
+        limits = np.iinfo(kind)
+        low, over = (number(float(x), "real", real) for x in (limits.min, limits.max + 1))
+        name = f"UINT{limits.bits}" if kind.startswith("u") else f"INT{limits.bits}"
+        least = "0" if kind.startswith("u") else f"{name}_MIN"
+        found[f"fg_whole_{kind}"] = (
+            (),
+            f"""/* a whole number from a real one: the nearest there is, and 0 for NaN */
+static inline {kind}_t fg_whole_{kind}({real} x) {{
+    return x >= {low} ? (x < {over} ? ({kind}_t)x : {name}_MAX) : (x < {low} ? {least} : 0);
+}}
+""",
+        )
     for kind in ("normal", "uniform"):
         found[f"fg_{kind}"] = (
             ("fg_philox", f"fg_one_{kind}"),

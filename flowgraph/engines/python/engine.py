@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from flowgraph.data.inputs import Inputs
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result
+from flowgraph.data.series import Series
+from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.contract import BlockEngine
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.python.run import Run
-from flowgraph.errors import DeclarationError
+from flowgraph.engines.state import load_registers
+from flowgraph.engines.subject import LoweredGraph
+from flowgraph.engines.trouble import Playback, all_finite, gaps_of, settled
+from flowgraph.errors import DeclarationError, FifoOverflowError, LoweringError
 from flowgraph.language.graph import Graph
+from flowgraph.pipeline.lowering import lower
 
 
 class PythonEngine(BlockEngine):
@@ -36,8 +45,58 @@ class PythonEngine(BlockEngine):
             )
 
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
-        run = Run(graph, inputs, init=options.init, state=options.state, seed=options.seed)  # type: ignore[arg-type]
-        return run.to_end(options.progress).result()
+        given, kept = _kept(inputs)
+        run, error = _started(graph, given, options), None
+        try:
+            run.to_end(options.progress)
+        except FifoOverflowError as full:
+            error = full
+        result = run.result()
+        if error is None and all_finite(result):
+            return result
+        return settled(result, _playback(graph, kept, options), options.diverged, error)
+
+
+def _started(graph: Graph, inputs: Inputs, options: RunOptions) -> Run:
+    return Run(graph, inputs, init=options.init, state=options.state, seed=options.seed)  # type: ignore[arg-type]
+
+
+def _playback(graph: Graph, kept: Callable[[], Inputs], options: RunOptions) -> Playback:
+    """The run again, with what is known of it from its lowered form, where it has one."""
+    hosted = any(call.block.host for _, call in graph.calls)
+    last = None if options.state is None else load_registers(graph, options.state)[1]
+
+    def events() -> Tape:
+        return tape(prepare(graph, kept(), last), graph)
+
+    def again(ticks: int) -> Result:
+        return _started(graph, kept(), options).to_end(most=ticks).result()
+
+    try:
+        pipeline = lower(graph)
+    except LoweringError:
+        return Playback(None, (), {}, events, None if hosted else again)
+    if hosted:  # its blocks must not do what they do a second time
+        return Playback(pipeline, [c.reset for r in pipeline.registers for c in r.cells], {}, events, None)
+    gaps = gaps_of(events(), list(graph.sources))
+    return Playback(pipeline, LoweredGraph(graph).start(options).cells, gaps, events, again)
+
+
+def _kept(inputs: Inputs) -> tuple[Inputs, Callable[[], Inputs]]:
+    """Inputs to be read now, and a function that gives as much of them again."""
+    if not isinstance(inputs, Mapping):
+        return inputs, lambda: inputs
+    read: dict[str, list[Any]] = {
+        n: [] for n, v in inputs.items() if isinstance(v, Iterable) and not isinstance(v, Series | tuple)
+    }
+    now = {n: _noted(v, read[n]) if n in read else v for n, v in inputs.items()}
+    return now, lambda: {n: list(read[n]) if n in read else v for n, v in inputs.items()}
+
+
+def _noted(events: Iterable[Any], into: list[Any]) -> Iterator[Any]:
+    for event in events:
+        into.append(event)
+        yield event
 
 
 ENGINE = PythonEngine()

@@ -6,6 +6,7 @@ plain tree of arrays, which can be saved, loaded and resumed to the same bits.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,11 +18,12 @@ from typing import Any, NoReturn
 from flowgraph.data.inputs import Inputs, check_event, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
-from flowgraph.data.tape import batches, merged, stack
+from flowgraph.data.tape import batches, merged, need_near, stack
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
-from flowgraph.errors import DataError, FifoOverflowError, UnknownNameError
+from flowgraph.engines.trouble import overflow_error
+from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
@@ -58,6 +60,7 @@ class Run:
         self._key = seed_words(seed)
         self._stopped: int | None = None
         self._busy, self._thread = Lock(), 0
+        self._first: int | None = None
         check_start(init, state, path=graph.name)
         if state is not None:
             self.state = state
@@ -143,6 +146,8 @@ class Run:
                 got=f"{time} ns",
                 fix="push all events of one time in one call, in order",
             )
+        self._first = time if self._first is None else self._first
+        need_near(self._first, time)
         for queue, value in checked:
             queue.append(value)
         try:
@@ -153,11 +158,11 @@ class Run:
             self._stopped = None  # this tick did not happen; the next may be pushed
             raise
 
-    def to_end(self, meter: Meter | None = None) -> Run:
-        """Run until the inputs end, telling `meter` now and then."""
+    def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
+        """Run until the inputs end, or for `most` ticks, telling `meter` now and then."""
         with self._alone("to_end"):
             self._refuse_if_stopped()
-            for batch in batches(self._ticks, _BATCH if self._recorded else 1):
+            for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
                 self._advance(batch)
                 if meter is not None:
                     meter.update(self.ticks, self.time)
@@ -246,7 +251,8 @@ class Run:
     def _overflow(self, index: int, time: int) -> NoReturn:
         call = self.graph.nodes[index]
         assert isinstance(call, CallNode)
-        raise overflow_error(call, time)
+        message = call.block.fault[1] if call.block.fault else "a queue is full"
+        raise overflow_error(message, call.path, call.settings.get("size"), time)
 
     @property
     def state(self) -> dict[str, Any]:
@@ -291,15 +297,3 @@ class _Reactions(dict[int, Callable[[int], None]]):
     def __missing__(self, key: int) -> Callable[[int], None]:
         self[key] = bound(plan(self._graph, key), self._names)
         return self[key]
-
-
-def overflow_error(call: CallNode, time: int) -> FifoOverflowError:
-    """The error of a queue that was full at `time`."""
-    size = call.settings.get("size")
-    return FifoOverflowError(
-        call.block.fault[1] if call.block.fault else "a queue is full",
-        path=call.path,
-        expected=f"at most {size} waiting values of one stream",
-        got=f"one more at t = {time} ns",
-        fix="raise size=, or look why the other stream is silent",
-    )

@@ -56,7 +56,7 @@ def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> 
         chunks.append(parts)
         done = min((n + 1) * size, len(seeds))
         for row in range(done - n * size):
-            runs.finish([cell[row] for cell in last])
+            runs.finish(members[row], [cell[row] for cell in last])
         if options.progress is not None:
             options.progress.update(done, 0)
     series = {

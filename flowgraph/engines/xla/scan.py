@@ -20,6 +20,7 @@ from flowgraph.errors import MissingDependencyError
 from flowgraph.pipeline.optimise import ARRAYS, optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder import ranges
 from flowgraph.recorder.ops import OPS, bound_attrs
 
 _MOST_PATTERNS = 8
@@ -52,15 +53,46 @@ def chosen_device() -> str:
     return str(import_jax().config.jax_default_device)
 
 
-class _JaxNamespace:
-    """`jax.numpy` with the two operations that pipelines add to it, and a faster `take`."""
+class _JaxLinearAlgebra:
+    """`jax.numpy.linalg`, where a singular matrix gives NaN throughout, as in the other engines."""
 
     def __init__(self, jax: Any) -> None:
         self._jax = jax
 
+    def cholesky(self, x: Any) -> Any:
+        jnp = self._jax.numpy
+        lower = jnp.linalg.cholesky(x)
+        last = lower[..., -1:, -1:]  # NaN where a pivot was not positive
+        return jnp.where(jnp.isnan(last), last, lower)
+
+    def solve(self, a: Any, b: Any) -> Any:
+        jnp = self._jax.numpy
+        x = jnp.linalg.solve(a, b)
+        axes = -1 if b.ndim == 1 else (-2, -1)
+        fits = jnp.isfinite(a).all(axis=(-2, -1)) & jnp.isfinite(b).all(axis=axes)
+        singular = fits & ~jnp.isfinite(x).all(axis=axes)
+        return jnp.where(singular[..., None] if b.ndim == 1 else singular[..., None, None], jnp.nan, x)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jax.numpy.linalg, name)
+
+
+class _JaxNamespace:
+    """`jax.numpy` with the operations that pipelines add to it or define further, and a faster `take`."""
+
+    def __init__(self, jax: Any) -> None:
+        self._jax = jax
+        self.linalg = _JaxLinearAlgebra(jax)
+
     def float32_bits(self, x: Any) -> Any:
         jnp = self._jax.numpy
         return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
+
+    def floor_divide(self, a: Any, b: Any) -> Any:
+        return ranges.floor_divide(self._jax.numpy, a, b)
+
+    def remainder(self, a: Any, b: Any) -> Any:
+        return ranges.remainder(self._jax.numpy, a, b)
 
     def materialise(self, x: Any) -> Any:
         return self._jax.lax.optimization_barrier(x)

@@ -1,0 +1,48 @@
+"""Operations outside their range: one rule for every engine, where IEEE and C leave it open.
+
+A real number becomes a whole one by cutting off its fraction; beyond the range it becomes the nearest end of
+it, and NaN becomes 0. A quotient or remainder of whole numbers by 0 is 0. A quotient of reals that is rounded
+down is what NumPy gives: x // 0 is x / 0, and -1 // inf is -1. A shift by as many bits as there are, or
+more, leaves 0, or -1 of a negative number shifted right. docs/semantics.md has the table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def cast(xp: Any, x: Any, dtype: Any) -> Any:
+    """`x` as another kind of number; reals saturate where they become whole ones."""
+    kind = np.dtype(dtype)
+    x = x if hasattr(x, "dtype") else xp.asarray(x)
+    return _whole(xp, x, kind) if x.dtype.kind == "f" and kind.kind in "iu" else x.astype(kind)
+
+
+def _whole(xp: Any, x: Any, kind: np.dtype[Any]) -> Any:
+    limits = np.iinfo(kind)
+    least, beyond = x.dtype.type(limits.min), x.dtype.type(2.0 ** (limits.bits - (kind.kind == "i")))
+    fits = (x >= least) & (x < beyond)  # False for NaN
+    inside = xp.where(fits, x, x.dtype.type(0)).astype(kind)
+    low, high = kind.type(limits.min), kind.type(limits.max)
+    found = xp.where(x >= beyond, high, xp.where(x < least, low, inside))
+    return found[()] if isinstance(found, np.ndarray) and not found.ndim else found
+
+
+def floor_divide(xp: Any, a: Any, b: Any) -> Any:
+    """The quotient rounded down, in a namespace whose own may have another rule than NumPy's."""
+    a, b = xp.asarray(a), xp.asarray(b)
+    zero = b == 0
+    if b.dtype.kind == "f":
+        return xp.where(zero, a / b, xp.floor_divide(a, b))
+    return xp.where(zero, 0, xp.floor_divide(a, xp.where(zero, 1, b)))
+
+
+def remainder(xp: Any, a: Any, b: Any) -> Any:
+    """The remainder that has the divisor's sign; of whole numbers by 0 it is 0."""
+    a, b = xp.asarray(a), xp.asarray(b)
+    if b.dtype.kind == "f":
+        return xp.remainder(a, b)
+    zero = b == 0
+    return xp.where(zero, 0, xp.remainder(a, xp.where(zero, 1, b)))
