@@ -53,12 +53,13 @@ class Names:
 
 def names_of(pipeline: Pipeline) -> Names:
     """Identifiers for everything in a pipeline, each once in its scope."""
-    ports = unique((_port(p.name) for p in (*pipeline.inputs, *pipeline.outputs)), PORTS)
+    module = _module(pipeline.name)
+    ports = unique((_port(p.name, module) for p in (*pipeline.inputs, *pipeline.outputs)), PORTS)
     split = len(pipeline.inputs)
     cells = unique((_member(_cell_name(r.path, c.name)) for r in pipeline.registers for c in r.cells), _CELLS)
     places = iter(cells)
     return Names(
-        _module(pipeline.name),
+        module,
         tuple(ports[:split]),
         tuple(tuple(unique(_member(leaf.name) for leaf in p.leaves)) for p in pipeline.inputs),
         tuple(ports[split:]),
@@ -72,8 +73,10 @@ def _module(text: str) -> str:
     return f"g_{name}" if name.lower() in _MODULES else name
 
 
-def _port(text: str) -> str:
+def _port(text: str, module: str) -> str:
     name = identifier(text)
+    if module.isupper():
+        name = name.lower()  # or the struct MODULE_PORT and the bit of the port would be one word
     return f"{name}_2" if name.lower().endswith("_t") else name
 
 

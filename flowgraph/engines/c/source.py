@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -183,7 +184,7 @@ class _File:
             must, may = must | (text == "true") << k, may | 1 << k
         self.presence[key] = must, may
         body.append("    return made;")
-        all_text = "\n".join(body)
+        all_text = re.sub(r"/\*.*?\*/", "", "\n".join(body))
         unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
         head = [f"    (void){n};" for n in unused]
         return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
@@ -353,8 +354,6 @@ class _File:
 
 
 def _names_it(text: str, name: str) -> bool:
-    import re
-
     return re.search(rf"(?<![A-Za-z0-9_>.]){re.escape(name)}\b", text) is not None
 
 
