@@ -8,10 +8,10 @@ from rooms before it in this list, never from one after it, and nothing goes in 
     The ground
       geometry     rotations, angles, curved states, places on the Earth
       metrics      errors against a truth, and what an honest filter's would be
-      inertial     an inertial unit: prediction, aiding, alignment, calibration
-    Methods, which know nothing of bodies
-      kalman       linear, extended, on roots; smoothing
+    Methods
+      kalman       linear, extended, on roots; smoothing; a gate's way back
       unscented    sigma points
+      inertial     an inertial unit: prediction, aiding, alignment, calibration
       particles    clouds, resampling, Rao-Blackwell
     What is estimated
       vision       cameras and tags, and the poses that they give
@@ -37,9 +37,9 @@ __all__ = [
     "signals",
     "geometry",
     "metrics",
-    "inertial",
     "kalman",
     "unscented",
+    "inertial",
     "particles",
     "vision",
     "models",

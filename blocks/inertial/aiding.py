@@ -1,8 +1,8 @@
 """Aiding: correct an inertial belief with positions and attitudes, where there are any.
 
 Each block takes a prior and an optional measurement. Without one the prior passes through and there is no
-innovation. With one, the error state is estimated by a Kalman update in Joseph form, folded into the nominal
-state, and reset.
+innovation; an entry that is NaN was not measured, and the others correct alone. With one, the error state is
+estimated by a Kalman update in Joseph form, folded into the nominal state, and reset.
 
 Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, sec. 7:
 update eqs. 275-276, injection eq. 283, reset eqs. 286-287 for the right (local) attitude error.
@@ -23,8 +23,8 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.metrics.chi_square import gate_table
-from flowgraph.blocks.signals import Attitude, Belief, Innovation, Position
+from flowgraph.blocks.kalman.filters import accepts, masked
+from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
 __all__ = ["aid_attitude", "aid_position"]
 
@@ -58,7 +58,7 @@ def aid_position(
     lever: tuple[float, float, float] = ORIGIN,
     gate: float | None = None,
     xp: Any,
-) -> tuple[Belief, Innovation | None]:
+) -> tuple[Belief, KalmanInnovation | None]:
     """Correct a belief with the measured position of a point fixed to the body.
 
     z = p + R(q) lever + noise, so H = [I, 0, -R skew(lever), 0, 0] and residual = z - p - R lever.
@@ -68,8 +68,8 @@ def aid_position(
         position: z, m in the world; or absent.
         noise: standard deviation, m.
         lever: the point in body coordinates, m.
-        gate: when given, a measurement with a nis above it changes nothing (for three axes 16.3 is 99.9 %);
-            below 1 it is that probability, such as 0.999.
+        gate: when given, a measurement that is too far off changes nothing; see `update_linear`. (For three
+            axes a nis of 16.3 is 99.9 %.)
 
     Returns:
         The posterior, and the innovation (m, world) where there was a measurement.
@@ -79,11 +79,10 @@ def aid_position(
     kind = prior.position.dtype
     R = to_matrix(prior.attitude, xp=xp)
     arm = xp.asarray(lever, dtype=kind)
-    residual = position.position - prior.position - (R @ arm[..., None])[..., 0]
+    apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
-    return posterior, Innovation(residual=residual, covariance=S, nis=nis)
+    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, xp)
 
 
 @block
@@ -95,7 +94,7 @@ def aid_attitude(
     mount: tuple[float, float, float, float] = ALIGNED,
     gate: float | None = None,
     xp: Any,
-) -> tuple[Belief, Innovation | None]:
+) -> tuple[Belief, KalmanInnovation | None]:
     """Correct a belief with a measured attitude.
 
     z = q * Exp(noise) * mount; residual = Log(q^-1 * z * mount^-1) and H = [0, 0, I, 0, 0], to first order.
@@ -113,11 +112,10 @@ def aid_attitude(
     if attitude is None:
         return prior, None
     kind = prior.position.dtype
-    residual = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
-    zero = 0.0 * (residual[..., :, None] * residual[..., None, :])
+    apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
+    zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    posterior, S, nis = _correct(prior, residual, H, _variance(noise, kind, xp), gate, xp)
-    return posterior, Innovation(residual=residual, covariance=S, nis=nis)
+    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, xp)
 
 
 def _variance(noise: Spread, kind: Any, xp: Any) -> Array:
@@ -133,18 +131,22 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
 
 
 def _correct(
-    prior: Belief, residual: Array, H: Array, R: Array, gate: float | None, xp: Any
-) -> tuple[Belief, Array, Array]:
-    """The update every measurement shares: (posterior, innovation covariance, nis)."""
+    prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, xp: Any
+) -> tuple[Belief, KalmanInnovation]:
+    """The update every measurement shares: the posterior and the innovation, of the known entries."""
     P = prior.covariance
+    present = ~xp.isnan(apart)
+    residual = xp.where(present, apart, 0.0)
+    H, R = masked(H, R, present, xp)
     HP = H @ P
     S = HP @ H.mT + R
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., 15:])[..., 0, 0]
+    accepted = accepts(nis, gate, present, xp)
     K = solved[..., :15].mT
     if gate is not None:
-        K = K * xp.astype(nis <= float(gate_table(gate, 3)[3]), K.dtype)[..., None, None]
+        K = K * xp.astype(accepted, K.dtype)[..., None, None]
     d = (K @ column)[..., 0]
     one = xp.eye(15, dtype=P.dtype)
     turn = d[..., 6:9]
@@ -160,4 +162,6 @@ def _correct(
         accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],
         covariance=0.5 * (P + P.mT),
     )
-    return posterior, S, nis
+    parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
+    innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
+    return posterior, innovation

@@ -159,14 +159,15 @@ def correct(
 
     Args:
         P: prior covariance (..., t, t).
-        residual: (..., m); 0 where an entry is missing.
+        residual: (..., m); NaN, or 0 and not `present`, where an entry is missing.
         H: Jacobian (..., m, t).
         R: covariance of the noise (..., m, m).
         present: (..., m) which entries there are; None: all.
         gate, space: as in `update_linear`.
     """
     if present is None:
-        present = residual == residual
+        present = ~xp.isnan(residual)
+        residual = xp.where(present, residual, 0.0)
     H, R = masked(H, R, present, xp)
     HP = H @ P
     S = HP @ H.mT + R

@@ -38,7 +38,8 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
 
     Returns:
         nis_mean, per measured number, 1 in a consistent filter; nis_low and nis_high, the band of that mean;
-        nis_inside, the fraction of single values in their own band; nis_count; nis_rejected, by a gate.
+        nis_inside, the fraction of single values in their own band; nis_count; and, where the innovations say
+        what a gate `accepted`, nis_rejected.
     """
     values = innovation["nis"]
     width = innovation["residual"].shape[-1]
@@ -46,15 +47,16 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     tail = 0.5 * (1.0 - probability)
     total = max(float(parts.sum()), 1.0)
     within = (values >= chi_square(tail, parts)) & (values <= chi_square(1.0 - tail, parts))
-    accepted = innovation["accepted"] if "accepted" in innovation.leaves else np.ones(len(values), dtype=bool)
-    return {
+    found = {
         "nis_mean": float(values.sum() / total),
         "nis_low": float(chi_square(tail, total) / total),
         "nis_high": float(chi_square(1.0 - tail, total) / total),
         "nis_inside": float(np.mean(within)) if len(values) else float("nan"),
         "nis_count": float(len(values)),
-        "nis_rejected": float(np.sum(~accepted)),
     }
+    if "accepted" in innovation.leaves:
+        found["nis_rejected"] = float(np.sum(~innovation["accepted"]))
+    return found
 
 
 def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:

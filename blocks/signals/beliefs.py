@@ -13,7 +13,6 @@ __all__ = [
     "GaussianRoot",
     "KalmanInnovation",
     "Belief",
-    "Innovation",
     "PointBelief",
     "PoseBelief",
     "QuaternionBelief",
@@ -70,18 +69,6 @@ class Belief(Signal):
     gyro_bias: Array = real(3, unit="rad/s", frame="body")
     accelerometer_bias: Array = real(3, unit="m/s^2", frame="body")
     covariance: Array = real(15, 15)
-
-
-class Innovation(Signal):
-    """What a three-part measurement said beyond its prediction.
-
-    residual: measured minus predicted (m in the world, or rad in the body); covariance: of the residual, as
-    the filter expects it; nis: normalised innovation squared, r^T covariance^-1 r, 3 on average.
-    """
-
-    residual: Array = real(3)
-    covariance: Array = real(3, 3)
-    nis: Array = real()
 
 
 class PointBelief(Signal):
