@@ -28,6 +28,7 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.data.export import write_tum
+from flowgraph.data.files import put
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
@@ -170,7 +171,7 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
     with writing(out / "diagram.svg") as file, without_font_warnings():
         case.graph.draw(str(file))
     with writing(out / "metrics.json") as file:
-        file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+        put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
     if case.estimate not in result.series:
         return
     estimate = result[case.estimate]
