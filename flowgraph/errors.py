@@ -8,9 +8,17 @@ finds the same thing in the same place each time.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def plain(words: str) -> str:
+    """Text that does nothing to a terminal: what would steer it is spelled out, but for ends of lines and tabs."""
+    return _CONTROL.sub(lambda m: m[0].encode("unicode_escape").decode(), words)
 
 
 class FlowgraphError(Exception):
@@ -47,7 +55,7 @@ class FlowgraphError(Exception):
         for label, part in parts.items():
             if part is not None:
                 lines.append(f"  {label + ':':<10}{part}")
-        return "\n".join(lines)
+        return plain("\n".join(lines))
 
 
 class DeclarationError(FlowgraphError):

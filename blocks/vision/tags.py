@@ -22,6 +22,8 @@ from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["TagMap", "course_map", "grid_map", "tags_series"]
 
+_DAMAGE = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
+
 
 @dataclass(frozen=True)
 class TagMap:

@@ -34,7 +34,7 @@ from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
 from flowgraph.engines.simulate import simulate
-from flowgraph.errors import DataError, FlowgraphError, writes
+from flowgraph.errors import DataError, FlowgraphError, plain, writes
 
 
 @app.command("list")
@@ -64,7 +64,7 @@ def show(
     """Draw a graph: in the terminal, or to a file."""
     built, _ = graph_of(graph, data, settings, seed)
     if output is None:
-        print(built.text())
+        print(plain(built.text()))
         return
     with writing(output), without_font_warnings():
         built.draw(str(output))
