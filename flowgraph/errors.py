@@ -17,7 +17,7 @@ _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud
 
 
 def plain(words: str) -> str:
-    """Text that does nothing to a terminal: what would steer it is spelled out, but for ends of lines and tabs."""
+    """Text that steers no terminal: characters that would are spelled out, but for ends of lines and tabs."""
     return _CONTROL.sub(lambda m: m[0].encode("unicode_escape").decode(), words)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
-from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
 
@@ -176,7 +176,23 @@ def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None 
     """
     kind, _, argument = spec.partition(":")
     load: Callable[..., Flight] = find_entry("flowgraph.flights", kind)
-    return load(argument, seed=seed, settings=dict(settings or {}))
+    try:
+        return load(argument, seed=seed, settings=dict(settings or {}))
+    except FlowgraphError:
+        raise
+    except Exception as error:  # of a damaged file a library may say anything
+        why = (
+            "more memory than there is"
+            if isinstance(error, MemoryError)
+            else f"{type(error).__name__}: {error}"
+        )
+        raise DataError(
+            "this recording cannot be read",
+            path=spec,
+            expected=f"a whole recording of the kind {kind}",
+            got=why[:300],
+            fix="restore the file; if it is whole, please report it to the package that reads this kind",
+        ) from error
 
 
 def flight_settings(spec: str) -> list[str]:
