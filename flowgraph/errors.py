@@ -104,12 +104,13 @@ class UnknownNameError(FlowgraphError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str], *, path: str | None = None) -> None:
         names = sorted(valid)
-        near = difflib.get_close_matches(str(name), names, n=1)
+        said = str(name) if len(str(name)) <= 200 else f"{str(name)[:200]}..."
+        near = difflib.get_close_matches(said, names, n=1)
         super().__init__(
-            f"no {kind} is called {str(name)!r}",
+            f"no {kind} is called {said!r}",
             path=path,
             expected="one of " + ", ".join(names) if names else f"no {kind} exists here",
-            got=repr(name),
+            got=repr(said),
             fix=f"did you mean {near[0]!r}?" if near else f"use one of the {kind} names above",
         )
         self.valid = names

@@ -26,7 +26,7 @@ from flowgraph.data.files import text_of
 from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError
 
 Value = bool | int | float | str
 Point = Mapping[str, Value]
@@ -191,7 +191,11 @@ class Study:
             ) from None
         if not isinstance(found, dict):
             raise _wrong(str(path), "a table of keys", type(found).__name__)
-        return cls.from_mapping(found)
+        try:
+            return cls.from_mapping(found)
+        except FlowgraphError as error:
+            error.path = f"{path}, {error.path}" if error.path else str(path)
+            raise
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, Any]) -> Study:
