@@ -148,6 +148,7 @@ def _member(content: bytes, rng: Random) -> bytes:
     else:
         members[at] = (name, _flip(array, rng))
     made = io.BytesIO()
+    members = list(dict(members).items())
     with zipfile.ZipFile(made, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for name, array in members:
             archive.writestr(name, array)
