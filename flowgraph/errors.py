@@ -8,12 +8,20 @@ finds the same thing in the same place each time.
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def plain(words: str) -> str:
+    """Text that steers no terminal: characters that would are spelled out, but for ends of lines and tabs."""
+    return _CONTROL.sub(lambda m: m[0].encode("unicode_escape").decode(), words)
 
 
 class FlowgraphError(Exception):
@@ -50,7 +58,7 @@ class FlowgraphError(Exception):
         for label, part in parts.items():
             if part is not None:
                 lines.append(f"  {label + ':':<10}{part}")
-        return "\n".join(lines)
+        return plain("\n".join(lines))
 
 
 class DeclarationError(FlowgraphError):
@@ -122,12 +130,13 @@ class UnknownNameError(FlowgraphError):
 
     def __init__(self, kind: str, name: object, valid: Iterable[str], *, path: str | None = None) -> None:
         names = sorted(valid)
-        near = difflib.get_close_matches(str(name), names, n=1)
+        said = str(name) if len(str(name)) <= 200 else f"{str(name)[:200]}..."
+        near = difflib.get_close_matches(said, names, n=1)
         super().__init__(
-            f"no {kind} is called {str(name)!r}",
+            f"no {kind} is called {said!r}",
             path=path,
             expected="one of " + ", ".join(names) if names else f"no {kind} exists here",
-            got=repr(name),
+            got=repr(said),
             fix=f"did you mean {near[0]!r}?" if near else f"use one of the {kind} names above",
         )
         self.valid = names

@@ -13,6 +13,7 @@ Source: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from flowgraph.blocks.datasets.tables import POLICIES, read_table
 from flowgraph.blocks.geometry.rotations import conjugate, multiply
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
+from flowgraph.data.files import text_of
 from flowgraph.errors import DataError
 
 __all__ = ["LEICA_LEVER", "SETTINGS", "load"]
@@ -186,8 +188,20 @@ def _need(file: Path, what: str) -> Path:
     return file
 
 
+_MOST_YAML = 2**20
+"""Bytes of the description of a sensor."""
+
+
 class _Loader(yaml.SafeLoader):
-    """The safe loader, which takes OpenCV's matrices for the mappings that they are."""
+    """The safe loader, which takes OpenCV's matrices for the mappings that they are.
+
+    It has no aliases, which a few lines could make stand for gigabytes.
+    """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it holds an alias")
+        return super().compose_node(parent, index)
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
@@ -199,16 +213,16 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 def _yaml(file: Path) -> dict[str, Any]:
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        text = text_of(file, most=_MOST_YAML)
         if text.startswith("%YAML:"):  # as OpenCV writes it; YAML itself has a space there
             text = text.partition("\n")[2]
         content = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise DataError(
             "this is not readable as YAML",
             path=str(file),
             expected="a mapping, as EuRoC's sensor.yaml",
-            got=str(error).splitlines()[0],
+            got=(str(error).splitlines() or [type(error).__name__])[0][:300],
             fix="restore the file of the sequence",
         ) from error
     if not isinstance(content, dict):
@@ -226,14 +240,14 @@ def _number(content: Mapping[str, Any], name: str, file: Path) -> float:
     value = content.get(name)
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]  # YAML 1.1 reads 1e-4 as a string
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number) or number <= 0.0:
         raise DataError(
             f"{name!r} is missing or not a positive number",
             path=str(file),
             expected=f"{name}: a positive number; of " + ", ".join([*_NOISE.values(), "rate_hz"]),
-            got=repr(value),
+            got=reprlib.repr(value),
             fix="restore the file of the sequence",
         )
     return number
@@ -264,7 +278,7 @@ def _extrinsics(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]] | Non
         if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)):
             raise ValueError("its 3 x 3 part is no rotation")
         w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)[[3, 0, 1, 2]].tolist()
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
             "T_BS is missing or malformed",
             path=str(file),

@@ -17,17 +17,19 @@ import numpy as np
 
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount, course_mount
 from flowgraph.blocks.vision.tags import TagMap, course_map, grid_map
+from flowgraph.data.files import content_of
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["Parameters", "parse_parameters"]
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_MOST = 2**20  # bytes of such a file
+_NUMBER = r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?"  # possessive: thousands of digits are one try
 _ANGLE = re.compile(
     rf"yaw\s*[=:]\s*(?P<sign>-?)\s*"
     rf"(?:(?P<pi>pi)\s*(?:/\s*(?P<by>{_NUMBER}))?|(?P<number>{_NUMBER}))",
     re.IGNORECASE,
 )
-_LENGTH = re.compile(rf"(?P<value>{_NUMBER})\s*m\b")
+_LENGTH = re.compile(rf"(?<!\d)(?P<value>{_NUMBER})\s*m\b")
 _COLUMNS = re.compile(r"(\d+)\s*(?:and|-|to|,)\s*(\d+)")
 
 
@@ -61,7 +63,7 @@ def parse_parameters(file: str | Path) -> Parameters:
     """
     file = Path(file)
     try:
-        text = file.read_text(encoding="utf-8-sig", errors="replace")
+        text = content_of(file, most=_MOST).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise DataError(
             "the parameters cannot be read",

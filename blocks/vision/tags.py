@@ -17,9 +17,12 @@ import numpy.typing as npt
 
 from flowgraph import Series
 from flowgraph.blocks.signals import Tags
+from flowgraph.data.files import put, text_of
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["TagMap", "course_map", "grid_map", "tags_series"]
+
+_DAMAGE = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -67,9 +70,13 @@ class TagMap:
         return type(self)(self.ids[keep], self.corners[keep])
 
     def save(self, file: str | Path) -> None:
-        """Write the map as JSON: {"tags": [{"id": 7, "corners": [[x, y, z], ...]}, ...]}, m."""
+        """Write the map as JSON: {"tags": [{"id": 7, "corners": [[x, y, z], ...]}, ...]}, m.
+
+        Raises:
+            OutputError: where the file cannot be written.
+        """
         tags = [{"id": int(i), "corners": c.tolist()} for i, c in zip(self.ids, self.corners, strict=True)]
-        Path(file).write_text(json.dumps({"unit": "m", "tags": tags}, indent=1) + "\n", encoding="utf-8")
+        put(file, json.dumps({"unit": "m", "tags": tags}, indent=1) + "\n")
 
     @classmethod
     def load(cls, file: str | Path) -> Self:
@@ -79,9 +86,17 @@ class TagMap:
             DataError: where the file is missing or of another form.
         """
         try:
-            tags = json.loads(Path(file).read_text(encoding="utf-8"))["tags"]
+            tags = json.loads(text_of(file))["tags"]
             return cls(np.array([t["id"] for t in tags]), np.array([t["corners"] for t in tags], dtype=float))
-        except (OSError, ValueError, TypeError, KeyError, DeclarationError) as error:
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            LookupError,
+            ArithmeticError,
+            RecursionError,
+            DeclarationError,
+        ) as error:
             raise DataError(
                 "this is no tag map",
                 path=str(file),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,7 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
+from flowgraph.data.files import put
 from flowgraph.data.registry import find_bench, parsed_settings, setting_names
 from flowgraph.errors import UnknownNameError
 
@@ -60,8 +62,9 @@ def bench(
         err_console.print(f"note: {note}", markup=False)
     if out is not None:
         for file_name, draw in report.figures.items():
-            with writing(out / file_name) as file:
-                draw(file)
+            with writing(out / file_name) as file, tempfile.TemporaryDirectory() as aside:
+                draw(Path(aside) / file.name)
+                put(file, (Path(aside) / file.name).read_bytes())
     if as_json:
         return print_json({"bench": name, "rows": list(report.rows)})
     print_whole(table(report.rows))

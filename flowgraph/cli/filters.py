@@ -40,12 +40,13 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.data.export import write_tum
+from flowgraph.data.files import put
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
 from flowgraph.engines.simulate import simulate
-from flowgraph.errors import DataError, FlowgraphError, writes
+from flowgraph.errors import DataError, FlowgraphError, plain, writes
 
 
 @app.command("list")
@@ -76,7 +77,7 @@ def show(
     """Draw a graph: in the terminal, or to a file."""
     built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
     if output is None:
-        print(built.text())
+        print(plain(built.text()))
         return
     with writing(output), without_font_warnings():
         built.draw(str(output))
@@ -191,7 +192,7 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
     with writing(out / "diagram.svg") as file, without_font_warnings():
         case.graph.draw(str(file))
     with writing(out / "metrics.json") as file:
-        file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+        put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
     if case.estimate not in result.series:
         return
     estimate = result[case.estimate]

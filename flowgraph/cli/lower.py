@@ -12,6 +12,7 @@ import typer
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, Truth, graph_of, one_flight
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
+from flowgraph.data.files import put
 from flowgraph.engines.registry import writers
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.block import NUMBERS
@@ -78,7 +79,7 @@ def lower(
         costs = cost_report(pipeline, passes=passes, multipliers=multipliers, lanes=lanes, clock=clock)
         for name, text in (("report.txt", costs.text()), ("report.html", costs.html())):
             with writing(output / name) as written:
-                written.write_text(text)
+                put(written, text)
         totals["cost"] = {section.title: list(section.rows) for section in costs.sections}
     if as_json:
         return print_json({**totals, "output": str(output)})

@@ -12,7 +12,15 @@ import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson
-from flowgraph.cli.terminal import err_console, make_ready, print_json, print_whole, reports_errors, table
+from flowgraph.cli.terminal import (
+    Terminated,
+    err_console,
+    make_ready,
+    print_json,
+    print_whole,
+    reports_errors,
+    table,
+)
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 Folder = Annotated[
@@ -42,7 +50,8 @@ def batch(
 ) -> None:
     """Run a study, or what is missing of it, to a table with a row a run.
 
-    Exit status: 0, or 1 where a run failed (its row says why), 2 for a wrong study, 130 after Ctrl-C.
+    Exit status: 0, or 1 where a run failed (its row says why), 2 for a wrong study, 130 after Ctrl-C, 143
+    after SIGTERM; what is done by then is in the table.
     """
     from dataclasses import replace
 
@@ -78,7 +87,7 @@ def batch(
         _show(outcome, study, quiet)
     if outcome.interrupted:
         err_console.print(f"stopped; to continue: {_again(sys.argv)}", markup=False)
-        raise typer.Exit(130)
+        raise typer.Exit(143 if outcome.by is Terminated else 130)
     if outcome.failed:
         first = outcome.failed[0]
         where = f"{first['graph']} on {first['data']}, seed {first['seed']}"

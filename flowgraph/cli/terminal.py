@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,15 +14,28 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
 from rich.table import Table
 
 from flowgraph.data.registry import installed
-from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError, writes
+from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError, plain, writes
 
-out_console = Console(soft_wrap=True)
-err_console = Console(stderr=True, soft_wrap=True, highlight=False)
+
+class PlainConsole(Console):
+    """A console on which what comes from a file is text, and steers no terminal."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.isprintable():
+                yield segment
+            else:
+                yield Segment(plain(segment.text), segment.style)
+
+
+out_console = PlainConsole(soft_wrap=True)
+err_console = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
 def give_up(message: str) -> None:
@@ -32,14 +46,39 @@ def give_up(message: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as Ctrl-C does: with what is done kept, and nothing left running."""
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM is raised as `Terminated`; where it cannot be (in a thread), it is left as it is."""
+
+    def raised(*_: object) -> None:
+        raise Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, raised)
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
 def reports_errors(command: Callable[..., None]) -> Callable[..., None]:
     """Errors of this package become a message on standard error and an exit status."""
 
     @functools.wraps(command)
     def run(*args: Any, **options: Any) -> None:
         try:
-            command(*args, **options)
+            with terminated_as_interrupted():
+                command(*args, **options)
             sys.stdout.flush()
+        except Terminated:
+            raise typer.Exit(128 + signal.SIGTERM) from None
         except FlowgraphError as error:
             err_console.print(f"error: {error}", markup=False)
             raise typer.Exit(2 if isinstance(error, UnknownNameError | DeclarationError) else 1) from None
@@ -134,7 +173,7 @@ def print_whole(shown: Table) -> None:
     """Print a table of figures with all its columns, wider than the terminal if it must be."""
     options = out_console.options.update(width=10_000)
     wide = max(out_console.width, out_console.measure(shown, options=options).maximum)
-    Console(file=out_console.file, width=wide).print(shown, crop=False, no_wrap=True)
+    PlainConsole(file=out_console.file, width=wide).print(shown, crop=False, no_wrap=True)
 
 
 def _short(value: Any) -> str:

@@ -21,6 +21,7 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
+from flowgraph.data.files import put
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError
 
@@ -80,7 +81,7 @@ def tune(
     report = _report(found)
     if out is not None:
         with writing(out) as file:
-            file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+            put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
     if as_json:
         return print_json(report)
     print_whole(table(_lines(found)))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flowgraph.data.files import put
 from flowgraph.data.series import Series
-from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError, writes
+from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError
 from flowgraph.types import leaves_of
 
 if TYPE_CHECKING:
@@ -52,8 +53,7 @@ def write_tum(series: Series, file: str | Path) -> None:
     for time, row in zip(series.time.tolist(), table.tolist(), strict=True):
         sign, (seconds, rest) = "-" if time < 0 else "", divmod(abs(time), 10**9)
         lines.append(f"{sign}{seconds}.{rest:09d} " + " ".join(map(repr, row)))
-    with writes(file):
-        Path(file).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    put(file, "\n".join(lines) + "\n")
 
 
 _AXES = {3: ["x", "y", "z"], 4: ["w", "x", "y", "z"]}

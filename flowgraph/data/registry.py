@@ -23,7 +23,7 @@ from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, parts_of, shared, with_truth
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
-from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
 
@@ -192,14 +192,32 @@ def load_flight(
     if len(specs) > 1:
         claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
         each = shared(specs, [flight_settings(s) for s in specs], claims, settings or {})
-    found: list[Flight] = [
-        load(s.partition(":")[2], seed=seed, settings=given)
-        for load, s, given in zip(loaders, specs, each, strict=True)
-    ]
+    found = [_loaded(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
     if truth is None:
         return found[0] if len(found) == 1 else joined(specs, found)
     whole = found[0] if len(found) == 2 else joined(specs[:-1], found[:-1])
     return with_truth(whole, truth, found[-1])
+
+
+def _loaded(load: Callable[..., Flight], spec: str, seed: int, settings: Mapping[str, str]) -> Flight:
+    kind, _, argument = spec.partition(":")
+    try:
+        return load(argument, seed=seed, settings=settings)
+    except FlowgraphError:
+        raise
+    except Exception as error:  # of a damaged file a library may say anything
+        why = (
+            "more memory than there is"
+            if isinstance(error, MemoryError)
+            else f"{type(error).__name__}: {error}"
+        )
+        raise DataError(
+            "this recording cannot be read",
+            path=spec,
+            expected=f"a whole recording of the kind {kind}",
+            got=why[:300],
+            fix="restore the file; if it is whole, please report it to the package that reads this kind",
+        ) from error
 
 
 def flight_settings(spec: str, truth: str | None = None) -> list[str]:

@@ -13,6 +13,7 @@ import re
 import shutil
 from pathlib import Path
 
+from flowgraph.data.files import put
 from flowgraph.drawing.text import (
     Link,
     block_words,
@@ -82,8 +83,7 @@ def draw(
     made = source.encode() if ending in (".dot", ".gv") else _render(source, ending[1:])
     with writes(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(made)
-    return path
+    return put(path, made)
 
 
 def _render(source: str, kind: str) -> bytes:

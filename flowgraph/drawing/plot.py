@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.files import whole
 from flowgraph.data.series import Series
 from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError, writes
 from flowgraph.types import ArrayType, leaves_of
@@ -190,7 +191,8 @@ def _save(figure: Figure, file: str | Path | None) -> Figure:
             raise UnknownNameError("file ending", path.suffix, ENDINGS, path=str(path))
         with writes(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=130)
+        with whole(path) as stream:
+            figure.savefig(stream, dpi=130, format=path.suffix[1:].lower())
     return figure
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError, writes
+from flowgraph.data.files import arrays_of, whole
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.language.graph import Graph, join_states
 from flowgraph.types import DTYPES, ArrayType, Type, as_value, flatten, leaves_of, unflatten
 
@@ -172,7 +172,7 @@ def _leaf(value: Any, type_: ArrayType, where: str) -> Any:
 
 
 def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
-    """Write a state tree to an .npz file, exactly.
+    """Write a state tree to an .npz file, exactly; the one that is there stays until the new one is whole.
 
     Raises:
         OutputError: where the file cannot be written.
@@ -185,7 +185,7 @@ def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
         for path, part in members.items():
             leaves = part.items() if isinstance(part, Mapping) else [("", part)]
             flat.update({f"{group}\n{path}\n{leaf}": np.asarray(a) for leaf, a in leaves})
-    with writes(file), open(file, "wb") as out:
+    with whole(file) as out:
         np.savez(out, **flat)  # type: ignore[arg-type]
 
 
@@ -196,8 +196,7 @@ def load_state(file: str | Path) -> dict[str, Any]:
         DataError: where the file is missing or is no such file.
     """
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            flat = {name: archive[name] for name in archive.files}
+        flat = arrays_of(file)
         tree: dict[str, Any] = {"registers": {}, "sources": {}}
         for name, array in flat.items():
             if name == "seed":
@@ -209,11 +208,11 @@ def load_state(file: str | Path) -> dict[str, Any]:
             else:
                 tree[group][path] = array
         return tree
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             "this is no saved state",
             path=str(file),
             expected="a file written by save_state",
-            got=f"{type(error).__name__}: {error}",
+            got=f"{type(error).__name__}: {error}"[:300],
             fix="write one with save_state(run.state, file)",
         ) from None

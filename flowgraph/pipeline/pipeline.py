@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowgraph.errors import LoweringError, PipelineError, UnknownNameError, writes
+from flowgraph.data.files import content_of, put_new, text_of
+from flowgraph.errors import LoweringError, PipelineError, UnknownNameError
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
 from flowgraph.recorder.ops import Spec
@@ -270,14 +271,12 @@ class Pipeline:
 
         Raises:
             PipelineError: where the folder holds another pipeline; nothing is overwritten in silence.
-            OutputError: where the folder or its files cannot be made.
+            OutputError: where it holds another `pipeline.txt`, or the folder or its files cannot be made.
         """
         target = Path(folder)
         text = json.dumps(self.to_json(), indent=1, allow_nan=False)
         file = target / _FILE
-        with writes(target):
-            target.mkdir(parents=True, exist_ok=True)
-        if file.exists() and file.read_text() != text:
+        if file.is_file() and content_of(file) != text.encode():
             raise PipelineError(
                 "another pipeline is already here",
                 path=str(file),
@@ -285,9 +284,7 @@ class Pipeline:
                 got=f"a different {_FILE}",
                 fix="choose another folder, or remove the old one first",
             )
-        with writes(file):
-            file.write_text(text)
-            (target / "pipeline.txt").write_text(self.listing())
+        put_new(target, {_FILE: text, "pipeline.txt": self.listing()}, what="pipeline")
         return target
 
     @classmethod
@@ -300,7 +297,7 @@ class Pipeline:
         file = Path(folder)
         file = file / _FILE if file.is_dir() else file
         try:
-            data = json.loads(file.read_text(), parse_constant=_no_number)
+            data = json.loads(text_of(file), parse_constant=_no_number)
         except (OSError, ValueError, RecursionError) as error:
             raise PipelineError(
                 "no pipeline can be read here",

@@ -35,7 +35,7 @@ class Outcome:
         rows: a row a run, in the order of the plan.
         done: how many were run now; `kept` were there before.
         seconds: that it took now.
-        interrupted: whether it was stopped; then `rows` are those that there are.
+        interrupted: whether it was stopped; then `rows` are those that there are. by: what was raised then.
     """
 
     folder: Path
@@ -44,6 +44,7 @@ class Outcome:
     kept: int
     seconds: float
     interrupted: bool = False
+    by: type[KeyboardInterrupt] | None = None
 
     @property
     def failed(self) -> list[Row]:
@@ -194,7 +195,7 @@ def run_study(
 
     Raises:
         DeclarationError: without a folder.
-        OutputError: where the folder cannot be written.
+        OutputError: where the folder cannot be written, or another study is running into it.
         MissingDependencyError: without pyarrow.
     """
     import_pyarrow()
@@ -210,10 +211,18 @@ def run_study(
     start = perf_counter()
     watcher = watcher or Watcher()
     store = Store(folder)
+    with store.locked():
+        return _run(study, store, start, watcher, workers, executor, force=force, retry=retry)
+
+
+def _run(
+    study: Study, store: Store, start: float, watcher: Watcher, workers: int, executor: Executor | None, *,
+    force: bool, retry: bool,
+) -> Outcome:  # fmt: skip
     store.write_study(study.resolved())
     rows: dict[str, Row] = {}
     done = kept = 0
-    interrupted = False
+    interrupted, by = False, None
     planned = Plan((), ())
     own = executor is None
     runner: Executor = executor or (InProcess() if workers == 1 else ProcessPool(workers))
@@ -235,14 +244,14 @@ def run_study(
                 rows[one.key] = one.row
                 done += 1
                 watcher.row(one.row)
-    except KeyboardInterrupt:
-        interrupted = True
+    except KeyboardInterrupt as error:
+        interrupted, by = True, type(error)
     finally:
         if own:
             runner.close()
     ordered = tuple(rows[r.key] for r in planned.runs if r.key in rows)
     store.write_table(ordered, first=("graph", "data", "seed", *study.names()))
-    outcome = Outcome(Path(folder), ordered, done, kept, perf_counter() - start, interrupted)
+    outcome = Outcome(store.folder, ordered, done, kept, perf_counter() - start, interrupted, by)
     watcher.end(outcome)
     return outcome
 

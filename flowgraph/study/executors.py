@@ -18,6 +18,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -27,6 +28,9 @@ from flowgraph.errors import DeclarationError, MissingDependencyError
 
 DEATHS = 3
 """So many workers may one task take with it before it is given up."""
+
+GRACE = 1.0
+"""Seconds that a worker has to end by itself."""
 
 PATIENCE = 5.0
 """Seconds that a Dask scheduler may take to answer."""
@@ -128,7 +132,10 @@ class _Worker:
         self.task: str | None = None
 
     def stop(self) -> None:
+        """End it; first asked, since it may have to end a compiler, and then made to."""
         self.connection.close()
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout=GRACE)
         self.process.kill()
         self.process.wait()
 
@@ -215,6 +222,8 @@ class ProcessPool(_Closing):
 
     def close(self) -> None:
         for worker in self._crew:
+            worker.process.terminate()
+        for worker in self._crew:
             worker.stop()
         self._crew, self._work = [], {}
         self._waiting.clear()
@@ -222,6 +231,7 @@ class ProcessPool(_Closing):
 
 def serve(descriptor: int) -> None:
     """What a worker process does: run tasks from its connection until that is closed."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     with Connection(descriptor) as connection:
         while True:
             try:

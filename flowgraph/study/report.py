@@ -20,10 +20,10 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.registry import flight_settings
-from flowgraph.errors import UnknownNameError
+from flowgraph.errors import UnknownNameError, plain
 from flowgraph.study.spec import text
 from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
-from flowgraph.study.store import Store, read_study, read_table, write_atomically
+from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
 
 WORST = 10
 _FEW = 10  # values of a box that are drawn as points too
@@ -69,7 +69,7 @@ def write_report(folder: str | Path, *, metric: str | None = None) -> Reported:
     parts = [
         f"<h1>Study: {_safe(', '.join(study.graphs))}</h1>",
         f"<p>{_count(len(rows), 'run')} over {_safe(', '.join(study.data))};"
-        f" {_count(len(study.each_seed), 'seed')}; engine {study.engine}, {study.dtype}."
+        f" {_count(len(study.each_seed), 'seed')}; engine {_safe(study.engine)}, {_safe(study.dtype)}."
         f" {len(failed)} failed.</p>",
     ]
     files: list[Path] = []
@@ -77,7 +77,7 @@ def write_report(folder: str | Path, *, metric: str | None = None) -> Reported:
         for title, name, draw in _pictures(rows, names, chosen):
             image = _png(draw)
             files.append(target / FIGURES / f"{name}.png")
-            write_atomically(files[-1], image)
+            put_inside(files[-1], image)
             code = base64.b64encode(image).decode()
             parts.append(
                 f'<h2>{_safe(title)}</h2><img alt="{_safe(title)}" src="data:image/png;base64,{code}">'
@@ -90,7 +90,7 @@ def write_report(folder: str | Path, *, metric: str | None = None) -> Reported:
         more = f"<p>and {len(failed) - 50} more.</p>" if len(failed) > 50 else ""
         parts.append(f"<h2>Failed runs ({len(failed)})</h2>" + _table(lines) + more)
     page = _page("Study of " + ", ".join(study.graphs), parts)
-    write_atomically(target / PAGE, page.encode())
+    put_inside(target / PAGE, page.encode())
     return Reported(target / PAGE, tuple(files), summary)
 
 
@@ -134,7 +134,7 @@ def write_comparison(
     )  # fmt: skip
     notes = _compared_notes(table, differing(theirs, ours, names))
     image = _png(lambda figure: _draw_ratios(figure, table))
-    write_atomically(Path(out) / FIGURES / "ratio.png", image)
+    put_inside(Path(out) / FIGURES / "ratio.png", image)
     code = base64.b64encode(image).decode()
     parts = [
         f"<h1>{_safe(str(b))} beside {_safe(str(a))}</h1>",
@@ -147,7 +147,7 @@ def write_comparison(
         _table(_shown(table)),
     ]
     page = Path(out) / "comparison.html"
-    write_atomically(page, _page("Comparison", parts).encode())
+    put_inside(page, _page("Comparison", parts).encode())
     return Comparison(page, table, notes)
 
 
@@ -184,19 +184,23 @@ def _pictures(
     for name in names:
         values = {r.get(name) for r in rows if r.get(name) is not None}
         if len(values) > 1 and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-            file = "against-" + "".join(c if c.isalnum() else "-" for c in name)
+            file = "against-" + "".join(c if c.isalnum() else "-" for c in name)[:60]
+            file += f"-{len(found)}" if file in [f for _, f, _ in found] else ""
             draw = lambda figure, name=name: _draw_against(figure, rows, name, metric)
             found.append((f"{metric} against {name}", file, draw))
     return found
 
 
 def _png(draw: Draw) -> bytes:
-    from matplotlib.figure import Figure  # a second that only pictures need
+    # A second that only pictures need.
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
-    draw(figure)
     sink = io.BytesIO()
-    figure.savefig(sink, format="png", dpi=110)
+    with rc_context({"text.parse_math": False}):  # a dollar in a name is a dollar
+        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+        draw(figure)
+        figure.savefig(sink, format="png", dpi=110)
     return sink.getvalue()
 
 
@@ -291,9 +295,9 @@ def _worst(rows: Sequence[Mapping[str, Any]], names: list[str], metric: str, sto
     for row in sorted(usable, key=lambda r: -r[metric])[:WORST]:
         line: dict[str, Any] = {**_setting(row, names), metric: row[metric]}
         line["run again"] = _Raw(f"<code>{_safe(_command(row, names))}</code>")
-        if store.has_trajectory(row["key"]):
+        if is_key(row["key"]) and store.has_trajectory(row["key"]):
             file = store.trajectory_file(row["key"]).relative_to(store.folder)
-            line["trajectory"] = _Raw(f'<a href="{file.as_posix()}">{row["key"][:8]}.npz</a>')
+            line["trajectory"] = _Raw(f'<a href="{_safe(file.as_posix())}">{_safe(row["key"][:8])}.npz</a>')
         lines.append(line)
     return _table(_shown(lines)) if lines else "<p>None.</p>"
 
@@ -361,7 +365,7 @@ def _page(title: str, parts: Sequence[str]) -> str:
 
 
 def _safe(words: str) -> str:
-    return html.escape(words)
+    return html.escape(plain(words))
 
 
 def _short(data: str) -> str:

@@ -12,6 +12,7 @@ import functools
 import itertools
 import json
 import math
+import re
 import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,11 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.files import text_of
 from flowgraph.data.joint import parts_of
 from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError
 from flowgraph.study.places import absolute, beside
 
 Value = bool | int | float | str
@@ -37,6 +39,14 @@ RESERVED = ("graph", "data", "seed", "error", "key", "ticks")
 
 CHUNK = 32
 MOST_RUNS = 10**7
+MOST_BYTES = 2**26
+"""Of a study's file."""
+
+MOST_DOTS = 64
+"""In a key: Python's reader of TOML takes time with the square of their number."""
+
+_WORD = r"(?:[A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')"
+_DOTTED = re.compile(rf"{_WORD}(?:[ \t]*\.[ \t]*{_WORD})*")
 SCALES = ("linear", "log")
 
 
@@ -172,14 +182,14 @@ class Study:
         """
         path = Path(file)
         try:
-            content = path.read_text(encoding="utf-8")
-            found = json.loads(content) if path.suffix == ".json" else tomllib.loads(content)
-        except (OSError, ValueError) as error:
+            content = text_of(path, most=MOST_BYTES)
+            found = json.loads(content) if path.suffix == ".json" else _toml(content)
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(
                 "no study can be read here",
                 path=str(path),
                 expected="a study in TOML, or the study.json beside results",
-                got=f"{type(error).__name__}: {error}",
+                got=f"{type(error).__name__}: {error}"[:300],
                 fix='the smallest one: graphs = ["ekf"], data = ["sim"], a line each',
             ) from None
         if not isinstance(found, dict):
@@ -189,7 +199,11 @@ class Study:
             found["data"] = [beside(spec, folder) for spec in found["data"]]
         if isinstance(found.get("out"), str):
             found["out"] = str(folder / found["out"])
-        return cls.from_mapping(found)
+        try:
+            return cls.from_mapping(found)
+        except FlowgraphError as error:
+            error.path = f"{path}, {error.path}" if error.path else str(path)
+            raise
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, Any]) -> Study:
@@ -202,6 +216,18 @@ class Study:
             if name not in given:
                 raise _wrong(name, "a list of names", "nothing")
         return cls(**given)
+
+
+def _toml(content: str) -> Any:
+    """TOML, but for keys of so many parts that only a reader's time is meant.
+
+    Raises:
+        ValueError: where it is none; RecursionError: where it is nested too deeply.
+    """
+    for match in _DOTTED.finditer(content):
+        if match[0].count(".") > MOST_DOTS:
+            raise ValueError(f"a key of {match[0].count('.') + 1} parts: {match[0][:40]}...")
+    return tomllib.loads(content)
 
 
 def text(value: Value) -> str:

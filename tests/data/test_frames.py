@@ -68,7 +68,8 @@ WRONG = {
         lambda: pandas.DataFrame({"v": [1.0], "t": [START]}), {"time": "t", "unit": "s"}, "within 64 bits"),
     "words": (lambda: pandas.DataFrame({"v": ["a"], "t": [5]}), {"time": "t"}, "holds no numbers"),
     "two of a name": (
-        lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"}, "'v' is ambiguous"),
+        lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"},
+        "'v' is ambiguous",
 }  # fmt: skip
 
 

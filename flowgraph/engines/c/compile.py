@@ -1,20 +1,31 @@
 """Compiling generated C with the system's compiler, once for each content.
 
-Libraries are kept in a folder of the user's, under a hash of the text, the flags and the compiler's
-version; the same filter is compiled once on a machine.
+Libraries are kept in a folder of the user's, under a digest of the text, the flags and what the compiler
+says of itself; the same filter is compiled once on a machine. Behind each library stands a digest of its
+bytes, and what does not agree with it is compiled again, for a library that was cut would kill the process
+that uses it. Each is made in a folder of its own beside the others, and renamed. What a killed process has
+left of such a folder is swept by the next one that compiles.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import hashlib
 import os
+import shlex
 import shutil
+import signal
+import stat
 import subprocess
 import tempfile
-from functools import lru_cache
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from flowgraph.errors import FlowgraphError, MissingDependencyError, writes
+from flowgraph.data.files import content_of, lock, put
+from flowgraph.errors import FlowgraphError, MissingDependencyError, OutputError, writes
 
 FLAGS = (
     "-std=c99",
@@ -29,19 +40,32 @@ FLAGS = (
 )
 """What `engine="c"` compiles with; none of them changes what NaN or infinity mean."""
 
+_MARK = b"\nflowgraph library, sha256 "
+_WORK = "work-"
+
 
 class CompileError(FlowgraphError):
-    """The C compiler refuses, with its message."""
+    """The C compiler refuses or fails, with its message."""
 
 
 def compiler() -> str:
-    """The C compiler: $CC, or cc.
+    """The C compiler: the program that $CC names, or cc.
 
     Raises:
         MissingDependencyError: where there is none.
     """
-    wanted = os.environ.get("CC") or "cc"
+    return _command()[0]
+
+
+def _command() -> list[str]:
+    """The compiler's program, and the arguments that $CC may have after it."""
+    wanted = os.environ.get("CC", "").strip() or "cc"
     found = shutil.which(wanted)
+    words = [wanted]
+    if found is None:
+        with suppress(ValueError):
+            words = shlex.split(wanted)
+            found = shutil.which(words[0])
     if found is None:
         raise MissingDependencyError(
             "the C engine needs a C compiler",
@@ -50,24 +74,110 @@ def compiler() -> str:
             got=f"no {wanted}",
             fix='install gcc or clang, or use engine="xla" or "python"',
         )
-    return found
+    return [found, *words[1:]]
 
 
-def cache_folder() -> Path:
-    """Where compiled filters are kept: $FLOWGRAPH_CACHE, or flowgraph in the user's cache folder."""
+def cache_folder() -> Path | None:
+    """Where compiled filters are kept: $FLOWGRAPH_CACHE, or flowgraph/c in the user's cache folder.
+
+    That is $XDG_CACHE_HOME or ~/.cache; None where neither is an absolute path and nobody's home is known, as
+    in a container.
+    """
     given = os.environ.get("FLOWGRAPH_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(given) if given else Path(base) / "flowgraph" / "c"
+    if given:
+        return Path(given).absolute()
+    base = Path(os.environ.get("XDG_CACHE_HOME") or "")
+    if not base.is_absolute():
+        home = Path(os.environ.get("HOME") or _home())
+        if not home.is_absolute():
+            return None
+        base = home / ".cache"
+    return base / "flowgraph" / "c"
 
 
-@lru_cache(maxsize=8)
-def _version(path: str) -> str:
+def _home() -> str:
+    try:
+        import pwd  # not everywhere
+
+        return pwd.getpwuid(os.getuid()).pw_dir
+    except (ImportError, KeyError):
+        return ""
+
+
+def _places() -> Iterator[Path]:
+    """Folders for libraries, the best first; another than the user's is said once."""
+    first = cache_folder()
+    if first is not None:
+        yield first
+        if os.environ.get("FLOWGRAPH_CACHE"):
+            return  # asked for: what is wrong with it is an error
+    own = Path(tempfile.gettempdir()) / f"flowgraph-{os.getuid()}"
+    _say(f"compiled filters are kept in {own}: {first or 'a home folder'} cannot be used")
+    with writes(own):
+        own.mkdir(mode=0o700, exist_ok=True)
+        found = own.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise OutputError(
+            "this folder is not ours alone, and programs in it could be anybody's",
+            path=str(own),
+            expected="a folder that only its owner can write to",
+            got=f"mode {stat.S_IMODE(found.st_mode):o} of user {found.st_uid}",
+            fix="set FLOWGRAPH_CACHE to a folder of your own",
+        )
+    yield own
+
+
+@functools.cache
+def _say(sentence: str) -> None:
+    warnings.warn(sentence, RuntimeWarning, stacklevel=2)
+
+
+@functools.lru_cache(maxsize=8)
+def _version(command: tuple[str, ...]) -> str:
     """The compiler's own words about itself, and what native means to it."""
-    said = [
-        subprocess.run([path, *ask], capture_output=True, text=True, check=False).stdout
-        for ask in (["--version"], ["-march=native", "-Q", "--help=target"])
-    ]
-    return "\n".join(said)
+    asked = (
+        ["--version"],
+        ["-march=native", "-Q", "--help=target"],
+        ["-march=native", "-dM", "-E", "-xc", "-"],
+    )
+    return "\n".join(_run([*command, *ask], None)[1] for ask in asked)
+
+
+def _run(command: list[str], folder: Path | None) -> tuple[int, str, str]:
+    """Exit status, and what a program wrote to its two ends; it and what it started end with us.
+
+    Raises:
+        CompileError: where it cannot be started.
+    """
+    environment = os.environ if folder is None else {**os.environ, "TMPDIR": str(folder)}
+    try:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            process_group=0,
+        )
+    except OSError as error:
+        raise CompileError(
+            "the C compiler cannot be started",
+            path=command[0],
+            expected="a program, cc or what $CC names",
+            got=f"{type(error).__name__}: {error.strerror or error}",
+            fix='install gcc or clang, or use engine="xla" or "python"',
+        ) from error
+    with process:
+        try:
+            said, complained = process.communicate()
+        except BaseException:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the compiler proper, which it has started
+            raise
+    return process.returncode, said, complained
 
 
 def _first_error(said: str) -> str:
@@ -80,33 +190,134 @@ def build(files: dict[str, str], flags: tuple[str, ...] = FLAGS) -> Path:
 
     Raises:
         MissingDependencyError: without a compiler.
-        CompileError: where the compiler refuses.
-        OutputError: where the cache folder cannot be written.
+        CompileError: where the compiler refuses, or makes nothing.
+        OutputError: where the cache folder cannot be written, and no other place can.
     """
-    cc = compiler()
-    said = "\0".join([cc, _version(cc), *flags, *(f"{n}\0{t}" for n, t in sorted(files.items()))])
-    folder = cache_folder()
-    target = folder / f"{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
-    if target.exists():
-        return target
+    return _built(files, flags)[0]
+
+
+def load(files: dict[str, str], flags: tuple[str, ...] = FLAGS) -> ctypes.CDLL:
+    """The library of C files, loaded into this process.
+
+    Raises:
+        MissingDependencyError, OutputError: as for `build`; CompileError: also where what the compiler made
+            cannot be loaded.
+    """
+    while True:
+        target, made = _built(files, flags)
+        try:
+            return ctypes.CDLL(str(target))
+        except OSError as error:
+            target.unlink(missing_ok=True)  # whatever it is, it is of no use
+            if not made:
+                continue  # it was kept from before
+            raise CompileError(
+                "what the C compiler made cannot be loaded",
+                path=compiler(),
+                expected="a shared library for this machine, in a folder from which programs may run",
+                got=str(error)[:300],
+                fix="look at $CC and the flags; where the folder forbids programs, set FLOWGRAPH_CACHE",
+            ) from error
+
+
+def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
+    """The library, and whether it was compiled now."""
+    command = _command()
+    said = "\0".join(
+        [*command, _version(tuple(command)), *flags, *(f"{n}\0{t}" for n, t in sorted(files.items()))]
+    )
+    name = f"{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
+    refused: OutputError | None = None
+    for folder in _places():
+        target = folder / name
+        if _is_whole(target):
+            return target, False
+        try:
+            _compile(command, flags, files, folder, target)
+        except OutputError as error:
+            refused = error
+        else:
+            return target, True
+    assert refused is not None  # there is one place at least
+    raise refused
+
+
+def _is_whole(library: Path) -> bool:
+    try:
+        content, mark, digest = content_of(library).rpartition(_MARK)
+    except OSError:
+        return False
+    return bool(mark) and hashlib.sha256(content).hexdigest().encode() == digest
+
+
+def _compile(
+    command: list[str], flags: tuple[str, ...], files: dict[str, str], folder: Path, target: Path
+) -> None:
+    """Compile into a place.
+
+    Raises:
+        CompileError: where the compiler refuses; OutputError: where the folder or the disk does.
+    """
     with writes(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(dir=folder))
-    try:
-        for name, text in files.items():
-            (work / name).write_text(text)
+    _sweep(folder)
+    with _workplace(folder) as work:
+        with writes(folder):
+            for name, text in files.items():
+                (work / name).write_text(text, encoding="utf-8")
         sources = sorted(n for n in files if n.endswith(".c"))
-        command = [cc, *flags, "-fPIC", "-shared", "-o", "made.so", *sources, "-lm"]
-        done = subprocess.run(command, cwd=work, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise CompileError(
-                "the C compiler refuses the generated code",
-                path=cc,
-                expected="code that compiles",
-                got=_first_error(done.stderr) or f"exit status {done.returncode}",
-                fix="pass other flags; if the default ones fail, please report the graph",
+        line = [*command, *flags, "-fPIC", "-shared", "-o", "made.so", *sources, "-lm"]
+        status, said, complained = _run(line, work)
+        made = work / "made.so"
+        if status and "No space left on device" in complained:
+            raise OutputError(
+                "the disk is full",
+                path=str(folder),
+                expected="room for a compiled filter",
+                got=_first_error(complained),
+                fix="make room, or set FLOWGRAPH_CACHE to a folder on another disk",
             )
-        os.replace(work / "made.so", target)  # whole or not at all, whoever else compiles the same
+        if status or not made.is_file() or not made.stat().st_size:
+            how = f"signal {-status}" if status < 0 else f"exit status {status}"
+            raise CompileError(
+                "the C compiler refuses the generated code" if status > 0 else "the C compiler made nothing",
+                path=command[0],
+                expected="code that compiles" if status > 0 else "a shared library",
+                got=_first_error(complained or said) or how,
+                fix="pass other flags; if the default ones fail, please report the graph"
+                if status > 0
+                else "look at what $CC names, at the memory and at the disk",
+            )
+        content = content_of(made)
+        put(target, content + _MARK + hashlib.sha256(content).hexdigest().encode(), lasting=False)
+
+
+@contextmanager
+def _workplace(folder: Path) -> Iterator[Path]:
+    """A folder to compile in, locked while that goes on."""
+    with writes(folder):
+        while True:
+            work = Path(tempfile.mkdtemp(prefix=_WORK, dir=folder))
+            with suppress(FileNotFoundError):
+                descriptor = os.open(work, os.O_RDONLY)
+                lock(descriptor)
+                if work.exists():
+                    break
+                os.close(descriptor)  # swept by another process before it was locked
+    try:
+        yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return target
+        os.close(descriptor)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes have left: folders to compile in, and halves of libraries."""
+    for old in [*folder.glob(f"{_WORK}*"), *folder.glob(".*.so.part")]:
+        with suppress(OSError):
+            descriptor = os.open(old, os.O_RDONLY)
+            try:
+                if lock(descriptor, wait=False):
+                    shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)
+            finally:
+                os.close(descriptor)

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.files import put_new, whole
 from flowgraph.data.inputs import Inputs
 from flowgraph.engines.c.replay import KEEPS, csv_names, main_text
 from flowgraph.engines.c.source import generate
 from flowgraph.engines.pipeline_inputs import events_of
-from flowgraph.errors import OutputError, writes
 from flowgraph.pipeline.optimise import COMPILED, check_passes, optimise
 from flowgraph.pipeline.pipeline import Pipeline, Port
 from flowgraph.pipeline.program import specialise
@@ -52,23 +52,7 @@ def write_c(
         "main.c": main_text(pipeline, made),
         "Makefile": makefile(m),
     }
-    target = Path(folder)
-    with writes(target):
-        target.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        file = target / name
-        if file.exists() and file.read_text() != text:
-            raise OutputError(
-                "another file is already here",
-                path=str(file),
-                expected="an empty folder, or the same filter",
-                got=f"a different {name}",
-                fix="choose another folder, or remove the old one first",
-            )
-    for name, text in texts.items():
-        with writes(target / name):
-            (target / name).write_text(text)
-    return {name: target / name for name in texts}
+    return put_new(folder, texts, what="filter")
 
 
 FLAGS = (
@@ -114,15 +98,15 @@ def write_events(pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: s
     columns = [_texts(port, s) for port, s in zip(pipeline.inputs, events.series, strict=True)]
     rows = [iter(c) for c in columns]
     names = csv_names(pipeline.inputs)
-    with writes(file), open(file, "w", encoding="utf-8") as out:
+    with whole(file) as out:
         if any(
             a.dtype.kind == "f" and not np.isfinite(a).all() for x in events.series for a in x.leaves.values()
         ):
-            out.write(f"{KEEPS}\n")
+            out.write(f"{KEEPS}\n".encode())
         for time, key in zip(events.time.tolist(), events.key.tolist(), strict=True):
             for k, name in enumerate(names):
                 if key >> k & 1:
-                    out.write(f"{time},{name}{next(rows[k])}\n")
+                    out.write(f"{time},{name}{next(rows[k])}\n".encode())
     return len(events.time)
 
 

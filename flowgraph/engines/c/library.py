@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, build
+from flowgraph.engines.c.compile import FLAGS, load
 from flowgraph.engines.c.loop import loop_text
 from flowgraph.engines.c.source import MOST_PATTERNS, generate
 from flowgraph.pipeline.optimise import optimise
@@ -104,7 +104,7 @@ class Compiled:
             f"{m}.c": self.source.source,
             "fg_loop.c": loop_text(pipeline, self.source),
         }
-        self._library = ctypes.CDLL(str(build(files, flags)))
+        self._library = load(files, flags)
         self._play = self._library.fg_play
         self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self._play.restype = None
