@@ -69,7 +69,7 @@ WRONG = {
     "words": (lambda: pandas.DataFrame({"v": ["a"], "t": [5]}), {"time": "t"}, "holds no numbers"),
     "two of a name": (
         lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"},
-        "'v' is ambiguous",
+        "'v' is ambiguous"),
 }  # fmt: skip
 
 
