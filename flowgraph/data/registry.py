@@ -192,14 +192,14 @@ def load_flight(
     if len(specs) > 1:
         claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
         each = shared(specs, [flight_settings(s) for s in specs], claims, settings or {})
-    found = [_loaded(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
+    found = [_read(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
     if truth is None:
         return found[0] if len(found) == 1 else joined(specs, found)
     whole = found[0] if len(found) == 2 else joined(specs[:-1], found[:-1])
     return with_truth(whole, truth, found[-1])
 
 
-def _loaded(load: Callable[..., Flight], spec: str, seed: int, settings: Mapping[str, str]) -> Flight:
+def _read(load: Callable[..., Flight], spec: str, seed: int, settings: Mapping[str, str]) -> Flight:
     kind, _, argument = spec.partition(":")
     try:
         return load(argument, seed=seed, settings=settings)
