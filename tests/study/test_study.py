@@ -32,6 +32,7 @@ from flowgraph.study import (
     tasks,
 )
 from flowgraph.study.execution import tasks_of
+from flowgraph.types import flatten, unflatten
 
 pytest.importorskip("pyarrow")
 SMALL: dict[str, Any] = {"graphs": ["ekf"], "data": ["sim"], "parameters": {"duration": 1.5, "imu.rate": 50}}
@@ -556,3 +557,29 @@ def test_values_that_only_look_alike_are_kept():
         points=[{"settle": 1}, {"settle": 2}, {"settle": 1, "gyro_factor": 2}],
     )  # fmt: skip
     assert len(list(study.combinations("ekf"))) == 6
+
+
+@pytest.mark.parametrize("engine", ["python", "c", "xla"])
+def test_a_run_that_diverges_is_a_row_and_the_others_go_on(tmp_path, monkeypatch, engine):
+    """One of them starts from numbers whose squares are infinite."""
+    made = tasks.prepared
+
+    def huge(node):
+        leaves = [np.full_like(leaf, 1e200) for leaf in flatten(node.initial, node.type)]
+        return replace(node, initial=unflatten(node.type, iter(leaves)))
+
+    def diverging(graph, data, seed, *more):
+        case, flight = made(graph, data, seed, *more)
+        if seed == 1:
+            held = {k for k, node in case.graph.registers if node.role == "delay"}
+            nodes = tuple(huge(n) if k in held else n for k, n in enumerate(case.graph.nodes))
+            case = replace(case, graph=replace(case.graph, nodes=nodes, plans={}))
+        return case, flight
+
+    monkeypatch.setattr(tasks, "prepared", diverging)
+    with np.errstate(all="ignore"):
+        done = run_study(small(seeds=3, engine=engine), tmp_path)
+    rows = {row["seed"]: row for row in done.rows}
+    assert "not finite" in rows[1]["error"]
+    assert rows[0]["error"] is rows[2]["error"] is None
+    assert rows[2]["position_rmse_m"] < 1.0
