@@ -1,4 +1,4 @@
-"""Reference pages written from the code: each block with its ports, each signal with its fields, each graph.
+"""Reference pages written from the code: each room, each block with its ports, each signal, each graph.
 
 The pages hold a comment where the text goes; the hook puts it there when the site is built. So the
 reference cannot fall behind the blocks.
@@ -9,7 +9,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import tomllib
 from collections.abc import Collection, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -18,6 +20,8 @@ from flowgraph import Block, Signal, find_graph
 from flowgraph.data.registry import graph_names
 from flowgraph.language.block import REQUIRED
 from flowgraph.types import StructType, Type, leaves_of, struct_type
+
+PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 
 
 def modules() -> list[ModuleType]:
@@ -71,6 +75,15 @@ def block_lines(block: Block[Any]) -> Iterator[str]:
     )
 
 
+def rooms() -> str:
+    """A section a room, from the ground up: what it says about itself."""
+    (contract,) = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    text: list[str] = []
+    for name in reversed(contract["layers"]):
+        text += [f"### `{name}`", *paragraphs(importlib.import_module(f"flowgraph.{name}"))]
+    return "\n\n".join(text)
+
+
 def signals() -> str:
     """A table of the signal types."""
     rows = ["| signal | field | type |", "|---|---|---|"]
@@ -117,7 +130,7 @@ def fenced(function: Any) -> str:
     return f"```text\n{doc}\n```" if doc else ""
 
 
-MARKS = {"<!-- blocks -->": blocks, "<!-- signals -->": signals}
+MARKS = {"<!-- blocks -->": blocks, "<!-- rooms -->": rooms, "<!-- signals -->": signals}
 
 
 def filled(markdown: str, drawn: Collection[str] = ()) -> str:

@@ -1,15 +1,21 @@
-"""What holds for all tests: without a C compiler, those that need one are skipped, and say so."""
+"""What holds for all tests: without a C compiler, those that need one are skipped, and say so.
+
+And what several of them need: a package of somebody else's, installed for one test.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator
+import sys
+from collections.abc import Generator, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from flowgraph import MissingDependencyError
+from tests.support import Install
 
 COMPILER = shutil.which(os.environ.get("CC") or "cc")
 
@@ -22,3 +28,24 @@ def pytest_runtest_call() -> Generator[None, Any, Any]:
         if COMPILER is None and "C compiler" in str(error):
             pytest.skip("needs a C compiler")
         raise
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Put a distribution on the path, with its modules and its entry points, until the test ends."""
+    imported: set[str] = set()
+
+    def written(name: str, modules: Mapping[str, str], groups: Mapping[str, Mapping[str, str]]) -> None:
+        for module, text in modules.items():
+            (tmp_path / f"{module}.py").write_text(text)
+        info = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        lines = [f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in of.items()) for g, of in groups.items()]
+        (info / "entry_points.txt").write_text("\n".join(lines))
+        imported.update(modules)
+        monkeypatch.syspath_prepend(str(tmp_path))  # now, for names are looked up once for a path
+
+    yield written
+    for module in imported:
+        sys.modules.pop(module, None)

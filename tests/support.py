@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Graph, Result, Series, simulate
+
+Install = Callable[[str, Mapping[str, str], Mapping[str, Mapping[str, str]]], None]
+"""The fixture `install`: (distribution, text by module, {group: {name: "module:object"}})."""
 
 MS = 1_000_000
 ENGINES = ("python", "reference", "xla", "c")

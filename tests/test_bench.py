@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flowgraph import simulate
-from tests.bench import imports, particles, toy
+from tests.bench import gpu, imports, particles, toy
 from tests.bench.__main__ import BENCHES, main, show
 
 NEEDS = {
@@ -94,3 +94,14 @@ def test_toy_peers_compute_what_numpy_says():
     np.testing.assert_allclose(toy.with_reactivex(toy.in_order(inputs)), wanted)
     pytest.importorskip("jax")
     np.testing.assert_allclose(toy.with_scan(23, inputs)(), wanted)
+
+
+def test_devices_are_compared_by_their_answers_too(capsys):
+    pytest.importorskip("jax")
+    rows = gpu.main(["--particles", "50", "--seconds", "0.3", "--repeats", "1", "--json"])
+    assert json.loads(capsys.readouterr().out)["rows"] == rows
+    assert rows[0]["device"] == "cpu"
+    for row in rows:
+        assert row["us_per_tick"] > 0.0
+        assert row["position_difference_rms_m"] < 1e-4
+        assert row["decisions"] > 0

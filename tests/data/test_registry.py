@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,6 +13,7 @@ from flowgraph import PluginError, UnknownNameError, find_graph, load_flight
 from flowgraph.cli import app
 from flowgraph.data.registry import KINDS, find_bench, graph_names, installed
 from flowgraph.engines.registry import find_engine, find_pipeline_engine, writers
+from tests.support import Install
 
 GOOD = '''
 from flowgraph import Report, Scalar, Series, Stream, graph
@@ -30,31 +29,6 @@ def halves(*, count: int = 2) -> Report:
     """Halve numbers."""
     return Report([{"half": n / 2} for n in range(count)])
 '''
-
-Install = Callable[[str, dict[str, str], dict[str, dict[str, str]]], None]
-
-
-@pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Put a distribution on the path, with its modules and its entry points by group."""
-    installed_modules: set[str] = set()
-
-    def written(name: str, modules: dict[str, str], groups: dict[str, dict[str, str]]) -> None:
-        for module, text in modules.items():
-            (tmp_path / f"{module}.py").write_text(text)
-        info = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-        lines = [
-            f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in of.items()) for group, of in groups.items()
-        ]
-        (info / "entry_points.txt").write_text("\n".join(lines))
-        installed_modules.update(modules)
-        monkeypatch.syspath_prepend(str(tmp_path))  # now, for names are looked up once for a path
-
-    yield written  # type: ignore[misc]
-    for name in installed_modules:
-        sys.modules.pop(name, None)
 
 
 def invoke(*arguments: str):

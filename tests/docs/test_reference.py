@@ -1,7 +1,8 @@
-"""What the pages list is what there is: blocks, joins, instructions, fields, settings, errors."""
+"""What the pages list is what there is: rooms, blocks, joins, instructions, passes, settings, files."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import re
@@ -12,10 +13,12 @@ import pytest
 
 import flowgraph
 from flowgraph import Block, FlowgraphError, Signal, errors, find_graph
-from flowgraph.blocks.datasets import broad, csv_file, ese650, euroc, rosbag, tum
 from flowgraph.blocks.flights import simulated
-from flowgraph.data.registry import graph_names
+from flowgraph.data.registry import flight_names, flight_settings, graph_names
+from flowgraph.language.graph import CallNode
+from flowgraph.pipeline.optimise import PASSES
 from flowgraph.recorder.ops import OPS
+from tests.test_house import LAYERS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -74,9 +77,47 @@ def test_the_section_of_ins_eskf_names_its_sources_and_settings() -> None:
 
 
 def test_every_join_is_listed() -> None:
-    joins = {"apply", "delay", "latest", "zip", "zip_latest", "zip_latest_right", "match", "merge", "every"}
-    assert joins <= set(flowgraph.__all__)
-    assert joins | {"collect", "sink"} <= code_words(page("blocks"))
+    rooms = [f"flowgraph.language.{name}" for name in ("joins", "pairs")]
+    joins = {name for name in flowgraph.__all__ if getattr(flowgraph, name).__module__ in rooms}
+    assert {"latest", "zip", "match", "merge", "every", "sink"} <= joins
+    assert joins | {"apply", "delay"} <= code_words(page("blocks"))
+
+
+def test_every_pass_is_listed() -> None:
+    section = page("lowering").split("## Passes")[1].split("\n`sparse`")[0]
+    assert re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE) == list(PASSES)
+
+
+def test_every_room_has_a_section_and_stands_in_the_picture(
+    library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = library.filled(page("architecture"))
+    places = [text.index(f"\n### `{room}`\n") for room in LAYERS]
+    assert places == sorted(places)
+    for room in LAYERS:
+        assert library.paragraphs(importlib.import_module(f"flowgraph.{room}"))[0] in text
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    house = importlib.import_module("rooms").house()
+    drawn = {node.path for node in house.nodes if isinstance(node, CallNode)}
+    assert drawn == {*LAYERS} - {"errors", "types", "verbs", "moved", "cli"}
+    assert all(f">{room}</text>" in house.draw(legend=False) for room in drawn)
+
+
+def test_what_the_architecture_page_names_is_there() -> None:
+    """Its files and tests, but for those that its recipes make up."""
+    text = page("architecture")
+    made_up = {
+        f"{of}.py"
+        for of in ("blocks/orientation/compass", "blocks/datasets/npz", "pipeline/optimise/reciprocal")
+    }
+    named = set(re.findall(r"`(?:flowgraph/)?([\w./]+(?:\.py|\.md|\.toml|/))`", text))
+    assert len(named) > 30
+    for name in named - made_up:
+        found = [*ROOT.glob(name), *(ROOT / "flowgraph").glob(f"**/{name}"), *ROOT.glob(f"tests/**/{name}")]
+        assert found or (ROOT / "flowgraph" / name).exists(), name
+    tests = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    for name in re.findall(r"`(test_\w+)`", text):
+        assert f"def {name}(" in tests, name
 
 
 def test_the_instructions_listed_are_those_there_are() -> None:
@@ -105,9 +146,9 @@ def test_every_field_of_the_description_is_explained() -> None:
 
 def test_every_flight_setting_is_listed() -> None:
     words = code_words(page("data"))
+    for name in set(flight_names()) - {"sim"}:
+        assert set(flight_settings(name)) <= words, name
     assert set(simulated.DEFAULTS) <= words
-    for module in (broad, csv_file, ese650, euroc, rosbag, tum):
-        assert set(module.SETTINGS) <= words, module.__name__
 
 
 def test_every_error_is_listed() -> None:

@@ -17,7 +17,7 @@ from flowgraph.data.batch import Runs
 from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import ManyOutcome, ManyRuns, dense, real_leaves
 from flowgraph.engines.options import RunOptions
-from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick
+from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick, chosen_device
 from flowgraph.errors import DataError
 from flowgraph.pipeline.pipeline import Pipeline, Port
 from flowgraph.recorder.random import seed_words
@@ -33,7 +33,7 @@ def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> 
     keys = first.patterns
     per_tick = size * bytes_per_tick(pipeline)
     ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
-    which = (keys, real.name, ticks, size, runs.shared, repr(runs.keep), passes)
+    which = (keys, real.name, ticks, size, runs.shared, repr(runs.keep), passes, chosen_device())
     # they live as long as the pipeline does
     compiled: dict[Any, Scan] = runs.pipeline.__dict__.setdefault("_batched", {})
     if which not in compiled:

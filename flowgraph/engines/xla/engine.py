@@ -22,7 +22,7 @@ from flowgraph.engines.forks import refuse_lost_threads
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.stretches import joined
 from flowgraph.engines.xla.batch import vectorised
-from flowgraph.engines.xla.scan import Scan, chunk_size, import_jax
+from flowgraph.engines.xla.scan import Scan, chosen_device, chunk_size, import_jax
 from flowgraph.pipeline.optimise import ARRAYS
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -68,7 +68,7 @@ class XlaEngine(PipelineEngine):
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
         chunk = chunk_size(pipeline, ticks)
-        which = (tuple(patterns), dtype, chunk, passes)
+        which = (tuple(patterns), dtype, chunk, passes, chosen_device())
         kept: dict[Any, Scan] = pipeline.__dict__.setdefault("_scans", {})  # as long as the pipeline lives
         if which not in kept:
             kept[which] = Scan(pipeline, tuple(patterns), np.dtype(dtype), chunk, passes=passes)

@@ -47,6 +47,11 @@ def import_jax() -> Any:
     return jax
 
 
+def chosen_device() -> str:
+    """What `jax.default_device` names now, as a key: a scan is compiled for one device."""
+    return str(import_jax().config.jax_default_device)
+
+
 class _JaxNamespace:
     """`jax.numpy` with the two operations that pipelines add to it, and a faster `take`."""
 
@@ -131,7 +136,8 @@ class Scan:
     def compile(self, cells: list[Any], seed: np.ndarray, inputs: list[list[np.ndarray]]) -> None:
         """Compile for these shapes, once."""
         if self._compiled is None:
-            with self.jax.enable_x64(True):
+            # A GPU would multiply float32 matrices with ten bits unless told otherwise.
+            with self.jax.enable_x64(True), self.jax.default_matmul_precision("highest"):
                 now = tuple(_as(c, self.dtype) for c in cells)
                 xs = self._slice(np.zeros(1, np.int64), np.zeros(1, np.int64), inputs, 0)
                 self._compiled = self._play_chunk.lower(now, seed, xs).compile()
