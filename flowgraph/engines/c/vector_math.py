@@ -105,7 +105,11 @@ static FG_INLINE {real} {{name}}"""
     both.number = x;
     return both.bits;
 }}
-static inline {real} fg_from_bits({word} x) {{
+""",
+        ),
+        "fg_from_bits": (
+            (),
+            f"""static inline {real} fg_from_bits({word} x) {{
     union {{ {word} bits; {real} number; }} both;
     both.bits = x;
     return both.number;
@@ -113,7 +117,7 @@ static inline {real} fg_from_bits({word} x) {{
 """,
         ),
         "fg_exp": (
-            ("fg_bits",),
+            ("fg_bits", "fg_from_bits"),
             start.format(what="exp(x): x = k log 2 + r, and the series of exp(r)", name="fg_exp")
             + f"""({real} x) {{
     const {real} c = x < {n(form.low)} ? {n(form.low)} : (x > {n(form.high)} ? {n(form.high)} : x);
@@ -127,7 +131,7 @@ static inline {real} fg_from_bits({word} x) {{
 """,
         ),
         "fg_log": (
-            ("fg_bits",),
+            ("fg_bits", "fg_from_bits"),
             start.format(
                 what="log(x): x = 2^k m with m near 1, and log(m) = 2 artanh((m - 1) / (m + 1))",
                 name="fg_log",

@@ -10,10 +10,10 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
 from threading import Lock, get_ident
 from time import perf_counter
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar, cast
 
 from flowgraph.data.inputs import Inputs, check_event, prepare
 from flowgraph.data.result import Result, statistics
@@ -28,6 +28,18 @@ from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 _BATCH = 2048
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def _alone(method: _F) -> _F:
+    """A run is for one thread: a method that would enter it while it is in a tick is refused."""
+
+    @wraps(method)
+    def entered(run: Run, *args: Any, **keywords: Any) -> Any:
+        with run._entered(method.__name__):
+            return method(run, *args, **keywords)
+
+    return cast("_F", entered)
 
 
 class Run:
@@ -92,26 +104,19 @@ class Run:
         self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
         self.time = max(self._last.values(), default=NEVER)
 
+    @_alone
     def step(self) -> bool:
         """Advance one tick; False when the inputs have ended."""
-        with self._alone("step"):
-            self._refuse_if_stopped()
-            tick = next(self._ticks, None)
-            if tick is None:
-                return False
-            self._advance([tick])
-            return True
+        self._refuse_if_stopped()
+        tick = next(self._ticks, None)
+        if tick is None:
+            return False
+        self._advance([tick])
+        return True
 
+    @_alone
     def push(self, time: int, /, **values: Any) -> None:
-        """One tick at `time` (int ns) in which the named sources have these values.
-
-        Raises:
-            DataError: for an event that does not fit, or while another thread, or a block, is in this run.
-        """
-        with self._alone("push"):
-            self._push(time, values)
-
-    def _push(self, time: int, values: dict[str, Any]) -> None:
+        """One tick at `time` (int ns) in which the named sources have these values."""
         if self._pushed is None:
             raise DataError(
                 "this run reads recorded inputs",
@@ -158,19 +163,18 @@ class Run:
             self._stopped = None  # this tick did not happen; the next may be pushed
             raise
 
+    @_alone
     def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
         """Run until the inputs end, or for `most` ticks, telling `meter` now and then."""
-        with self._alone("to_end"):
-            self._refuse_if_stopped()
-            for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
-                self._advance(batch)
-                if meter is not None:
-                    meter.update(self.ticks, self.time)
+        self._refuse_if_stopped()
+        for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
+            self._advance(batch)
+            if meter is not None:
+                meter.update(self.ticks, self.time)
         return self
 
     @contextmanager
-    def _alone(self, what: str) -> Iterator[None]:
-        """A run is for one thread: entering it again while it is in a tick would lose updates."""
+    def _entered(self, what: str) -> Iterator[None]:
         if not self._busy.acquire(blocking=False):
             raise self._entered_twice(what)
         self._thread = get_ident()
