@@ -95,8 +95,8 @@ def parse_parameters(file: str | Path) -> Parameters:
         what = "tag map"
         if "ids" in found:
             tag_map = _mat(found["ids"], text)
-    except (DeclarationError, OverflowError) as error:
-        if isinstance(error, OverflowError):
+    except (DeclarationError, ArithmeticError) as error:
+        if isinstance(error, ArithmeticError):
             error = DeclarationError(str(error), path=what, expected="finite numbers", fix="mend the file")
         raise DataError(
             f"the {what} is malformed", path=f"{file}: {error.path}", expected=error.expected, got=error.got,
