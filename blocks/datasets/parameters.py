@@ -82,21 +82,26 @@ def parse_parameters(file: str | Path) -> Parameters:
             found.setdefault(name, table)
     notes = []
     camera, mount, tag_map = COURSE_CAMERA, COURSE_MOUNT, course_map()
+    what = "camera"
     try:
         if "K" in found or "distortion" in found:
             K = found.get("K", COURSE_CAMERA.K)
             camera = Camera(K, tuple(found.get("distortion", np.array(COURSE_CAMERA.distortion)).ravel()))
-    except DeclarationError as error:
+        what = "mount"
+        angle = _ANGLE.search(text)
+        if "xyz" in found or angle:
+            xyz = found["xyz"].ravel() if "xyz" in found else COURSE_MOUNT.origin
+            mount = course_mount(xyz, _angle(angle) if angle else math.pi / 4)
+        what = "tag map"
+        if "ids" in found:
+            tag_map = _mat(found["ids"], text)
+    except (DeclarationError, ArithmeticError) as error:
+        if isinstance(error, ArithmeticError):
+            error = DeclarationError(str(error), path=what, expected="finite numbers", fix="mend the file")
         raise DataError(
-            "the camera is malformed", path=f"{file}: {error.path}", expected=error.expected, got=error.got,
+            f"the {what} is malformed", path=f"{file}: {error.path}", expected=error.expected, got=error.got,
             fix=error.fix,
         ) from error  # fmt: skip
-    angle = _ANGLE.search(text)
-    if "xyz" in found or angle:
-        xyz = found["xyz"].ravel() if "xyz" in found else COURSE_MOUNT.origin
-        mount = course_mount(xyz, _angle(angle) if angle else math.pi / 4)
-    if "ids" in found:
-        tag_map = _mat(found["ids"], text)
     for what, there in (
         ("camera matrix", "K" in found),
         ("distortion", "distortion" in found),

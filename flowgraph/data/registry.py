@@ -206,16 +206,11 @@ def _read(load: Callable[..., Flight], spec: str, seed: int, settings: Mapping[s
     except FlowgraphError:
         raise
     except Exception as error:  # of a damaged file a library may say anything
-        why = (
-            "more memory than there is"
-            if isinstance(error, MemoryError)
-            else f"{type(error).__name__}: {error}"
-        )
         raise DataError(
             "this recording cannot be read",
             path=spec,
             expected=f"a whole recording of the kind {kind}",
-            got=why[:300],
+            got=f"{type(error).__name__}: {error}"[:300],
             fix="restore the file; if it is whole, please report it to the package that reads this kind",
         ) from error
 

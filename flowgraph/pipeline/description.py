@@ -41,8 +41,11 @@ from flowgraph.recorder.ops import OPS, Spec
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, leaves_of
 
-_TRIED = 2**24
+_TRIED = 2**20
 """Elements of the largest result for which an instruction is tried out when it is read."""
+
+_MOST = 2**31
+"""Elements of the largest value: a description is small whatever it claims, and a run makes room for all."""
 
 
 def _refuse(message: str, path: str, expected: object, got: object) -> NoReturn:
@@ -313,8 +316,10 @@ def _check_values(pipeline: Pipeline, path: str) -> None:
     if len(specs) < len(given):
         twice = sorted(n for n, k in Counter(n for n, _ in given).items() if k > 1)
         _refuse("a value is assigned twice", path, "one number a value", twice)
+    _check_size(path, given)
     for stage in pipeline.stages:
         for i in stage.instructions:
+            _check_size(f"{path}: stage {stage.path}", [(i.out, i.spec)])
             _check_instruction(i, specs, f"{path}: stage {stage.path}, value {i.out}")
             specs[i.out] = i.spec
     flag, stamp = Spec((), "bool"), Spec((), "int64")
@@ -340,6 +345,12 @@ def _check_values(pipeline: Pipeline, path: str) -> None:
                 "a register cell that exists and holds one int64",
                 f"{fault.register}, {fault.cell}",
             )
+
+
+def _check_size(where: str, values: Iterable[tuple[int, Spec]]) -> None:
+    for n, spec in values:
+        if math.prod(spec.shape) > _MOST:
+            _refuse("a value is too large", f"{where}, value {n}", f"up to {_MOST} elements", spec)
 
 
 def _check_instruction(i: Instruction, specs: Mapping[int, Spec], where: str) -> None:

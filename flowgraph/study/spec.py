@@ -13,6 +13,7 @@ import itertools
 import json
 import math
 import re
+import sys
 import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -353,7 +354,8 @@ def _axis(key: str, given: Any) -> tuple[Value, ...]:
             raise _wrong(key, "a count from 1", numbers[2])
         if kind == "logspace" and min(numbers[:2]) <= 0:
             raise _wrong(key, "positive ends, which are values and not exponents", ends)
-        made = (np.linspace if kind == "linspace" else np.geomspace)(*numbers).tolist()
+        spread = np.linspace if kind == "linspace" else np.geomspace
+        made = spread(*map(float, numbers[:2]), numbers[2]).tolist()
         if len(set(made)) < len(made):
             raise _wrong(key, "ends that differ, or a count of 1", ends)
         return tuple(made)
@@ -388,7 +390,7 @@ def _different(points: list[dict[str, Value]]) -> tuple[dict[str, Value], ...]:
 
 
 def _number(x: object) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
 
 
 def _drawn(given: Any) -> list[dict[str, Value]]:

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 import flowgraph
 from flowgraph import (
+    DataError,
     DeclarationError,
     OutputError,
     ProgressBar,
@@ -35,6 +36,7 @@ from flowgraph import (
     simulate_many,
 )
 from flowgraph.cli import app
+from flowgraph.cli.terminal import PlainConsole, table
 from flowgraph.data.progress import tick_count
 from flowgraph.drawing.plot import plot_result
 from flowgraph.errors import writes
@@ -480,3 +482,26 @@ def test_a_graph_that_no_example_fits_is_shown_as_it_stands():
     done = invoke("show", "imu_calibration", "--set", "gated=no")
     assert done.exit_code == 1
     assert "lacks what imu_calibration needs" in done.stderr
+
+
+@pytest.mark.parametrize("text", ["\x1b[31mred", "\x1b]0;title\x07", "a\rb\x08", "\x9b31m", "\u202eback"])
+def test_what_a_file_says_does_not_steer_the_terminal(tmp_path, text):
+    """Errors, tables and what is printed beside them: characters that would are spelled out."""
+    steering = "\x1b\x07\x08\r\x9b\u202e"
+    error = DataError("wrong", path=str(tmp_path / text), got=text)
+    assert not set(str(error)) & set(steering)
+    sink = io.StringIO()
+    console = PlainConsole(file=sink, width=200, force_terminal=False)
+    console.print(text, markup=False)
+    console.print(table([{"graph": text, text: 1.0}]))
+    assert not set(sink.getvalue()) & set(steering)
+    (tmp_path / "s.toml").write_text(f'graphs = ["ekf"]\ndata = ["sim"]\n{json.dumps(text)} = 1\n')
+    done = invoke("batch", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"))
+    assert done.exit_code == 2
+    assert not set(done.stderr) & set(steering)
+
+
+def test_colours_of_our_own_pass():
+    sink = io.StringIO()
+    PlainConsole(file=sink, force_terminal=True, color_system="standard").print("[red]a[/red]")
+    assert "\x1b[31ma" in sink.getvalue()

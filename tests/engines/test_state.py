@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import copy
+import os
+import signal
+import subprocess
+import sys
+import zipfile
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,9 +26,11 @@ from flowgraph import (
     every,
     graph,
     latest,
+    load_state,
     lower,
     match,
     real,
+    save_state,
     simulate,
     window,
 )
@@ -227,3 +234,49 @@ def test_initial_values_and_a_state_exclude_each_other(how):
     }
     with pytest.raises(DeclarationError, match="from initial values or from a state"):
         calls.get(how, lambda: simulate(MIXED, later(), engine=how, **options))()
+
+
+def test_a_checkpoint_outlives_what_is_killed_while_it_is_written_over(tmp_path):
+    file = tmp_path / "state.npz"
+    save_state(STATE, file)
+    whole = file.read_bytes()
+    code = (
+        "import os, signal, sys\nimport numpy as np\nfrom flowgraph import load_state, save_state\n"
+        "state = load_state(sys.argv[1])\n"
+        "np.savez = lambda out, **_: (out.write(b'half'), out.flush(), os.kill(os.getpid(), signal.SIGKILL))\n"
+        "save_state(state, sys.argv[1])"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(file)], check=False).returncode == -signal.SIGKILL
+    assert file.read_bytes() == whole
+    same_state(load_state(file), STATE)
+    save_state(STATE, file)
+    assert os.listdir(tmp_path) == ["state.npz"]
+
+
+def test_a_pipe_or_a_folder_is_no_state(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for file in (tmp_path / "pipe", tmp_path, tmp_path / "none"):
+        with pytest.raises(DataError, match="this is no saved state"):
+            load_state(file)
+
+
+@pytest.mark.parametrize("damage", ["password", "method", "deflate", "shape", "name", "twice"])
+def test_a_state_that_is_damaged_is_our_error(tmp_path, damage):
+    file = tmp_path / "state.npz"
+    save_state(STATE, file)
+    content = bytearray(file.read_bytes())
+    first = content.index(b"PK\x01\x02")
+    if damage == "password":
+        content[6] |= 1
+        content[first + 8] |= 1
+    elif damage in ("method", "deflate"):
+        content[8:10] = content[first + 10 : first + 12] = b"\x63\x00" if damage == "method" else b"\x08\x00"
+    elif damage == "shape":
+        content = content.replace(b"(", b"9", 1)
+    file.write_bytes(content)
+    if damage in ("name", "twice"):
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.writestr("seed.npy" if damage == "twice" else "a\nb\nc\nd.npy", b"")
+    with pytest.raises(DataError, match="this is no saved state") as error:
+        load_state(file)
+    assert str(file) in str(error.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from flowgraph import (
     DeclarationError,
     Flight,
     FlowgraphError,
+    OutputError,
     Pipeline,
     PipelineError,
     Scalar,
@@ -333,6 +335,30 @@ def test_save_does_not_replace_another_pipeline(tmp_path: Path):
     with pytest.raises(PipelineError, match=r"pipeline\.json: another pipeline is already here"):
         lower(other.build()).save(tmp_path)
     assert Pipeline.load(tmp_path).name == "tracker"
+
+
+@pytest.mark.parametrize("other", [b"my notes", b"\xff\xfe", b""])
+def test_save_does_not_replace_another_listing_and_does_nothing_by_half(tmp_path: Path, other):
+    (tmp_path / "pipeline.txt").write_bytes(other)
+    with pytest.raises(OutputError, match=r"pipeline\.txt: another file is already here"):
+        PIPELINE.save(tmp_path)
+    assert [f.name for f in tmp_path.iterdir()] == ["pipeline.txt"]
+    assert (tmp_path / "pipeline.txt").read_bytes() == other
+
+
+def test_load_refuses_a_pipe_at_once(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipeline.json")
+    with pytest.raises(PipelineError, match="no regular file"):
+        Pipeline.load(tmp_path)
+
+
+@pytest.mark.parametrize("shape", [[2**32], [2**16, 2**16], [10**30]])
+def test_load_refuses_values_that_no_memory_holds(tmp_path: Path, shape):
+    found = json.loads(TEXT)
+    found["inputs"][0]["leaves"][0]["shape"] = shape
+    (tmp_path / "pipeline.json").write_text(json.dumps(found))
+    with pytest.raises(PipelineError, match=r"a value is too large|these fields make no value|axes"):
+        Pipeline.load(tmp_path)
 
 
 @pytest.mark.parametrize("content", [None, "", "{", "[]", '{"format": "flowgraph-pipeline", "version": 99}'])
