@@ -266,8 +266,8 @@ def _date(match: re.Match[str]) -> tuple[int, str]:
         digits = part["zone"][1:].replace(":", "").ljust(4, "0")
         shift = timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))
         zone = timezone(-shift if part["zone"][0] == "-" else shift)  # type: ignore[assignment]
-    clock = [int(part[n] or 0) for n in "hms"]
-    whole = datetime(int(part["y"]), month, int(part["d"]), *clock, tzinfo=zone) - _EPOCH
+    h, m, sec = (int(part[n] or 0) for n in "hms")
+    whole = datetime(int(part["y"]), month, int(part["d"]), h, m, sec, tzinfo=zone) - _EPOCH
     seconds = whole.days * 86400 + whole.seconds
     return seconds * 10**9 + _fraction(part["f"]), "zone" if part["zone"] else "date"
 

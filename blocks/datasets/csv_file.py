@@ -172,10 +172,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         columns = {}
         for field in fields:
             group = places[stream, field]
-            values = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
-            name, values = _converted(
-                given, sheet, stream, field, group, np.stack(values, axis=1), made.notes
-            )
+            parts = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
+            name, values = _converted(given, sheet, stream, field, group, np.stack(parts, axis=1), made.notes)
             columns[name] = values
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
@@ -251,9 +249,9 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
             mapped.setdefault(stream, {})[field] = columns
     for stream, found in mapped.items():
         ways = [f for f in found if f in _TURNS]
-        fields = frozenset("attitude" if f in _TURNS else f for f in found)
+        kinds = frozenset("attitude" if f in _TURNS else f for f in found)
         needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
-        if len(ways) > 1 or fields not in _SIGNALS or (stream != "truth" and set(fields) != needed):
+        if len(ways) > 1 or kinds not in _SIGNALS or (stream != "truth" and set(kinds) != needed):
             raise DeclarationError(
                 f"{stream} lacks a field" if len(ways) < 2 else f"{stream} has its attitude twice",
                 path=f"csv.{stream}",
