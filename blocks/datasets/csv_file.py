@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight
-from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
+from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
 from flowgraph.blocks.datasets.shape import (
     NOISE_SETTINGS,
@@ -90,6 +90,7 @@ _SIGNALS: Mapping[frozenset[str], Any] = {
 }
 _TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
 """Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
+_INDEX = ("index", "row", "row.names")
 
 
 def _said_by(field: str) -> str:
@@ -305,7 +306,9 @@ def _clock(
             notes.append(note("assumed", f"{sheet.file.name}: column {sheet.names[found[0]]!r} is the time"))
         return found[0]
     first = sheet.names[0]
-    if first == "" or first.lower().startswith("unnamed:") or first.lower() in ("index", "row.names", "row"):
+    if first == "" and is_date(sheet.cells(0)[0]):  # as pandas writes an index of times
+        notes.append(note("assumed", f"{sheet.file.name}: the first column, without a name, is the time"))
+    elif first == "" or first.lower().startswith("unnamed:") or first.lower() in _INDEX:
         raise DataError(
             "the first column is an index of rows, not a time",
             path=str(sheet.file),
