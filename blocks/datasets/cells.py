@@ -18,7 +18,7 @@ from flowgraph.blocks.datasets.units import TIME
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
-__all__ = ["BLANKS", "MISSING", "decimal_mark", "is_datum", "numbers", "stamps"]
+__all__ = ["BLANKS", "MISSING", "decimal_mark", "is_date", "is_datum", "numbers", "stamps"]
 
 BLANKS = ("", "-", "--")
 """Cells that may hold nothing in rows of names, of units and of numbers alike."""
@@ -65,9 +65,12 @@ def is_datum(cell: str) -> bool:
     cell = _plain(cell)
     if _NUMBER.fullmatch(cell) or cell.lower() in MISSING or _ENDLESS.fullmatch(cell):
         return True
-    return cell[0] in "0123456789+-" and any(
-        p.fullmatch(cell) for p in (_ISO, _BASIC, _WORDED, _SPAN, _THOUSANDS, _UNCLEAR)
-    )
+    return is_date(cell) or bool(_THOUSANDS.fullmatch(cell) or _UNCLEAR.fullmatch(cell))
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell holds a date with a clock, or a span."""
+    return cell[:1] in tuple("0123456789-") and any(p.fullmatch(cell) for p in (_ISO, _BASIC, _WORDED, _SPAN))
 
 
 def decimal_mark(
@@ -188,7 +191,7 @@ def stamps(
     """
     size = TIME[unit]
     if cells and not _NUMBER.fullmatch(_plain(cells[0])):
-        return _dates(cells, where)
+        return _dates(cells, where, unit)
     found = []
     for k, cell in enumerate(cells):
         plain = _plain(cell)
@@ -227,7 +230,7 @@ def _no_time(place: str, cell: str, unit: str) -> DataError:
     )
 
 
-def _dates(cells: Sequence[str], where: Callable[[int], str]) -> tuple[np.ndarray, str]:
+def _dates(cells: Sequence[str], where: Callable[[int], str], unit: str) -> tuple[np.ndarray, str]:
     """Dates or spans, all of one kind, in whole nanoseconds."""
     found, zones = [], set()
     for k, cell in enumerate(cells):
@@ -239,7 +242,7 @@ def _dates(cells: Sequence[str], where: Callable[[int], str]) -> tuple[np.ndarra
             if not -(2**63) <= stamp < 2**63:
                 raise ValueError
         except (OverflowError, ValueError):
-            raise _no_time(where(k), cell, "s") from None
+            raise _no_time(where(k), cell, unit) from None
         zones.add(zone)
         if len(zones) > 1:
             raise DataError(
@@ -266,8 +269,8 @@ def _date(match: re.Match[str]) -> tuple[int, str]:
         digits = part["zone"][1:].replace(":", "").ljust(4, "0")
         shift = timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))
         zone = timezone(-shift if part["zone"][0] == "-" else shift)  # type: ignore[assignment]
-    clock = [int(part[n] or 0) for n in "hms"]
-    whole = datetime(int(part["y"]), month, int(part["d"]), *clock, tzinfo=zone) - _EPOCH
+    h, m, sec = (int(part[n] or 0) for n in "hms")
+    whole = datetime(int(part["y"]), month, int(part["d"]), h, m, sec, tzinfo=zone) - _EPOCH
     seconds = whole.days * 86400 + whole.seconds
     return seconds * 10**9 + _fraction(part["f"]), "zone" if part["zone"] else "date"
 

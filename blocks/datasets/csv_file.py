@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight
-from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
+from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
 from flowgraph.blocks.datasets.shape import (
     NOISE_SETTINGS,
@@ -90,6 +90,7 @@ _SIGNALS: Mapping[frozenset[str], Any] = {
 }
 _TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
 """Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
+_INDEX = ("index", "row", "row.names")
 
 
 def _said_by(field: str) -> str:
@@ -172,10 +173,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         columns = {}
         for field in fields:
             group = places[stream, field]
-            values = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
-            name, values = _converted(
-                given, sheet, stream, field, group, np.stack(values, axis=1), made.notes
-            )
+            parts = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
+            name, values = _converted(given, sheet, stream, field, group, np.stack(parts, axis=1), made.notes)
             columns[name] = values
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
@@ -251,9 +250,9 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
             mapped.setdefault(stream, {})[field] = columns
     for stream, found in mapped.items():
         ways = [f for f in found if f in _TURNS]
-        fields = frozenset("attitude" if f in _TURNS else f for f in found)
+        kinds = frozenset("attitude" if f in _TURNS else f for f in found)
         needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
-        if len(ways) > 1 or fields not in _SIGNALS or (stream != "truth" and set(fields) != needed):
+        if len(ways) > 1 or kinds not in _SIGNALS or (stream != "truth" and set(kinds) != needed):
             raise DeclarationError(
                 f"{stream} lacks a field" if len(ways) < 2 else f"{stream} has its attitude twice",
                 path=f"csv.{stream}",
@@ -307,7 +306,9 @@ def _clock(
             notes.append(note("assumed", f"{sheet.file.name}: column {sheet.names[found[0]]!r} is the time"))
         return found[0]
     first = sheet.names[0]
-    if first == "" or first.lower().startswith("unnamed:") or first.lower() in ("index", "row.names", "row"):
+    if first == "" and is_date(sheet.cells(0)[0]):  # as pandas writes an index of times
+        notes.append(note("assumed", f"{sheet.file.name}: the first column, without a name, is the time"))
+    elif first == "" or first.lower().startswith("unnamed:") or first.lower() in _INDEX:
         raise DataError(
             "the first column is an index of rows, not a time",
             path=str(sheet.file),

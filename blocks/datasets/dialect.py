@@ -377,7 +377,7 @@ def _head(rows: list[list[str]], wide: int) -> tuple[list[int], int]:
                 head.append(k)  # names that do not fit the rows are refused later
             elif not follows:
                 return head, k
-        elif k == 0 and _numbered(row):
+        elif (k == 0 and _numbered(row)) or (k in (h + 1 for h in head) and set(row) <= {"-", "--"}):
             head.append(k)
         elif not (follows and (len(row) != wide or row[0] in BLANKS)):
             return head, k

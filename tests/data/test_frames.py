@@ -68,8 +68,7 @@ WRONG = {
         lambda: pandas.DataFrame({"v": [1.0], "t": [START]}), {"time": "t", "unit": "s"}, "within 64 bits"),
     "words": (lambda: pandas.DataFrame({"v": ["a"], "t": [5]}), {"time": "t"}, "holds no numbers"),
     "two of a name": (
-        lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"},
-        "'v' is ambiguous"),
+        lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"}, "is ambiguous"),
 }  # fmt: skip
 
 
@@ -142,7 +141,7 @@ def test_a_result_is_frames():
 
 # -- masked arrays -------------------------------------------------------------------------------------
 
-HIDDEN = np.ma.array([1.0, 999.0, 3.0], mask=[0, 1, 0])
+HIDDEN = np.ma.array([1.0, 999.0, 3.0], mask=[False, True, False])
 
 
 @pytest.mark.parametrize(
@@ -165,7 +164,7 @@ def test_a_masked_entry_goes_as_nan_does(values):
 
 
 def test_masks_in_signals_lists_and_tuples():
-    rows = np.ma.array(np.ones((2, 3)), mask=[[0, 0, 0], [0, 1, 0]])
+    rows = np.ma.array(np.ones((2, 3)), mask=np.array([[0, 0, 0], [0, 1, 0]], bool))
     series = Series([0, 1], Imu(gyro=rows, specific_force=np.ma.array([[1, 2, 3]] * 2, mask=rows.mask)))
     assert np.isnan(series["gyro"]).sum() == np.isnan(series["specific_force"]).sum() == 1
     assert np.isnan(Series([0, 1], [rows[0], rows[1]]).values).sum() == 1
@@ -184,9 +183,9 @@ def test_live_events_and_iterables_have_masks_too():
 
 def test_only_what_is_real_can_be_masked():
     for time, values in (
-        (np.ma.array([0, 1], mask=[0, 1]), np.zeros(2)),
-        ([0, 1], np.ma.array([1, 2], mask=[0, 1])),
-        ([0, 1], np.ma.array([True, False], mask=[0, 1])),
+        (np.ma.array([0, 1], mask=[False, True]), np.zeros(2)),
+        ([0, 1], np.ma.array([1, 2], mask=[False, True])),
+        ([0, 1], np.ma.array([True, False], mask=[False, True])),
     ):
         with pytest.raises(DataError, match="a masked entry is no real number"):
             Series(time, values)
