@@ -355,7 +355,7 @@ def _axis(key: str, given: Any) -> tuple[Value, ...]:
         if kind == "logspace" and min(numbers[:2]) <= 0:
             raise _wrong(key, "positive ends, which are values and not exponents", ends)
         spread = np.linspace if kind == "linspace" else np.geomspace
-        made = spread(*map(float, numbers[:2]), numbers[2]).tolist()
+        made = spread(float(numbers[0]), float(numbers[1]), numbers[2]).tolist()
         if len(set(made)) < len(made):
             raise _wrong(key, "ends that differ, or a count of 1", ends)
         return tuple(made)
