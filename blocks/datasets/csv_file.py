@@ -19,15 +19,16 @@ import numpy as np
 
 from flowgraph import Flight
 from flowgraph.blocks.datasets.shape import (
+    MEASURED_NOISE,
     NOISE_SETTINGS,
     Recording,
     chosen,
     imu_noise,
     known,
-    number,
+    measured_noise,
     policy,
+    stream_settings,
     the_file,
-    unit_quaternions,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.signals import (
@@ -97,8 +98,8 @@ SETTINGS: Mapping[str, str] = {
         if len(units) > 1
     },
     **NOISE_SETTINGS,
-    "position.noise": "standard deviation of measured positions, m",
-    "attitude.noise": "standard deviation of measured attitudes, rad",
+    **MEASURED_NOISE,
+    **stream_settings(*STREAMS),
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
 }
 """The settings of `load` and what they mean."""
@@ -125,9 +126,17 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     given = {name: str(value) for name, value in (settings or {}).items()}
     known(given, SETTINGS, "csv")
     mapped = _mapped(given)
-    unit = _UNITS[chosen(given, "time.unit", list(_UNITS), "csv")]
+    clock = chosen(given, "time.unit", list(_UNITS), "csv")
+    unit = _UNITS[clock]
     delimiter = _DELIMITERS[chosen(given, "delimiter", list(_DELIMITERS), "csv")]
-    made = Recording(Path(argument).stem, policy(given, "csv"))
+    made = Recording(
+        Path(argument).stem,
+        policy(given, "csv"),
+        kind="csv",
+        given=given,
+        unit=clock,
+        units="say its unit with {stream}.{field}.unit={unit}, or convert the file to SI units",
+    )
     file = the_file(argument, kind="csv", what="table")
     names, lines, rows = _rows(file, delimiter)
     time = np.array(
@@ -138,7 +147,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         for field, chosen_columns in fields.items():
             places = [_column(file, names, name) for name in chosen_columns]
             numbers = _numbers(file, lines, rows, places)
-            columns[field] = _converted(given, file, stream, field, numbers)
+            columns[field] = _converted(given, stream, field, numbers)
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
         made.add(
@@ -151,9 +160,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         )
     if "imu" in made.streams:
         made.info["imu_noise"] = imu_noise(given, "csv", made.notes)
-    for name in ("position", "attitude"):
-        if f"{name}.noise" in given:
-            made.info[f"{name}_noise"] = number(given, f"{name}.noise", 0.01, "csv")
+    measured_noise(given, "csv", made.info)
     return made.flight()
 
 
@@ -292,14 +299,12 @@ def _numbers(file: Path, lines: list[int], rows: list[list[str]], places: list[i
     return table
 
 
-def _converted(
-    given: Mapping[str, str], file: Path, stream: str, field: str, numbers: np.ndarray
-) -> np.ndarray:
+def _converted(given: Mapping[str, str], stream: str, field: str, numbers: np.ndarray) -> np.ndarray:
     """In SI units; a quaternion scalar first; a lone column without its axis."""
     width, units = STREAMS[stream][field]
     key = f"{stream}.{field}.{'order' if field == 'attitude' else 'unit'}"
     unit = chosen(given, key, list(units), "csv")
     if field == "attitude":
-        return unit_quaternions(numbers[:, [3, 0, 1, 2]] if unit == "xyzw" else numbers, f"{file}: {stream}")
+        return numbers[:, [3, 0, 1, 2]] if unit == "xyzw" else numbers
     numbers = numbers * units[unit]
     return numbers[:, 0] if width == 1 else numbers

@@ -7,34 +7,24 @@ through line by line, to find the row to blame.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
+from flowgraph.blocks.datasets.stamps import (
+    POLICIES,
+    UNITS,
+    as_nanoseconds,
+    in_order,
+    likely_unit,
+    nanoseconds,
+    strictly_later,
+)
 from flowgraph.errors import DataError
 
-__all__ = ["POLICIES", "in_order", "nanoseconds", "read_table", "strictly_later"]
+__all__ = ["POLICIES", "UNITS", "in_order", "nanoseconds", "read_table", "strictly_later"]
 
-POLICIES = ("raise", "drop", "sort")
-"""What to do with rows whose time does not increase: refuse them; leave them out; sort, and of equal times
-keep the first."""
-
-
-def nanoseconds(seconds: str) -> int:
-    """Decimal seconds as an integer of nanoseconds, rounded once and never through a float.
-
-    Raises:
-        ValueError: when the text is not a finite number, or beyond 64 bits.
-    """
-    try:
-        number = Decimal(seconds)
-        if "_" in seconds or not -9_223_372_036 < number < 9_223_372_036:
-            raise ValueError
-        return int((number * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"not a finite number below 9.2e9: {seconds!r}") from error
+_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
 def read_table(
@@ -43,9 +33,9 @@ def read_table(
     columns: int,
     bad_time: str = "raise",
     delimiter: str | None = ",",
-    seconds: bool = False,
-    quaternion: int | None = None,
+    unit: str = "ns",
     gaps: bool = False,
+    lines: list[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Read rows of a stamp and `columns` numbers. Empty lines and lines that start with # are passed over.
 
@@ -54,9 +44,10 @@ def read_table(
         columns: how many numbers follow the stamp.
         bad_time: one of `POLICIES`.
         delimiter: between columns; None for white space.
-        seconds: whether a stamp is decimal seconds instead of integer nanoseconds.
-        quaternion: the first of four columns that must have a norm within 1 % of 1; they are normalised.
+        unit: of the stamps, of `UNITS`: whole numbers of ns, decimal numbers of others.
         gaps: whether a NaN is data, a number that was not measured; otherwise it is refused.
+        lines: to be filled with the line of each row, from 1; then rows stay as they are in the file, and
+            their order is left to the caller.
 
     Returns:
         Times (n,) int64 ns, increasing; numbers (n, columns) float64; and notes on what was left out or
@@ -66,8 +57,8 @@ def read_table(
         DataError: the file has no rows, or a row is malformed or out of order; names the file and the line.
     """
     text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()  # some editors write a mark
-    lines = [i for i, line in enumerate(text) if line and not line.isspace() and line[0] != "#"]
-    rows = [text[i] for i in lines]
+    held = [i for i, line in enumerate(text) if line and not line.isspace() and line[0] != "#"]
+    rows = [text[i] for i in held]
     if not rows:
         raise DataError(
             "no rows",
@@ -76,74 +67,33 @@ def read_table(
             got=f"{len(text)} lines, all empty or comments",
             fix="restore the file",
         )
-    stamp = "U40" if seconds else "i8"
+    stamp = "i8" if unit == "ns" else "U40"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a stamp like 1e9 is parsed through a float, with a warning
             dtype = np.dtype([("time", stamp), ("x", "f8", (columns,))])
             table = np.loadtxt(rows, delimiter=delimiter, dtype=dtype, comments=None, ndmin=1)
-        time = np.array([nanoseconds(t) for t in table["time"]] if seconds else table["time"], dtype=np.int64)
+        time = np.array(
+            table["time"] if unit == "ns" else [as_nanoseconds(t, unit) for t in table["time"]],
+            dtype=np.int64,
+        )
         x = np.ascontiguousarray(table["x"])
     except (ValueError, OverflowError, Warning) as error:
-        _blame(file, text, lines, columns, delimiter, seconds, gaps)
+        _blame(file, text, held, columns, delimiter, unit, gaps)
         raise DataError(
             "this is not a table of numbers",
-            path=f"{file}, lines {lines[0] + 1} to {lines[-1] + 1}",
+            path=f"{file}, lines {held[0] + 1} to {held[-1] + 1}",
             expected=f"rows of a stamp and {columns} numbers",
             got=str(error),
             fix="mend or delete the row",
         ) from error
     if np.isinf(x).any() or (not gaps and np.isnan(x).any()):
-        _blame(file, text, lines, columns, delimiter, seconds, gaps)
-    if quaternion is not None:
-        part = x[:, quaternion : quaternion + 4]
-        norm = np.linalg.norm(part, axis=-1, keepdims=True)
-        off = np.flatnonzero(np.abs(norm[:, 0] - 1.0) > 0.01)
-        if len(off):
-            raise DataError(
-                "an attitude is not a unit quaternion",
-                path=f"{file}, line {lines[off[0]] + 1}",
-                expected="a norm within 1 % of 1",
-                got=f"{norm[off[0], 0]:.6g}",
-                fix="mend or delete the row",
-            )
-        x[:, quaternion : quaternion + 4] = part / norm
-    where = "/".join(file.parts[-2:])
-    return in_order(where, lambda k: f"{file}, line {lines[k] + 1}", time, x, bad_time)
-
-
-def in_order(
-    name: str, row: Callable[[int], str], time: np.ndarray, x: np.ndarray, bad_time: str
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Times (n,) and rows (n, ...) with increasing time, as `bad_time` (of `POLICIES`) says, and notes.
-
-    Args:
-        name: what the notes are about.
-        row: what to call row k in a message.
-
-    Raises:
-        DataError: with bad_time="raise", for the first row that is not later than all before it.
-    """
-    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(time)[:-1]])
-    bad = np.flatnonzero(time <= before) if len(time) else time[:0]
-    if not len(bad):
+        _blame(file, text, held, columns, delimiter, unit, gaps)
+    if lines is not None:
+        lines.extend(i + 1 for i in held)
         return time, x, []
-    if bad_time == "raise":
-        k = int(bad[0])
-        raise DataError(
-            "time does not increase",
-            path=row(k),
-            expected=f"a stamp after {before[k]} ns",
-            got=f"{time[k]} ns",
-            fix="bad_time=drop leaves such rows out, bad_time=sort sorts them in",
-        )
-    if bad_time == "drop":
-        kept = time > before
-        return time[kept], x[kept], [f"{name}: {len(bad)} rows out of order left out"]
-    times, first = np.unique(time, return_index=True)
-    twice = len(time) - len(times)
-    note = f"{name}: sorted, {len(bad)} rows were out of order"
-    return times, x[first], [note + (f", {twice} of equal time left out" if twice else "")]
+    where = "/".join(file.parts[-2:])
+    return in_order(where, lambda k: f"{file}, line {held[k] + 1}", time, x, bad_time)
 
 
 def _blame(
@@ -152,7 +102,7 @@ def _blame(
     lines: list[int],
     columns: int,
     delimiter: str | None,
-    seconds: bool,
+    unit: str,
     gaps: bool,
 ) -> None:
     """Raise a DataError for the first malformed row."""
@@ -168,16 +118,21 @@ def _blame(
                 fix="mend or delete the row",
             )
         try:
-            stamp = nanoseconds(cells[0]) if seconds else int(cells[0])
+            stamp = int(cells[0]) if unit == "ns" else as_nanoseconds(cells[0], unit)
             if "_" in cells[0] or not -(2**63) <= stamp < 2**63:
                 raise ValueError
         except ValueError:
+            likely = likely_unit(cells[0]) if unit != "ns" else None
             raise DataError(
                 "the stamp is not a time",
                 path=where,
-                expected="decimal seconds" if seconds else "integer nanoseconds, within 64 bits",
+                expected=f"decimal {_WORDS.get(unit, unit)}"
+                if unit != "ns"
+                else "integer nanoseconds, within 64 bits",
                 got=repr(cells[0]),
-                fix="mend or delete the row",
+                fix=f"these look like {_WORDS[likely]} since 1970: time.unit={likely}"
+                if likely
+                else "mend or delete the row",
             ) from None
         for column, cell in enumerate(cells[1:], start=2):
             try:
@@ -193,18 +148,3 @@ def _blame(
                     got=repr(cell),
                     fix="mend or delete the row",
                 )
-
-
-def strictly_later(seconds: np.ndarray, what: str, file: Path) -> tuple[np.ndarray, list[str]]:
-    """Which rows (n,) come after all before them, and notes that name those that do not."""
-    stamps = np.rint(np.asarray(seconds) * 1e9)
-    before = np.concatenate([[-np.inf], np.maximum.accumulate(stamps)[:-1]])
-    keep = stamps > before
-    bad = np.flatnonzero(~keep)
-    if not len(bad):
-        return keep, []
-    first = int(bad[0])
-    step = 1e3 * float(seconds[first] - seconds[first - 1])
-    more = f"; {len(bad)} rows in all are not after those before them" if len(bad) > 1 else ""
-    note = f"{file.name}: {what}, row {first + 1} is {step:+.3f} ms after the one before{more}: left out"
-    return keep, [note]

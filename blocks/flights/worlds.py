@@ -20,6 +20,7 @@ from flowgraph.blocks import sensors as s
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.signals import NavigationState
 from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 __all__ = ["MOST_SAMPLES", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
@@ -158,8 +159,10 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
     )
     info["across"] = float(np.sqrt(np.mean(np.square(motion.specific_force[:, :2]).sum(-1))))
-    notes = [f"simulated with seed {seed}: {figures(world)}"]
-    notes += [_late(name, streams[name], stamp, world) for name, stamp in stamps.items() if len(stamp)]
+    notes = [note("info", f"simulated with seed {seed}: {figures(world)}")]
+    notes += [
+        note("info", _late(name, streams[name], stamp, world)) for name, stamp in stamps.items() if len(stamp)
+    ]
     return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, tuple(notes))
 
 
