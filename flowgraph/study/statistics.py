@@ -171,8 +171,8 @@ def compared(
             path="--compare",
             expected="runs of the same flight, at the same settings of it, with the same seed",
             got="; ".join([*said, *(f"{n}: {x} and {y}" for n, (x, y) in apart.items())]),
-            fix="run both over the same data, seeds and settings of the flight, or name settings in which pairs"
-            " may differ: --across NAME",
+            fix="run both over the same data, seeds and settings of the flight, or name the settings in"
+            " which pairs may differ: --across NAME",
         )
     return table
 
