@@ -1,8 +1,8 @@
 """What numbers can be: the unit of a field, the range of a geodetic position, and digits that are not there.
 
-A reading in g, a latitude in degrees that was said to be in radians, a motion capture in millimetres: each is a
-column of good numbers. They are told by what they would mean, and refused where they cannot be meant, or
-named in a note where they hardly are.
+A reading in g, a latitude in degrees that was said to be in radians, a motion capture in millimetres: each
+is a column of good numbers. They are told by what they would mean, and refused where they cannot be meant,
+or named in a note where they hardly are.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def geodetic(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Latitudes and longitudes (rad) and heights (m) within their ranges, and notes.
 
-    Longitudes from half a turn to a whole one are taken round; a position of exactly 0, 0 is none, and becomes
-    NaN.
+    Longitudes from half a turn to a whole one are taken round; a position of exactly 0, 0 is none, and
+    becomes NaN.
 
     Args:
         name: of the stream.
@@ -194,7 +194,7 @@ def _placed(name: str, time: np.ndarray, position: np.ndarray, alone: bool) -> l
 
 
 def upright(imu: Series, poses: Series, name: str) -> list[str]:
-    """Notes where attitudes do not turn what the accelerometer reads upwards, or not as fast as the gyroscope.
+    """Notes where attitudes do not turn what is read upwards, or not as fast as the gyroscope says.
 
     Over a flight the specific force is gravity's in the mean. Where the attitudes turn it elsewhere, their
     quaternions are in another order, or the accelerometer's axes or sign are others.

@@ -84,11 +84,17 @@ def run(
     """Run a graph on a flight and compare it with the truth."""
     if out is not None:
         make_ready(out)
-    case, flight = case_of(graph, data, settings, seed)
+    notes: dict[str, None] = {}
+
+    def say(found: tuple[str, ...]) -> None:
+        for note in found:
+            if note not in notes:
+                err_console.print(f"note: {note}", markup=False)
+            notes[note] = None
+
+    case, flight = case_of(graph, data, settings, seed, say)  # said before the run, which may fail
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
-    notes = dict.fromkeys((*flight.notes, *case.notes, *result.notes))
-    for note in notes:
-        err_console.print(f"note: {note}", markup=False)
+    say(result.notes)
     report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report["notes"] = list(notes)
     if out is not None:

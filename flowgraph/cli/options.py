@@ -47,16 +47,26 @@ Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
-def case_of(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
+def case_of(
+    name: str,
+    spec: str,
+    settings: list[str] | None,
+    seed: int,
+    say: Callable[[tuple[str, ...]], None] = lambda notes: None,
+) -> tuple[Case, Flight]:
+    """A graph made ready for a flight; `say` is told the notes of each as soon as they are known."""
     graph = find_graph(name)
     given = pairs(settings)
     if graph.prepare is None:
         return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
     mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
     flight = load_flight(spec, seed=seed, settings=rest)
+    say(flight.notes)
     if "seed" in inspect.signature(graph.prepare).parameters:
         mine.setdefault("seed", seed)
-    return graph.case(flight, **mine), flight
+    case = graph.case(flight, **mine)
+    say(case.notes)
+    return case, flight
 
 
 def graph_of(
