@@ -131,7 +131,7 @@ def _single(name: str, degrees: Mapping[str, np.ndarray]) -> list[str]:
         if len(np.unique(values)) < 5:
             continue
         coarse = values.astype(np.float32).astype(float)
-        if np.allclose(values, coarse, rtol=1e-13, atol=0.0):
+        if np.allclose(values, coarse, rtol=1e-9, atol=0.0):
             step = float(np.spacing(np.float32(np.abs(values).max()))) * 111e3
             said.append(
                 note(
@@ -180,7 +180,7 @@ def _placed(name: str, time: np.ndarray, position: np.ndarray, alone: bool) -> l
     far = float(np.nanmax(np.abs(position)))
     if far > _FAR:
         coarse = float(np.spacing(np.float32(far)))
-        held = (position == position.astype(np.float32).astype(float)) | np.isnan(position)
+        held = np.isclose(position, position.astype(np.float32), rtol=1e-10, atol=0.0, equal_nan=True)
         sentence = (
             f"{name}: positions reach {far:.3g} m, where single precision has steps of {1e3 * coarse:.3g} mm"
         )

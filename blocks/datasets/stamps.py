@@ -208,9 +208,10 @@ def _out_of_order(
 ) -> NoReturn:
     n, lost = len(time), int((~kept).sum())
     back = int(before[k]) - int(time[k])
-    wraps = next((what for size, what in _WRAPS.items() if abs(back - size) < 0.02 * size), None)
     ahead = np.flatnonzero(~kept)
     blamed = int(ahead[0]) if len(ahead) and ahead[0] < k else k  # one that lies ahead of those that follow
+    sizes = _WRAPS if blamed == k else {}
+    wraps = next((what for size, what in sizes.items() if abs(back - size) < 0.02 * size), None)
     enough = max((1.0 - _KEPT) * n, 2)
     remedies = []
     if wraps is None and lost <= enough:
