@@ -2,22 +2,23 @@
 
     csv:FILE  time=stamp  time.unit=ns  imu.gyro=wx,wy,wz  imu.gyro.unit=deg/s  imu.specific_force=ax,ay,az
 
-A column is named by the first row, or by its number from 0 where no row names them. Columns that no setting
-mentions may hold anything. An empty cell or NaN was not measured: that row is absent from its stream, while
-the others keep it, so that sensors of several rates may share a table.
+A column is named by the head of the file, or by its number from 0 where no row names them. Columns that no
+setting mentions may hold anything. An empty cell or NaN was not measured: that row is absent from its stream,
+while the others keep it, so that sensors of several rates may share a table. What a file says of its own
+units is taken, and said.
 """
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Flight
+from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
+from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
 from flowgraph.blocks.datasets.shape import (
     MEASURED_NOISE,
     NOISE_SETTINGS,
@@ -31,6 +32,18 @@ from flowgraph.blocks.datasets.shape import (
     the_file,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
+from flowgraph.blocks.datasets.turns import ORDERS, from_angles, from_matrices
+from flowgraph.blocks.datasets.units import (
+    ANGLE,
+    FIELD,
+    FORCE,
+    LENGTH,
+    RATE,
+    SPEED,
+    TIME,
+    split_unit,
+    unit_of,
+)
 from flowgraph.blocks.signals import (
     Attitude,
     GeodeticPosition,
@@ -40,35 +53,32 @@ from flowgraph.blocks.signals import (
     Pose,
     Position,
 )
-from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.data.notes import note
+from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["SETTINGS", "STREAMS", "load"]
+__all__ = ["SETTINGS", "STREAMS", "claims", "load"]
 
-_DEGREE = np.pi / 180.0
-_LENGTH = {"m": 1.0, "mm": 1e-3}
-_RATE = {"rad/s": 1.0, "deg/s": _DEGREE}
-_FORCE = {"m/s^2": 1.0, "g": 9.80665}
-_FIELD = {"T": 1.0, "uT": 1e-6, "G": 1e-4}
-_ANGLE = {"rad": 1.0, "deg": _DEGREE}
-_ORDER = {"wxyz": 1.0, "xyzw": 1.0}
+_QUATERNION = {"wxyz": 1.0, "xyzw": 1.0}
+_ROWS = {"rows": 1.0, "columns": 1.0}
+_TURNS = {"attitude": (4, _QUATERNION), "angles": (3, ANGLE), "matrix": (9, _ROWS)}
 
 STREAMS: Mapping[str, Mapping[str, tuple[int, Mapping[str, float]]]] = {
-    "imu": {"gyro": (3, _RATE), "specific_force": (3, _FORCE)},
-    "vicon": {"position": (3, _LENGTH), "attitude": (4, _ORDER)},
-    "leica": {"position": (3, _LENGTH)},
-    "gps": {"latitude": (1, _ANGLE), "longitude": (1, _ANGLE), "height": (1, _LENGTH)},
-    "magnetometer": {"field": (3, _FIELD)},
+    "imu": {"gyro": (3, RATE), "specific_force": (3, FORCE)},
+    "vicon": {"position": (3, LENGTH), **_TURNS},
+    "leica": {"position": (3, LENGTH)},
+    "gps": {"latitude": (1, ANGLE), "longitude": (1, ANGLE), "height": (1, LENGTH)},
+    "magnetometer": {"field": (3, FIELD)},
     "truth": {
-        "position": (3, _LENGTH),
-        "attitude": (4, _ORDER),
-        "velocity": (3, {"m/s": 1.0}),
-        "gyro_bias": (3, _RATE),
-        "accelerometer_bias": (3, _FORCE),
+        "position": (3, LENGTH),
+        **_TURNS,
+        "velocity": (3, SPEED),
+        "gyro_bias": (3, RATE),
+        "accelerometer_bias": (3, FORCE),
     },
 }
-"""The fields of each stream: how many columns, and the units (or orders of a quaternion) that they may have,
-the first where nothing is said. All fields of a stream are needed; of the truth, an attitude alone, with a
-position, or all five."""
+"""The fields of each stream: how many columns, and the units (or orders of numbers) that they may have, the
+first where nothing is said. `attitude`, `angles` and `matrix` are three ways to write one field, of which one
+is given. All fields of a stream are needed; of the truth, an attitude alone, with a position, or all five."""
 
 _SIGNALS: Mapping[frozenset[str], Any] = {
     frozenset(STREAMS["imu"]): Imu,
@@ -77,25 +87,37 @@ _SIGNALS: Mapping[frozenset[str], Any] = {
     frozenset(("attitude",)): Attitude,
     frozenset(STREAMS["gps"]): GeodeticPosition,
     frozenset(STREAMS["magnetometer"]): MagneticField,
-    frozenset(STREAMS["truth"]): NavigationState,
+    frozenset(STREAMS["truth"]) - {"angles", "matrix"}: NavigationState,
 }
-_UNITS = {"s": Decimal(10**9), "ms": Decimal(10**6), "us": Decimal(10**3), "ns": Decimal(1)}
-_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": None}
+_TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
+"""Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
+
+
+def _said_by(field: str) -> str:
+    """The setting of what the columns of a field are in."""
+    return "order" if field in ("attitude", "matrix") else "unit"
+
 
 SETTINGS: Mapping[str, str] = {
-    "time": "the column of the stamps; the first if left out",
-    "time.unit": "of the stamps: " + ", ".join(_UNITS),
-    "delimiter": "between columns: " + ", ".join(_DELIMITERS),
+    "time": "the column of the stamps; if left out, that of a name such as t, time or stamp, else the first",
+    "time.unit": "of the stamps: " + ", ".join(TIME),
+    "delimiter": "between columns: " + ", ".join(DELIMITERS) + "; found if left out",
+    "decimal": "the decimal mark: point, comma; found if left out",
+    "comment": "a mark that lines to pass over begin with, beside # % // ! ;",
     **{
         f"{stream}.{field}": f"{n} columns, comma-separated"
         for stream, fields in STREAMS.items()
         for field, (n, _) in fields.items()
     },
     **{
-        f"{stream}.{field}.{'order' if field == 'attitude' else 'unit'}": ", ".join(units)
+        f"{stream}.{field}.{_said_by(field)}": ", ".join(units)
         for stream, fields in STREAMS.items()
         for field, (_, units) in fields.items()
         if len(units) > 1
+    },
+    **{
+        f"{stream}.angles.order": "of the turns, each about an axis of the turned body: " + ", ".join(ORDERS)
+        for stream in ("vicon", "truth")
     },
     **NOISE_SETTINGS,
     **MEASURED_NOISE,
@@ -119,35 +141,47 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
     Raises:
         DataError: the file is missing or has no rows; a cell is not a number or a stamp (file, line); stamps
-            are out of order; values cannot be of the unit that is said.
-        DeclarationError: where no stream is mapped, one lacks a field, or a field has not so many columns.
+            are out of order; values cannot be of the unit that is said; a name is ambiguous.
+        DeclarationError: where no stream is mapped, one lacks a field, a field has not so many columns, or
+            the file says another unit than the setting.
         UnknownNameError: for a setting, unit or column that is not there; lists the valid ones.
     """
     given = {name: str(value) for name, value in (settings or {}).items()}
     known(given, SETTINGS, "csv")
     mapped = _mapped(given)
-    clock = chosen(given, "time.unit", list(_UNITS), "csv")
-    unit = _UNITS[clock]
-    delimiter = _DELIMITERS[chosen(given, "delimiter", list(_DELIMITERS), "csv")]
     made = Recording(
         Path(argument).stem,
         policy(given, "csv"),
         kind="csv",
         given=given,
-        unit=clock,
         units="say its unit with {stream}.{field}.unit={unit}, or convert the file to SI units",
     )
     file = the_file(argument, kind="csv", what="table")
-    names, lines, rows = _rows(file, delimiter)
-    time = np.array(
-        _stamps(file, lines, rows, _column(file, names, given.get("time", "0")), unit), dtype=np.int64
-    )
+    sheet = _sheet(file, given, mapped)
+    made.notes.extend(sheet.notes)
+    clock = _clock(sheet, given, mapped, made.notes)
+    places = {
+        (stream, field): [sheet.column(name) for name in names]
+        for stream, fields in mapped.items()
+        for field, names in fields.items()
+    }
+    used = {clock, *(k for group in places.values() for k in group)}
+    cells = {k: sheet.cells(k) for k in sorted(used)}
+    mark = chosen(given, "decimal", ("point", "comma"), "csv") if "decimal" in given else None
+    decimal, said = decimal_mark(list(cells.values()), sheet.where, mark)
+    if said:
+        made.notes.append(said.replace("numbers", f"{file.name}: numbers"))
+    made.unit = unit = _time_unit(sheet, given, clock, made.notes)
+    time, said = stamps(cells[clock], sheet.where, unit=unit, decimal=decimal)
+    if said:
+        made.notes.append(said.replace("stamps", f"{file.name}: stamps"))
     for stream, fields in mapped.items():
         columns = {}
-        for field, chosen_columns in fields.items():
-            places = [_column(file, names, name) for name in chosen_columns]
-            numbers = _numbers(file, lines, rows, places)
-            columns[field] = _converted(given, stream, field, numbers)
+        for field in fields:
+            group = places[stream, field]
+            parts = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
+            name, values = _converted(given, sheet, stream, field, group, np.stack(parts, axis=1), made.notes)
+            columns[name] = values
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
         made.add(
@@ -156,12 +190,44 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             time[kept],
             {f: c[kept] for f, c in columns.items()},
             _SIGNALS[frozenset(columns)],
-            row=lambda k, kept=kept: f"{file}, line {lines[kept[k]]}",  # type: ignore[misc]
+            row=lambda k, kept=kept: sheet.where(kept[k]),  # type: ignore[misc]
         )
     if "imu" in made.streams:
         made.info["imu_noise"] = imu_noise(given, "csv", made.notes)
     measured_noise(given, "csv", made.info)
     return made.flight()
+
+
+def claims(argument: str, settings: Mapping[str, str]) -> set[str]:
+    """Which of the settings of a flight of several parts are for this file: those of streams all of whose
+    columns it has, and all that are not of a stream."""
+    given = {n: v for n, v in settings.items() if n in SETTINGS}
+    mapped = {n: _listed(v) for n, v in given.items() if n.count(".") == 1 and n.split(".")[0] in STREAMS}
+    mapped = {n: columns for n, columns in mapped.items() if n.split(".")[1] in STREAMS[n.split(".")[0]]}
+    file = the_file(argument, kind="csv", what="table")
+    wanted = [c for columns in mapped.values() for c in columns]
+    sheet = read_sheet(file, delimiter=_delimiter(given), comment=given.get("comment"), wanted=wanted)
+    elsewhere = {n.split(".")[0] for n, columns in mapped.items() if not all(map(sheet.matches, columns))}
+    lost = {n for n in given if n.split(".")[0] in elsewhere}
+    if "time" in given and not sheet.matches(given["time"]):
+        lost.add("time")
+    return set(given) - lost
+
+
+def _listed(text: str) -> list[str]:
+    return [" ".join(c.split()) for c in text.split(",")]
+
+
+def _delimiter(given: Mapping[str, str]) -> str | None:
+    return chosen(given, "delimiter", list(DELIMITERS), "csv") if "delimiter" in given else None
+
+
+def _sheet(file: Path, given: Mapping[str, str], mapped: Mapping[str, Mapping[str, list[str]]]) -> Sheet:
+    wanted = [name for fields in mapped.values() for names in fields.values() for name in names]
+    clock = [given["time"]] if "time" in given else list(_TIMES)
+    return read_sheet(
+        file, delimiter=_delimiter(given), comment=given.get("comment"), wanted=[*wanted, *clock]
+    )
 
 
 def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
@@ -172,24 +238,32 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
             text = given.get(f"{stream}.{field}")
             if text is None:
                 continue
-            columns = [c.strip() for c in text.split(",")]
+            columns = _listed(text)
             if len(columns) != n:
+                other = next((f for f in _TURNS if field in _TURNS and _TURNS[f][0] == len(columns)), field)
                 raise DeclarationError(
                     f"{stream}.{field} has not so many columns",
                     path=f"csv.{stream}.{field}",
                     expected=f"{n} column{'s' if n > 1 else ''}, comma-separated",
                     got=f"{len(columns)}: {text}",
-                    fix=f"write {stream}.{field}=" + ",".join("abcd"[:n]),
+                    fix=f"write {stream}.{field}=" + ",".join("abcdefghi"[:n])
+                    if other == field
+                    else f"write {stream}.{other}={text} if they are "
+                    + ("roll, pitch and yaw" if other == "angles" else f"a {other}"),
                 )
             mapped.setdefault(stream, {})[field] = columns
     for stream, found in mapped.items():
-        if frozenset(found) not in _SIGNALS or (stream != "truth" and set(found) != set(STREAMS[stream])):
+        ways = [f for f in found if f in _TURNS]
+        kinds = frozenset("attitude" if f in _TURNS else f for f in found)
+        needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
+        if len(ways) > 1 or kinds not in _SIGNALS or (stream != "truth" and set(kinds) != needed):
             raise DeclarationError(
-                f"{stream} lacks a field",
+                f"{stream} lacks a field" if len(ways) < 2 else f"{stream} has its attitude twice",
                 path=f"csv.{stream}",
-                expected=", ".join(f"{stream}.{f}" for f in STREAMS[stream]),
+                expected=", ".join(f"{stream}.{f}" for f in STREAMS[stream] if f in needed)
+                + (" (or angles, or matrix)" if "attitude" in needed else ""),
                 got=", ".join(f"{stream}.{f}" for f in found),
-                fix="name the columns of the others too",
+                fix="name the columns of the others too" if len(ways) < 2 else "leave one of them out",
             )
     if not mapped:
         raise DeclarationError(
@@ -202,109 +276,143 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
     return mapped
 
 
-def _rows(file: Path, delimiter: str | None) -> tuple[list[str], list[int], list[list[str]]]:
-    """The names of the columns (or none), and the line number and cells of each row."""
-    text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    held = [(i, line) for i, line in enumerate(text, start=1) if line.strip()]
-    split = [
-        (i, line.split() if delimiter is None else next(csv.reader([line], delimiter=delimiter)))
-        for i, line in held
-    ]
-    cells = [(i, [c.strip() for c in row]) for i, row in split]
-    names: list[str] = []
-    remarks = [(i, row) for i, row in cells if row[0].startswith("#")]
-    cells = [(i, row) for i, row in cells if not row[0].startswith("#")]
-    if cells and not _is_number(cells[0][1][0]):
-        names, cells = cells[0][1], cells[1:]
-    elif cells and remarks and remarks[0][0] < cells[0][0]:  # names behind a #, or just a remark
-        words = [c.strip() for c in [remarks[0][1][0].lstrip("#"), *remarks[0][1][1:]]]
-        words = words if words[0] else words[1:]
-        names = words if len(words) == len(cells[0][1]) else []
-    if not cells:
+def _clock(
+    sheet: Sheet,
+    given: Mapping[str, str],
+    mapped: Mapping[str, Mapping[str, list[str]]],
+    notes: list[str],
+) -> int:
+    """The column of the stamps.
+
+    Raises:
+        DataError: where several may be it, or the first is the index of a table and no other is named as one.
+        UnknownNameError: for a column that is not there.
+    """
+    if "time" in given:
+        return sheet.column(" ".join(given["time"].split()))
+    if not sheet.names:
+        return 0
+    taken = {
+        k for fields in mapped.values() for names in fields.values() for n in names for k in sheet.matches(n)
+    }
+    found = [k for k, n in enumerate(sheet.names) if k not in taken and _base(n) in _TIMES]
+    if len(found) > 1:
+        names = [sheet.names[k] for k in found]
         raise DataError(
-            "no rows",
-            path=str(file),
-            expected="rows of a stamp and numbers",
-            got=f"{len(text)} lines, all empty, comments or names",
-            fix="restore the file",
+            "several columns may be the time",
+            path=str(sheet.file),
+            expected="one column with a name such as t, time or stamp",
+            got=", ".join(names),
+            fix="say which: " + " or ".join(f"time={n}" for n in dict.fromkeys(names)),
         )
-    return names, [i for i, _ in cells], [row for _, row in cells]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        Decimal(cell)
-    except InvalidOperation:
-        return False
-    return True
-
-
-def _column(file: Path, names: list[str], name: str) -> int:
-    if name in names:
-        return names.index(name)
-    if name.isdecimal() and (not names or int(name) < len(names)):
-        return int(name)
-    raise UnknownNameError("column", name, names or ["0", "1", "..."], path=str(file))
-
-
-def _cell(file: Path, line: int, row: list[str], place: int) -> str:
-    if place >= len(row):
+    if found:
+        if found[0]:
+            notes.append(note("assumed", f"{sheet.file.name}: column {sheet.names[found[0]]!r} is the time"))
+        return found[0]
+    first = sheet.names[0]
+    if first == "" or first.lower().startswith("unnamed:") or first.lower() in ("index", "row.names", "row"):
         raise DataError(
-            "wrong number of columns",
-            path=f"{file}, line {line}",
-            expected=f"at least {place + 1}",
-            got=f"{len(row)}",
-            fix="mend or delete the row, or check the delimiter",
+            "the first column is an index of rows, not a time",
+            path=str(sheet.file),
+            expected="a column of stamps",
+            got=f"the name {first!r} and {', '.join(sheet.cells(0)[:3])} ...",
+            fix="name the column of the stamps: time="
+            + " or ".join(dict.fromkeys(filter(None, sheet.names[1:4]))),
         )
-    return row[place]
+    return 0
 
 
-def _stamps(file: Path, lines: list[int], rows: list[list[str]], place: int, unit: Decimal) -> list[int]:
-    found = []
-    for line, row in zip(lines, rows, strict=True):
-        cell = _cell(file, line, row, place)
-        try:
-            stamp = Decimal(cell) * unit
-            if "_" in cell or not -(2**63) <= stamp < 2**63:
-                raise ValueError
-            found.append(int(stamp.to_integral_value()))
-        except (InvalidOperation, ValueError):
-            raise DataError(
-                "the stamp is not a time",
-                path=f"{file}, line {line}",
-                expected="a number within 64 bits of nanoseconds",
-                got=repr(cell),
-                fix="mend the row, or say the unit: time.unit=" + " or ".join(_UNITS),
-            ) from None
-    return found
+def _base(name: str) -> str:
+    """The name of a clock without its unit, which may also be its last part: `timestamp_ns`."""
+    plain, _, last = split_unit(name)[0].lower().rpartition("_")
+    return plain if plain and last in TIME else split_unit(name)[0].lower()
 
 
-def _numbers(file: Path, lines: list[int], rows: list[list[str]], places: list[int]) -> np.ndarray:
-    table = np.empty((len(rows), len(places)))
-    for k, (line, row) in enumerate(zip(lines, rows, strict=True)):
-        for j, place in enumerate(places):
-            cell = _cell(file, line, row, place)
-            try:
-                table[k, j] = float(cell) if cell else np.nan
-                if "_" in cell or np.isinf(table[k, j]):
-                    raise ValueError
-            except ValueError:
-                raise DataError(
-                    f"column {place + 1} is not a finite number",
-                    path=f"{file}, line {line}",
-                    expected="a finite number, or nothing where none was measured",
-                    got=repr(cell),
-                    fix="mend or delete the row",
-                ) from None
-    return table
+def _time_unit(sheet: Sheet, given: Mapping[str, str], clock: int, notes: list[str]) -> str:
+    """The unit of the stamps: as the setting or the file says; seconds where neither does."""
+    if "time.unit" in given:
+        chosen(given, "time.unit", list(TIME), "csv")
+    found = _units(sheet, given, "time.unit", [clock], TIME, notes)
+    if not found and sheet.names:
+        last = sheet.names[clock].lower().rpartition("_")[2]
+        if "_" in sheet.names[clock] and last in TIME and last != "s" and "time.unit" not in given:
+            notes.append(note("info", f"time.unit: {last}, as the name {sheet.names[clock]!r} says"))
+            return last
+    return found or given.get("time.unit", "s")
 
 
-def _converted(given: Mapping[str, str], stream: str, field: str, numbers: np.ndarray) -> np.ndarray:
-    """In SI units; a quaternion scalar first; a lone column without its axis."""
+def _units(
+    sheet: Sheet,
+    given: Mapping[str, str],
+    key: str,
+    places: list[int],
+    valid: Mapping[str, Any],
+    notes: list[str],
+) -> str:
+    """What the file says of the unit of columns, "" where it says nothing that is understood.
+
+    Raises:
+        DeclarationError: where the setting says another; DataError: where it cannot be the unit of these.
+    """
+    texts = [sheet.units[k] for k in places] if sheet.units else []
+    written = {unit_of(t) for t in texts if t}
+    path = f"{sheet.file}, line {sheet.said_at}"
+    if "" in written:
+        unclear = next(t for t in texts if t and not unit_of(t))
+        notes.append(
+            note("skipped", f"{sheet.file.name}: line {sheet.said_at}, unit {unclear!r} not understood")
+        )
+    written -= {"", "none"}
+    if not written:
+        return ""
+    if len(written) > 1 or not written <= set(valid):
+        raise DataError(
+            f"the units of these columns cannot be those of {key.rsplit('.', 1)[0]}",
+            path=path,
+            expected="one of " + ", ".join(valid),
+            got=", ".join(texts),
+            fix="check the columns, or mend the units in the file",
+        )
+    (unit,) = written
+    if given.get(key, unit) != unit:
+        raise DeclarationError(
+            f"the file says another unit than {key}",
+            path=path,
+            expected=f"{key}={unit}, as the file says",
+            got=f"{key}={given[key]}",
+            fix=f"leave {key} out, or mend the file",
+        )
+    if key not in given and unit != next(iter(valid)):
+        notes.append(note("info", f"{key}: {unit}, as line {sheet.said_at} of {sheet.file.name} says"))
+    return unit
+
+
+def _converted(
+    given: Mapping[str, str],
+    sheet: Sheet,
+    stream: str,
+    field: str,
+    places: list[int],
+    values: np.ndarray,
+    notes: list[str],
+) -> tuple[str, np.ndarray]:
+    """The name of the field, and its values in SI units: a quaternion scalar first; a lone column without its
+    axis."""
     width, units = STREAMS[stream][field]
-    key = f"{stream}.{field}.{'order' if field == 'attitude' else 'unit'}"
+    key = f"{stream}.{field}.{_said_by(field)}"
     unit = chosen(given, key, list(units), "csv")
     if field == "attitude":
-        return numbers[:, [3, 0, 1, 2]] if unit == "xyzw" else numbers
-    numbers = numbers * units[unit]
-    return numbers[:, 0] if width == 1 else numbers
+        return field, values[:, [3, 0, 1, 2]] if unit == "xyzw" else values
+    if field == "matrix":
+        return "attitude", from_matrices(values, sheet.where, by_rows=unit == "rows")
+    said = _units(sheet, given, key, places, units, notes)
+    if field != "angles":
+        values = values * units[said or unit]
+        return field, values[:, 0] if width == 1 else values
+    if not said and key not in given:
+        said = "deg" if np.nanmax(np.abs(values), initial=0.0) > 2.0 * np.pi else "rad"
+        notes.append(note("assumed", f"{stream}.angles are in {said}; {key} says it"))
+    order = chosen(given, f"{stream}.angles.order", ORDERS, "csv")
+    if f"{stream}.angles.order" not in given:
+        notes.append(note("assumed", f"{stream}.angles are roll, pitch, yaw, turned in the order {order}"))
+    return "attitude", from_angles(values * units[said or unit], order)

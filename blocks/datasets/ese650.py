@@ -112,9 +112,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     reading = calibrated.step(counts.values, calibration=calibration, xp=np)
     columns = {"gyro": reading.gyro, "specific_force": reading.specific_force}
     made.add("imu", str(folder / f"imuRaw{n}.mat"), counts.time, columns, Imu)
-    made.info.update(
-        imu_noise=imu_noise(given, "ese650", made.notes, NOISE), calibration=calibration, calibrated_by=by
-    )
+    made.info.update(calibration=calibration, calibrated_by=by)
+    made.info["imu_noise"] = imu_noise(given, "ese650", made.notes, NOISE)
     source = f"sets {', '.join(map(str, by))}" if by else "the data sheet"
     made.notes.append(note("info", f"imu: calibrated by {source}"))
     return made.flight()

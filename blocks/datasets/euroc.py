@@ -7,8 +7,9 @@
                                                     t[ns], p, q wxyz, v, gyro bias, accelerometer bias
     MH_01_easy/groundtruth.tum                      t[s], p, q xyzw (beside mav0 or in it)
 
-Stamps are read as integers, exactly. Of the relatives: mocap0 in place of vicon0, imu0.csv in place of a folder,
-a truth of fewer columns, no sensor.yaml or Kalibr's, quaternions with the scalar last where the names say so.
+Stamps are read as integers, exactly. Of the relatives: mocap0 in place of vicon0, imu0.csv in place of a
+folder, a truth of fewer columns, no sensor.yaml or Kalibr's, and quaternions with the scalar last where the
+names of the columns say so.
 
 Source: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
@@ -61,7 +62,6 @@ SETTINGS: Mapping[str, str] = {
 
 _READINGS = {"gyro": [0, 1, 2], "specific_force": [3, 4, 5]}
 _POSE = {"position": [0, 1, 2], "attitude": [3, 4, 5, 6]}
-_SCALAR_LAST = {"position": [0, 1, 2], "attitude": [6, 3, 4, 5]}
 _STATE = {**_POSE, "velocity": [7, 8, 9], "gyro_bias": [10, 11, 12], "accelerometer_bias": [13, 14, 15]}
 _TRUTHS = ("state_groundtruth_estimate0", "ground_truth0", "groundtruth0", "gt0")
 
@@ -130,7 +130,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     if vicon is not None:
         lever, mount = extrinsics(vicon / "sensor.yaml") or UNMOUNTED
         data = _need(vicon / "data.csv", "the motion capture")
-        add("vicon", data, _pose_of(data, made.notes), Pose, mount=mount)
+        add("vicon", data, _POSE, Pose, mount=mount, scalar_last=_scalar_last(data, made.notes))
         info.setdefault("vicon_lever", _from(lever, at))
         info.setdefault("vicon_mount", mount)
     asl = next((f for n in _TRUTHS if (f := mav / n / "data.csv").is_file()), None)
@@ -138,13 +138,15 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     if asl is not None:
         width, fields, signal = _truth_of(asl, made.notes)
     elif tum is not None:
-        width, fields, signal = 7, _SCALAR_LAST, Pose
+        width, fields, signal = 7, _POSE, Pose
     if (asl or tum) is None:
         made.notes.append(note("info", f"no ground truth: no {_TRUTHS[0]}/data.csv and no groundtruth.tum"))
     else:
         if any(at) and "attitude" in fields:
             made.given.setdefault("truth.lever", [-x for x in at])
-        how: dict[str, Any] = {"unit": "s", "delimiter": None} if asl is None else {}
+        how: dict[str, Any] = {"unit": "s", "delimiter": None, "scalar_last": True}
+        if asl is not None:
+            how = {"scalar_last": "attitude" in fields and _scalar_last(asl, made.notes)}
         add("truth", asl or tum, fields, signal, width=width, **how)  # type: ignore[arg-type]
     measured_noise(given, "euroc", info)
     _passed_over(mav, {imu0, leica, vicon, asl and asl.parent}, made.notes)
@@ -193,13 +195,13 @@ def _names(file: Path) -> list[str]:
     return cells if not any(re.fullmatch(r"[-+\d.e]+", c) for c in cells) else []
 
 
-def _pose_of(file: Path, notes: list[str]) -> Mapping[str, list[int]]:
-    """Where a table has its position and attitude: the scalar last where the names of the columns say so."""
+def _scalar_last(file: Path, notes: list[str]) -> bool:
+    """Whether the names of a table's columns say that its quaternions are x, y, z, w."""
     ends = [re.sub(r".*?_?q_?(?:rs_)?([wxyz])$", r"\1", n) for n in _names(file)][4:8]
-    if ends == ["x", "y", "z", "w"]:
+    last = ends == ["x", "y", "z", "w"]
+    if last:
         notes.append(note("info", f"{file.parent.name}: quaternions with the scalar last, by their names"))
-        return _SCALAR_LAST
-    return _POSE
+    return last
 
 
 def _truth_of(file: Path, notes: list[str]) -> tuple[int, Mapping[str, list[int]], Any]:
@@ -216,17 +218,17 @@ def _truth_of(file: Path, notes: list[str]) -> tuple[int, Mapping[str, list[int]
     if width == 10:
         notes.append(note("skipped", "truth: the velocities, for want of biases beside them"))
     if width in (7, 10):
-        return width, _pose_of(file, notes), Pose
+        return width, _POSE, Pose
     if row and width != 16:
         raise DataError(
             "wrong number of columns",
             path=str(file),
-            expected="17 (stamp, position, quaternion, velocity, both biases), 11 (without biases), 8 (poses) or "
+            expected="17 (stamp, position, quaternion, velocity, both biases), 11 (no biases), 8 (poses) or "
             "4 (positions)",
             got=f"{width + 1}: {row[:60]!r}",
             fix="restore the file, or leave out what is beyond the pose",
         )
-    return 16, {**_STATE, **_pose_of(file, notes)}, NavigationState
+    return 16, _STATE, NavigationState
 
 
 def _from(lever: tuple[float, ...], at: tuple[float, ...]) -> tuple[float, ...]:

@@ -1,8 +1,8 @@
 """What numbers can be: the unit of a field, the range of a geodetic position, and digits that are not there.
 
-A reading in g, a latitude in degrees that was said to be in radians, a motion capture in millimetres: each is a
-column of good numbers. They are told by what they would mean, and refused where they cannot be meant, or
-named in a note where they hardly are.
+A reading in g, a latitude in degrees that was said to be in radians, a motion capture in millimetres: each
+is a column of good numbers. They are told by what they would mean, and refused where they cannot be meant,
+or named in a note where they hardly are.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def geodetic(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Latitudes and longitudes (rad) and heights (m) within their ranges, and notes.
 
-    Longitudes from half a turn to a whole one are taken round; a position of exactly 0, 0 is none, and becomes
-    NaN.
+    Longitudes from half a turn to a whole one are taken round; a position of exactly 0, 0 is none, and
+    becomes NaN.
 
     Args:
         name: of the stream.
@@ -135,7 +135,7 @@ def _single(name: str, degrees: Mapping[str, np.ndarray]) -> list[str]:
         if len(np.unique(values)) < 5:
             continue
         coarse = values.astype(np.float32).astype(float)
-        if np.allclose(values, coarse, rtol=1e-13, atol=0.0):
+        if np.allclose(values, coarse, rtol=1e-9, atol=0.0):
             step = float(np.spacing(np.float32(np.abs(values).max()))) * 111e3
             said.append(
                 note(
@@ -184,7 +184,7 @@ def _placed(name: str, time: np.ndarray, position: np.ndarray, alone: bool) -> l
     far = float(np.nanmax(np.abs(position)))
     if far > _FAR:
         coarse = float(np.spacing(np.float32(far)))
-        held = (position == position.astype(np.float32).astype(float)) | np.isnan(position)
+        held = np.isclose(position, position.astype(np.float32), rtol=1e-10, atol=0.0, equal_nan=True)
         sentence = (
             f"{name}: positions reach {far:.3g} m, where single precision has steps of {1e3 * coarse:.3g} mm"
         )
@@ -198,7 +198,7 @@ def _placed(name: str, time: np.ndarray, position: np.ndarray, alone: bool) -> l
 
 
 def upright(imu: Series, poses: Series, name: str) -> list[str]:
-    """Notes where attitudes do not turn what the accelerometer reads upwards, or not as fast as the gyroscope.
+    """Notes where attitudes do not turn what is read upwards, or not as fast as the gyroscope says.
 
     Over a flight the specific force is gravity's in the mean. Where the attitudes turn it elsewhere, their
     quaternions are in another order, or the accelerometer's axes or sign are others.

@@ -144,7 +144,7 @@ _TYPICAL = ImuNoise(gyro=2e-4, accelerometer=2e-3, gyro_bias=2e-5, accelerometer
 def imu_noise(
     given: Mapping[str, Any], path: str, notes: list[str], otherwise: ImuNoise = _TYPICAL
 ) -> ImuNoise:
-    """The unit's noise from `NOISE_SETTINGS`; where one is left out that of `otherwise`, and a note says so."""
+    """The unit's noise from `NOISE_SETTINGS`; what is left out is that of `otherwise`, and a note says so."""
     usual = vars(otherwise)
     names = dict(
         zip(NOISE_SETTINGS, ("gyro", "accelerometer", "gyro_bias", "accelerometer_bias"), strict=True)

@@ -167,6 +167,7 @@ class Recording:
         mount: tuple[float, ...] | None = None,
         raw: bool = False,
         exact: bool = False,
+        scalar_last: bool = False,
     ) -> Series:
         """A stream, or the truth where `name` is "truth".
 
@@ -185,6 +186,7 @@ class Recording:
             mount: quaternion, sensor to body, as the recording has it: it is taken out.
             raw: whether the numbers are counts, of which nothing is known.
             exact: whether attitudes are of unit norm as they were made, and not read.
+            scalar_last: whether attitudes are x, y, z, w; they are put scalar first.
 
         Raises:
             DataError: for stamps that are no clock's or out of order, infinite values, attitudes that are
@@ -210,6 +212,8 @@ class Recording:
             flat = {n: np.where(gone[:, None], np.nan, part) for n, part in flat.items()}
         if "attitude" in flat and not exact:
             flat["attitude"] = unit_quaternions(flat["attitude"], place, where)
+        if scalar_last:
+            flat["attitude"] = flat["attitude"][:, [3, 0, 1, 2]]
         if "latitude" in flat:
             flat, said = geodetic(name, flat, where, lambda field: self._convert(name, field))
             self.notes += said

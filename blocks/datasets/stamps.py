@@ -1,8 +1,8 @@
 """Stamps: in which unit they are, whether they can be a clock's, and what to do with those out of order.
 
 A wrong stamp looks like any other number. What gives it away is the company it keeps: a step of 44 years
-beside steps of 20 ms, an inertial unit of 50 MHz, a table in which nearly all stamps are equal. What cannot be
-is refused by its row; a remedy that would throw most of a recording away is not offered.
+beside steps of 20 ms, an inertial unit of 50 MHz, a table in which nearly all stamps are equal. What cannot
+be is refused by its row; a remedy that would throw most of a recording away is not offered.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def as_nanoseconds(stamp: str, unit: str) -> int:
     """
     try:
         number = Decimal(stamp)
-        if "_" in stamp or not -9_223_372_036 < number * UNITS[unit] / 10**9 < 9_223_372_036:
+        most = Decimal(9_223_372_036 * 10**9) / UNITS[unit]
+        if "_" in stamp or not -most < number < most:
             raise ValueError
         return int((number * UNITS[unit]).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError) as error:
@@ -164,7 +165,7 @@ def in_order(
 
 
 def _kept(time: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Which rows (n,) are left in order: those after all before them, unless a few of them lie ahead of most."""
+    """Which rows (n,) are left in order: those after all before them, unless a few lie ahead of most."""
     kept = time > before
     if kept.mean() >= _KEPT:
         return kept
@@ -197,8 +198,8 @@ def _all_alike(row: Callable[[int], str], time: np.ndarray, different: int) -> N
         path=row(int(same[0]) + 1 if len(same) else 0),
         expected="a stamp of its own for each row",
         got=f"{len(time)} rows with {different} different stamp{'s' * (different != 1)}",
-        fix="write the stamps with all their digits (six is what a C++ stream or %g gives), or check the column "
-        "and the unit of the time",
+        fix="write the stamps with all their digits (a C++ stream and %g write six), or check the column and "
+        "the unit of the time",
     )
 
 
@@ -207,9 +208,10 @@ def _out_of_order(
 ) -> NoReturn:
     n, lost = len(time), int((~kept).sum())
     back = int(before[k]) - int(time[k])
-    wraps = next((what for size, what in _WRAPS.items() if abs(back - size) < 0.02 * size), None)
     ahead = np.flatnonzero(~kept)
     blamed = int(ahead[0]) if len(ahead) and ahead[0] < k else k  # one that lies ahead of those that follow
+    sizes = _WRAPS if blamed == k else {}
+    wraps = next((what for size, what in sizes.items() if abs(back - size) < 0.02 * size), None)
     enough = max((1.0 - _KEPT) * n, 2)
     remedies = []
     if wraps is None and lost <= enough:

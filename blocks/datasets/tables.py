@@ -1,7 +1,7 @@
 """Tables of time-stamped numbers in text files: fast, exact in time, and precise about a bad row.
 
 The whole file is read in one go by NumPy's C parser, stamps as integers. Only if that fails is it gone
-through line by line, to find the row to blame.
+through cell by cell, to find what dialect it is in, or the row to blame.
 """
 
 from __future__ import annotations
@@ -11,20 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from flowgraph.blocks.datasets.stamps import (
-    POLICIES,
-    UNITS,
-    as_nanoseconds,
-    in_order,
-    likely_unit,
-    nanoseconds,
-    strictly_later,
-)
+from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
+from flowgraph.blocks.datasets.dialect import Sheet, lines_of, read_sheet, text_of
+from flowgraph.blocks.datasets.stamps import POLICIES, in_order, nanoseconds, strictly_later
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
-__all__ = ["POLICIES", "UNITS", "in_order", "nanoseconds", "read_table", "strictly_later"]
-
-_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+__all__ = ["POLICIES", "in_order", "nanoseconds", "read_table", "strictly_later"]
 
 
 def read_table(
@@ -37,14 +30,17 @@ def read_table(
     gaps: bool = False,
     lines: list[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Read rows of a stamp and `columns` numbers. Empty lines and lines that start with # are passed over.
+    """Read rows of a stamp and `columns` numbers. Empty lines and comments are passed over.
+
+    What is not as expected, such as another delimiter, a decimal comma or a row of names, is read as
+    `dialect.read_sheet` finds it.
 
     Args:
         file: a text file.
         columns: how many numbers follow the stamp.
         bad_time: one of `POLICIES`.
-        delimiter: between columns; None for white space.
-        unit: of the stamps, of `UNITS`: whole numbers of ns, decimal numbers of others.
+        delimiter: between columns, where nothing speaks against it; None for white space.
+        unit: of the stamps, of `units.TIME`: whole numbers of ns; of others decimal numbers, or dates.
         gaps: whether a NaN is data, a number that was not measured; otherwise it is refused.
         lines: to be filled with the line of each row, from 1; then rows stay as they are in the file, and
             their order is left to the caller.
@@ -56,95 +52,94 @@ def read_table(
     Raises:
         DataError: the file has no rows, or a row is malformed or out of order; names the file and the line.
     """
-    text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()  # some editors write a mark
-    held = [i for i, line in enumerate(text) if line and not line.isspace() and line[0] != "#"]
-    rows = [text[i] for i in held]
-    if not rows:
-        raise DataError(
-            "no rows",
-            path=str(file),
-            expected=f"rows of a stamp and {columns} numbers",
-            got=f"{len(text)} lines, all empty or comments",
-            fix="restore the file",
-        )
-    stamp = "i8" if unit == "ns" else "U40"
+    text, said = text_of(file)
+    held = [(i, line) for i, line in enumerate(lines_of(text), start=1) if line.strip() and line[0] != "#"]
     try:
+        at, rows = [i for i, _ in held], [line for _, line in held]
+        if not rows:
+            raise ValueError
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a stamp like 1e9 is parsed through a float, with a warning
-            dtype = np.dtype([("time", stamp), ("x", "f8", (columns,))])
+            dtype = np.dtype([("time", "i8" if unit == "ns" else "U40"), ("x", "f8", (columns,))])
             table = np.loadtxt(rows, delimiter=delimiter, dtype=dtype, comments=None, ndmin=1)
-        time = np.array(
-            table["time"] if unit == "ns" else [as_nanoseconds(t, unit) for t in table["time"]],
-            dtype=np.int64,
-        )
+        time = table["time"]
+        if unit != "ns":
+            time, clock = stamps(table["time"].tolist(), lambda k: f"{file}, line {at[k]}", unit=unit)
+            said = [*said, *filter(None, [clock])]
         x = np.ascontiguousarray(table["x"])
-    except (ValueError, OverflowError, Warning) as error:
-        _blame(file, text, held, columns, delimiter, unit, gaps)
-        raise DataError(
-            "this is not a table of numbers",
-            path=f"{file}, lines {held[0] + 1} to {held[-1] + 1}",
-            expected=f"rows of a stamp and {columns} numbers",
-            got=str(error),
-            fix="mend or delete the row",
-        ) from error
-    if np.isinf(x).any() or (not gaps and np.isnan(x).any()):
-        _blame(file, text, held, columns, delimiter, unit, gaps)
+        if np.isinf(x).any() or (not gaps and np.isnan(x).any()):
+            raise ValueError
+    except (ValueError, OverflowError, Warning):
+        at, time, x, more = _in_dialect(file, columns, delimiter, unit, gaps)
+        said = [*said, *more]
     if lines is not None:
-        lines.extend(i + 1 for i in held)
-        return time, x, []
+        lines.extend(at)
+        return time, x, said
     where = "/".join(file.parts[-2:])
-    return in_order(where, lambda k: f"{file}, line {held[k] + 1}", time, x, bad_time)
+    time, x, moved = in_order(where, lambda k: f"{file}, line {at[k]}", time, x, bad_time)
+    return time, x, [*said, *moved]
 
 
-def _blame(
-    file: Path,
-    text: list[str],
-    lines: list[int],
-    columns: int,
-    delimiter: str | None,
-    unit: str,
-    gaps: bool,
-) -> None:
-    """Raise a DataError for the first malformed row."""
-    for i in lines:
-        cells = text[i].strip().split(delimiter)
-        where = f"{file}, line {i + 1}"
-        if len(cells) != columns + 1:
+def _in_dialect(
+    file: Path, columns: int, delimiter: str | None, unit: str, gaps: bool
+) -> tuple[list[int], np.ndarray, np.ndarray, list[str]]:
+    """Lines, times, numbers and notes of a table that is not plain.
+
+    Raises:
+        DataError: for the first malformed row.
+    """
+    sheet = read_sheet(file, width=columns + 1, otherwise=delimiter)
+    for k, row in enumerate(sheet.rows):
+        if len(row) > columns + 1 and not any(row[columns + 1 :]):
+            del row[columns + 1 :]
+        if len(row) != columns + 1:
             raise DataError(
                 "wrong number of columns",
-                path=where,
+                path=sheet.where(k),
                 expected=f"{columns + 1}: a stamp and {columns} numbers",
-                got=f"{len(cells)}: {text[i][:60]!r}",
+                got=f"{len(row)}: {', '.join(row)[:60]!r}",
                 fix="mend or delete the row",
             )
+    cells = [sheet.cells(k) for k in range(columns + 1)]
+    decimal, said = decimal_mark(cells, sheet.where, None)
+    clock = ""
+    if unit == "ns" and not any(c in cells[0][0] for c in ":T/"):
+        time = _whole(cells[0], sheet)
+    else:
+        time, clock = stamps(cells[0], sheet.where, unit=unit, decimal=decimal)
+    x = np.empty((len(time), columns))
+    for k in range(columns):
+        x[:, k] = numbers(cells[k + 1], sheet.where, k + 1, decimal=decimal, blank=False)
+        absent = np.flatnonzero(np.isnan(x[:, k]))
+        if len(absent) and not gaps:
+            raise DataError(
+                f"column {k + 2} is not a finite number",
+                path=sheet.where(int(absent[0])),
+                expected="a finite number",
+                got=repr(cells[k + 1][absent[0]]),
+                fix="mend or delete the row",
+            )
+    passed = note("skipped", f"{file.name}: ")  # what a plain table may have, and is not said of it
+    notes = [n for n in sheet.notes if not (n.startswith(passed) and n.endswith("of comment"))]
+    return sheet.lines, time, x, [*notes, *filter(None, [said, clock])]
+
+
+def _whole(cells: list[str], sheet: Sheet) -> np.ndarray:
+    """Stamps that are whole nanoseconds.
+
+    Raises:
+        DataError: for the first that is not.
+    """
+    for k, cell in enumerate(cells):
         try:
-            stamp = int(cells[0]) if unit == "ns" else as_nanoseconds(cells[0], unit)
-            if "_" in cells[0] or not -(2**63) <= stamp < 2**63:
+            if "_" in cell or not -(2**63) <= int(cell) < 2**63:
                 raise ValueError
         except ValueError:
-            likely = likely_unit(cells[0]) if unit != "ns" else None
             raise DataError(
                 "the stamp is not a time",
-                path=where,
-                expected=f"decimal {_WORDS.get(unit, unit)}"
-                if unit != "ns"
-                else "integer nanoseconds, within 64 bits",
-                got=repr(cells[0]),
-                fix=f"these look like {_WORDS[likely]} since 1970: time.unit={likely}"
-                if likely
-                else "mend or delete the row",
+                path=sheet.where(k),
+                expected="integer nanoseconds, within 64 bits",
+                got=repr(cell),
+                fix="mend or delete the row",
             ) from None
-        for column, cell in enumerate(cells[1:], start=2):
-            try:
-                number = float(cell)
-                finite = "_" not in cell and bool(np.isfinite(number) or (gaps and np.isnan(number)))
-            except ValueError:
-                finite = False
-            if not finite:
-                raise DataError(
-                    f"column {column} is not a finite number",
-                    path=where,
-                    expected="a finite number",
-                    got=repr(cell),
-                    fix="mend or delete the row",
-                )
+    return np.array([int(c) for c in cells], dtype=np.int64)

@@ -64,7 +64,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     lines: list[int] = []
     time, x, said = read_table(file, columns=7, delimiter=None, unit=unit, gaps=True, lines=lines)
     made.notes.extend(said)
-    pose = {"position": x[:, :3], "attitude": x[:, [6, 3, 4, 5]]}
-    made.add(name, str(file), time, pose, Pose, row=lambda k: f"{file}, line {lines[k]}")
+    pose = {"position": x[:, :3], "attitude": x[:, 3:7]}
+    made.add(name, str(file), time, pose, Pose, row=lambda k: f"{file}, line {lines[k]}", scalar_last=True)
     measured_noise(given, "tum", made.info)
     return made.flight()

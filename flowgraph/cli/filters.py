@@ -13,7 +13,19 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, Data, DataOrNone, Engine, Name, Seed, Settings, case_of, graph_of
+from flowgraph.cli.options import (
+    AsJson,
+    Data,
+    DataOrNone,
+    Engine,
+    Name,
+    Seed,
+    Settings,
+    Truth,
+    case_of,
+    graph_of,
+    one_flight,
+)
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -57,11 +69,12 @@ def show(
         Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
     ] = None,
     data: DataOrNone = None,
+    truth: Truth = None,
     settings: Settings = None,
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file."""
-    built, _ = graph_of(graph, data, settings, seed)
+    built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
     if output is None:
         print(built.text())
         return
@@ -74,6 +87,7 @@ def show(
 def run(
     graph: Name,
     data: Data,
+    truth: Truth = None,
     engine: Engine = "python",
     dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     seed: Seed = 0,
@@ -84,12 +98,20 @@ def run(
     """Run a graph on a flight and compare it with the truth."""
     if out is not None:
         make_ready(out)
-    case, flight = case_of(graph, data, settings, seed)
+    notes: dict[str, None] = {}
+
+    def say(found: tuple[str, ...]) -> None:
+        for note in found:
+            if note not in notes:
+                err_console.print(f"note: {note}", markup=False)
+            notes[note] = None
+
+    spec = one_flight(data) or ""
+    case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
-    notes = dict.fromkeys((*flight.notes, *case.notes, *result.notes))
-    for note in notes:
-        err_console.print(f"note: {note}", markup=False)
-    report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    say(result.notes)
+    report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
     if out is not None:
         _write_report(out, case, flight, result, report)

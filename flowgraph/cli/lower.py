@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, graph_of
+from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, Truth, graph_of, one_flight
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.engines.registry import writers
 from flowgraph.errors import UnknownNameError
@@ -24,6 +24,7 @@ def lower(
     graph: Name,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="For the pipeline.")],
     data: DataOrNone = None,
+    truth: Truth = None,
     settings: Settings = None,
     seed: Seed = 0,
     target: Annotated[
@@ -53,7 +54,7 @@ def lower(
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()), passes=DEFAULT if engine is None else engine.passes)
-    built, inputs = graph_of(graph, data, settings, seed)
+    built, inputs = graph_of(graph, one_flight(data), settings, seed, truth)
     pipeline = lower_graph(built, dtype=dtype)
     pipeline.save(output)
     if engine is not None:

@@ -17,16 +17,21 @@ from flowgraph.language.graph import Graph
 
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
 Data = Annotated[
-    str,
+    list[str],
     typer.Option(
         "--data",
         metavar="SPEC",
-        help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH, broad:FILE, ese650:DIR:N ...",
+        help="sim, sim:thesis, sim:hover, sim:roundtrip, sim:plane, euroc:PATH, broad:FILE, ese650:DIR:N ..."
+        " Several files of one flight: csv:A+csv:B.",
     ),
 ]
 DataOrNone = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option("--data", metavar="SPEC", help="As for run; if left out, a simulated flight that fits."),
+]
+Truth = Annotated[
+    str | None,
+    typer.Option("--truth", metavar="SPEC", help="Whose truth, or only stream of poses, is the truth."),
 ]
 EXAMPLES: tuple[tuple[str, Mapping[str, str]], ...] = (
     ("sim", {}),
@@ -47,20 +52,53 @@ Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
-def case_of(name: str, spec: str, settings: list[str] | None, seed: int) -> tuple[Case, Flight]:
+def one_flight(data: list[str] | None) -> str | None:
+    """The SPEC of the one flight that a command takes.
+
+    Raises:
+        DeclarationError: for several, which would be several recordings.
+    """
+    if data and len(data) > 1:
+        raise DeclarationError(
+            "this command takes one flight",
+            path="--data",
+            expected="one SPEC",
+            got=" and ".join(data),
+            fix=f"if these are files of one flight, write --data {'+'.join(data)}; several flights go to"
+            " flowgraph tune or into a study",
+        )
+    return data[0] if data else None
+
+
+def case_of(
+    name: str,
+    spec: str,
+    settings: list[str] | None,
+    seed: int,
+    truth: str | None = None,
+    say: Callable[[tuple[str, ...]], None] = lambda notes: None,
+) -> tuple[Case, Flight]:
+    """A graph made ready for a flight; `say` is told the notes of each as soon as they are known."""
     graph = find_graph(name)
     given = pairs(settings)
     if graph.prepare is None:
         return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
-    mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec), path=name)
-    flight = load_flight(spec, seed=seed, settings=rest)
+    mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec, truth), path=name)
+    flight = load_flight(spec, seed=seed, settings=rest, truth=truth)
+    say(flight.notes)
     if "seed" in inspect.signature(graph.prepare).parameters:
         mine.setdefault("seed", seed)
-    return graph.case(flight, **mine), flight
+    case = graph.case(flight, **mine)
+    say(case.notes)
+    return case, flight
 
 
 def graph_of(
-    name: str, data: str | None = None, settings: list[str] | None = None, seed: int = 0
+    name: str,
+    data: str | None = None,
+    settings: list[str] | None = None,
+    seed: int = 0,
+    truth: str | None = None,
 ) -> tuple[Graph, Inputs]:
     """The graph on a flight, and what it is fed there; without `data`, on the first of `EXAMPLES` that fits.
 
@@ -70,7 +108,7 @@ def graph_of(
         DataError: the first flight's, where a graph neither fits a flight nor builds without one.
     """
     if data is not None:
-        case, _ = case_of(name, data, settings, seed)
+        case, _ = case_of(name, data, settings, seed, truth)
         return case.graph, case.inputs
     first: DataError | None = None
     for spec, more in EXAMPLES:

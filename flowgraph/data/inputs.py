@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Flight, Series, unmasked
 from flowgraph.errors import ClockError, DataError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.language.graph import NEVER, Graph
@@ -38,8 +38,8 @@ def arrays(
         time: (n,) integer nanoseconds, in order.
         values: a signal or array with a leading axis of length n.
         duplicates: of two events at one time "raise", or keep the "first" or "last".
-        not_finite: where a value is NaN or infinite "raise", or treat the event as "absent"; "keep" lets NaN
-            pass as data, for blocks that take it as an entry that was not measured.
+        not_finite: where a value is NaN, masked or infinite "raise", or treat the event as "absent"; "keep"
+            lets NaN pass as data, for blocks that take it as an entry that was not measured.
     """
     rule = _rule("not_finite", not_finite, ("raise", "absent", "keep"))
     series = Series(time, values, name=name, gaps=rule == "keep")
@@ -285,7 +285,7 @@ def check_event(
             fix="round float seconds once, at the source: round(seconds * 1e9)",
         )
     check_times(name, np.asarray([time], dtype=np.int64), timing, before)
-    made = as_value(value, type_, path=f"source {name}")
+    made = as_value(unmasked(value, name, np.float64), type_, path=f"source {name}")
     for leaf in flatten(made, type_):
         if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
             _not_finite(name, int(time), "this event")

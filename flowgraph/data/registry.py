@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph.data.inputs import Inputs
+from flowgraph.data.joint import joined, numbered, parts_of, shared, with_truth
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
@@ -166,24 +167,49 @@ def find_entry(group: str, name: str) -> Any:
     raise UnknownNameError(KINDS[group], name, entry_names(group))
 
 
-def load_flight(spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None) -> Flight:
+def load_flight(
+    spec: str, *, seed: int = 0, settings: Mapping[str, str] | None = None, truth: str | None = None
+) -> Flight:
     """Load the flight that a text such as "sim" or "euroc:PATH" names.
+
+    Args:
+        spec: KIND or KIND:WHERE; several, of one flight, are joined by `+`: "csv:imu.csv+csv:mocap.csv".
+        seed: of what is simulated.
+        settings: of the loaders by name. Of several parts, each takes those that it has; `2.NAME` is for the
+            second alone.
+        truth: a SPEC whose truth, or only stream of poses, is the flight's truth; its settings have the
+            number after the last part.
 
     Raises:
         UnknownNameError: for a kind that is not installed, or a setting that it does not have.
         PluginError: for a kind whose package cannot be imported.
-        DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong.
+        DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong, or
+            parts do not fit together.
     """
-    kind, _, argument = spec.partition(":")
-    load: Callable[..., Flight] = find_entry("flowgraph.flights", kind)
-    return load(argument, seed=seed, settings=dict(settings or {}))
+    specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
+    loaders = [find_entry("flowgraph.flights", s.partition(":")[0]) for s in specs]
+    each = [dict(settings or {})]
+    if len(specs) > 1:
+        claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
+        each = shared(specs, [flight_settings(s) for s in specs], claims, settings or {})
+    found: list[Flight] = [
+        load(s.partition(":")[2], seed=seed, settings=given)
+        for load, s, given in zip(loaders, specs, each, strict=True)
+    ]
+    if truth is None:
+        return found[0] if len(found) == 1 else joined(specs, found)
+    whole = found[0] if len(found) == 2 else joined(specs[:-1], found[:-1])
+    return with_truth(whole, truth, found[-1])
 
 
-def flight_settings(spec: str) -> list[str]:
-    """The settings that the loader of a kind of flight understands."""
-    load = find_entry("flowgraph.flights", spec.partition(":")[0])
-    module = inspect.getmodule(load)
-    return list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
+def flight_settings(spec: str, truth: str | None = None) -> list[str]:
+    """The settings that the loaders of a SPEC understand; of several parts, for all and for each."""
+    specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
+    names = []
+    for one in specs:
+        module = inspect.getmodule(find_entry("flowgraph.flights", one.partition(":")[0]))
+        names.append(list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {}))))
+    return names[0] if len(names) == 1 else numbered(names)
 
 
 def setting_names(function: Callable[..., Any]) -> list[str]:

@@ -72,5 +72,9 @@ class Result:
         """An `xarray.DataTree` with a dataset a stream; see `flowgraph.data.export`. Needs xarray."""
         return to_xarray(self)
 
+    def to_pandas(self) -> dict[str, Any]:
+        """A pandas `DataFrame` a stream, by name, each with a `time` of its own (int64 ns). Needs pandas."""
+        return {name: series.to_pandas() for name, series in self.series.items()}
+
     def __repr__(self) -> str:
         return f"<Result of {self.graph} ({self.engine}): {self.ticks} ticks, {', '.join(self.series)}>"

@@ -6,13 +6,14 @@ run gives back. Signals are batch-first: each leaf has the time axis in front.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.frames import frame_of, signal_of, stamps_of
 from flowgraph.data.notes import said
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import (
@@ -33,8 +34,9 @@ class Series:
     """`n` values of one signal with their times.
 
     Args:
-        time: (n,) int64 nanoseconds, increasing.
-        values: a `Signal`, tuple or array whose leaves have a leading axis of length n.
+        time: (n,) int64 nanoseconds, or datetime64 or timedelta64, increasing.
+        values: a `Signal`, tuple or array whose leaves have a leading axis of length n. A masked entry of a
+            masked array is NaN.
         type: the type of one value; found from `values` where it is left out.
         name: what to call it in messages.
         gaps: whether a NaN is data, an entry that was not measured; otherwise a run refuses it.
@@ -54,7 +56,11 @@ class Series:
         name: str = "series",
         gaps: bool = False,
     ) -> None:
+        if isinstance(time, np.ma.MaskedArray) and np.ma.is_masked(time):
+            raise _only_real(f"{name}: time")
         stamps = _array(time, name)
+        if stamps.dtype.kind in "mM":
+            stamps = _from_dates(stamps, name)
         if stamps.dtype.kind not in "iu":
             raise DataError(
                 "times must be integer nanoseconds",
@@ -112,6 +118,40 @@ class Series:
                 fix="drop such rows at the source",
             )
         return cls(stamps.astype(np.int64), values, **more)
+
+    @classmethod
+    def from_pandas(
+        cls,
+        frame: Any,
+        signal: Any = None,
+        *,
+        columns: Any = None,
+        time: str | None = None,
+        unit: str | None = None,
+        **more: Any,
+    ) -> Series:
+        """A series from a pandas `DataFrame` or `Series`.
+
+        Args:
+            frame: with a row a sample.
+            signal: the class of the signal; without it, the values are an array.
+            columns: by field of the signal, `{"gyro": ["wx", "wy", "wz"]}`, or of the array; if left out,
+                the names that `to_pandas` gives, or all columns.
+            time: the column of the stamps; the index if left out, which must not only count rows.
+            unit: "s", "ms", "us" or "ns" of stamps that are numbers; whole numbers are ns if left out.
+            more: `name`, `gaps` or `type`, as of `Series`.
+
+        Raises:
+            DataError: for an index that is no clock, or columns that hold no numbers.
+            UnknownNameError: for a column or a unit that is not there.
+        """
+        name = str(more.get("name", "series"))
+        stamps = stamps_of(frame, time, unit, name)
+        return cls(stamps, signal_of(frame, signal, columns, time, name), **more)
+
+    def to_pandas(self) -> Any:
+        """A pandas `DataFrame` with a column a number (`position.x`), by `time` in int64 ns. Needs pandas."""
+        return frame_of(self.time, self.leaves, self.type)
 
     @property
     def leaves(self) -> dict[str, np.ndarray]:
@@ -184,7 +224,8 @@ class Series:
 
 
 def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:
-    """An array of what was given, if it is one."""
+    """An array of what was given, if it is one; NaN where it is masked."""
+    values = unmasked(values, name, dtype)
     try:
         return np.asarray(values, dtype=dtype)
     except (TypeError, ValueError, OverflowError) as error:
@@ -195,6 +236,68 @@ def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:
             got=str(error),
             fix="give rows of one length, padded where they are shorter",
         ) from None
+
+
+def unmasked(values: Any, name: str, dtype: Any = None) -> Any:
+    """Values without a mask, in signals and tuples too: what was masked is NaN, and goes by `not_finite`.
+
+    Args:
+        values: of any kind; what has no mask is given back as it is.
+        name: for messages.
+        dtype: what they will be; whole numbers can be masked where it is real.
+
+    Raises:
+        DataError: where what is masked is not real.
+    """
+    if isinstance(values, Signal):
+        parts = {n: getattr(values, n) for n, _ in struct_type(type(values)).fields}
+        plain = {n: unmasked(v, f"{name}.{n}", dtype) for n, v in parts.items()}
+        same = all(plain[n] is v for n, v in parts.items())
+        return values if same else type(values)(**plain)
+    if isinstance(values, Mapping):
+        return {n: unmasked(v, f"{name}.{n}", dtype) for n, v in values.items()}
+    if isinstance(values, list | tuple):
+        inner: Sequence[Any] = values
+        if isinstance(values, list) and any(isinstance(v, np.ma.MaskedArray) for v in inner):
+            values = np.ma.stack([np.ma.asanyarray(v) for v in inner])
+        elif isinstance(values, tuple) and any(
+            isinstance(v, np.ma.MaskedArray | Signal | tuple) for v in inner
+        ):
+            return tuple(unmasked(v, f"{name}.{i}", dtype) for i, v in enumerate(inner))
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if not np.ma.is_masked(values):
+        return values.data
+    if values.dtype.kind != "f":
+        if values.dtype.kind not in "iu" or dtype is None or np.dtype(dtype).kind != "f":
+            raise _only_real(name)
+        values = values.astype(np.float64)
+    return values.filled(np.nan)
+
+
+def _only_real(name: str) -> DataError:
+    return DataError(
+        "a masked entry is no real number",
+        path=name,
+        expected="masks of real numbers only: what is masked becomes NaN",
+        got="a mask of times, whole numbers or booleans",
+        fix="leave such rows out, or convert them: values.astype(float)",
+    )
+
+
+def _from_dates(stamps: np.ndarray, name: str) -> np.ndarray:
+    """datetime64 or timedelta64 of any unit, as int64 ns; finer ones are cut off."""
+    exact = stamps.astype(f"{stamps.dtype.kind}8[ns]")
+    finer = np.datetime_data(stamps.dtype)[0] in ("ps", "fs", "as")
+    if np.isnat(stamps).any() or (not finer and (exact.astype(stamps.dtype) != stamps).any()):
+        raise DataError(
+            "a time is missing, or beyond what int64 nanoseconds hold",
+            path=name,
+            expected="times from 1677 to 2262, and no NaT",
+            got=f"dtype {stamps.dtype}",
+            fix="drop such rows at the source",
+        )
+    return exact.astype(np.int64)
 
 
 def _one_of(values: Any, name: str) -> Type:
@@ -219,7 +322,8 @@ def _one_of(values: Any, name: str) -> Type:
 
 
 def _drop_axis(declared: ArrayType | None, values: Any, name: str) -> ArrayType:
-    array = _array(values, name)
+    real = declared is not None and declared.dtype == "real"
+    array = _array(unmasked(values, name, np.float64 if real else None), name)
     if array.dtype.kind in "iu" and declared is not None and declared.dtype == "real":
         array = array.astype(np.float64)
     batch = type_of(array)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.joint import parts_of
 from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
@@ -103,7 +104,8 @@ class Study:
 
     def _check_runs(self) -> None:
         for spec in self.data:
-            _one_of("data", spec.partition(":")[0], flight_names(), kind="kind of flight")
+            for part in parts_of(spec, flight_names()):
+                _one_of("data", part.partition(":")[0], flight_names(), kind="kind of flight")
         swept = {
             name for name, _ in self.parameters.items() if not isinstance(self.parameters[name], Mapping)
         }
