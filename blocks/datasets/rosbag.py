@@ -22,16 +22,15 @@ from flowgraph.blocks.datasets.bag_file import Bag
 from flowgraph.blocks.datasets.bag_messages import KINDS, TRANSFORMS, Kind, kind_of
 from flowgraph.blocks.datasets.bag_topics import named, nothing, passed_over, readable, usual, wanted
 from flowgraph.blocks.datasets.shape import (
+    MEASURED_NOISE,
     NOISE_SETTINGS,
     Recording,
     chosen,
     imu_noise,
     known,
-    number,
-    offset,
-    plausible,
+    measured_noise,
     policy,
-    unit_quaternions,
+    stream_settings,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.data.notes import note
@@ -39,30 +38,24 @@ from flowgraph.errors import DataError, UnknownNameError
 
 __all__ = ["KINDS", "SETTINGS", "load"]
 
-STREAMS = (
-    *("imu", "gyro", "accelerometer", "vicon", "leica", "gps", "magnetometer", "velocity"),
-    "truth",
-)
-"""The names of streams that filters ask for."""
-
 _OF_A_STREAM: Mapping[str, str] = {
     "stamp": "as `stamp`, for this stream",
     "frame": "of which frame_id, where a topic has several",
     "body": "of which child_frame_id, where a topic has several",
-    "time_offset": "s, added to its stamps",
 }
 
 SETTINGS: Mapping[str, str] = {
     "topics": "NAME:TOPIC, comma-separated: which topics to read, and their streams' names; truth is one",
     "stamp": "header (when it was measured) or bag (when it was recorded)",
-    **{f"{s}.{name}": meaning for s in STREAMS for name, meaning in _OF_A_STREAM.items()},
+    **{f"STREAM.{name}": meaning for name, meaning in _OF_A_STREAM.items()},
     **NOISE_SETTINGS,
-    "position.noise": "standard deviation of measured positions, m",
-    "attitude.noise": "standard deviation of measured attitudes, rad",
+    **MEASURED_NOISE,
     "bad_time": "messages out of order: " + ", ".join(POLICIES),
+    **stream_settings("STREAM"),
 }
-"""The settings of `load` and what they mean. Those of a stream go by its name, whatever that is."""
+"""The settings of `load` and what they mean. STREAM stands for the name of any."""
 
+STAMPS = ("header", "bag")
 _DOWN = re.compile(r"(^|_)(ned|frd|esd)($|_)", re.IGNORECASE)
 _STRANGE = 3_600 * 10**9
 """ns: stamps that are farther from a stamp of 0 were not counted from there."""
@@ -90,9 +83,17 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     """
     given = settings or {}
     asked = wanted(str(given["topics"]), given) if "topics" in given else None
-    mine = {f"{s}.{name}": "" for s, _ in asked or () for name in _OF_A_STREAM}
-    known(given, {**SETTINGS, **mine}, "rosbag")
-    made = Recording(Path(argument).stem, policy(given, "rosbag"))
+    known(given, SETTINGS, "rosbag")
+    stamp = chosen(given, "stamp", STAMPS, "rosbag")
+    made = Recording(
+        Path(argument).stem,
+        policy(given, "rosbag"),
+        kind="rosbag",
+        given=given,
+        clock="stamp=bag takes the clock of the recorder" if stamp == "header" else "check the bag",
+        units="mend the driver: ROS has SI units",
+        place=argument,
+    )
     path = Path(argument).expanduser()
     made.info.update(topics={}, frames={}, bodies={})
     with Bag(path) as bag:
@@ -100,7 +101,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             parts = ", ".join(f.name for f in bag.files)
             made.notes.append(note("assumed", f"the files of the folder are one recording: {parts}"))
         types = readable(bag)
-        for name, topic in named(bag, types, asked) if asked is not None else usual(bag, types):
+        plan = named(bag, types, asked) if asked is not None else usual(bag, types)
+        _of_streams(given, [name for name, _ in plan])
+        for name, topic in plan:
             _read(made, bag, name, topic, types[topic], given, asked=asked is not None)
         if not made.streams and made.truth is None:
             raise nothing(bag)
@@ -108,10 +111,20 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     _frames_apart(made)
     if any({"gyro", "rate"} & set(s.leaves) for s in made.streams.values()):
         made.info["imu_noise"] = imu_noise(given, "rosbag", made.notes)
-    for name in ("position", "attitude"):
-        if f"{name}.noise" in given:
-            made.info[f"{name}_noise"] = number(given, f"{name}.noise", 0.01, "rosbag")
+    measured_noise(given, "rosbag", made.info)
     return made.flight()
+
+
+def _of_streams(given: Mapping[str, Any], streams: Sequence[str]) -> None:
+    """Refuse a setting of a stream that is not read.
+
+    Raises:
+        UnknownNameError: listing those that are.
+    """
+    for setting in given:
+        stream, _, what = str(setting).rpartition(".")
+        if what in _OF_A_STREAM and stream and stream not in streams:
+            raise UnknownNameError("stream", stream, streams, path=f"rosbag.{setting}")
 
 
 class _Messages(NamedTuple):
@@ -189,36 +202,15 @@ def _read(
             return
         raise _several(place, name, topic, pairs)
     _measured(made, place, name, topic, how, found)
-    stamp = chosen(
-        given,
-        f"{name}.stamp" if f"{name}.stamp" in given else "stamp",
-        ("header", "bag"),
-        "rosbag",
-    )
-    shift = offset(given, f"{name}.time_offset", "rosbag")
-    times = _stamps(place, name, found, stamp, shift)
-    if shift:
-        made.notes.append(note("info", f"{name}: stamps shifted by {shift} ns"))
+    stamp = chosen(given, f"{name}.stamp" if f"{name}.stamp" in given else "stamp", STAMPS, "rosbag")
     table = np.array(found.rows, dtype=float)
-    columns = {field: table[:, part] for field, part in how.fields.items()}
-    if "attitude" in columns:
-        columns["attitude"] = unit_quaternions(columns["attitude"], place)
-    units = {"rate": "gyro", "force": "specific_force"}
-    for field, values in columns.items():
-        plausible(
-            units.get(field, field),
-            values[np.isfinite(values).all(axis=1)],
-            f"{place}: {field}",
-            "mend the driver: ROS has SI units",
-        )
     made.add(
         name,
         place,
-        times,
-        columns,
+        _stamps(place, name, found, stamp),
+        {field: table[:, part] for field, part in how.fields.items()},
         how.signal,
         row=lambda k: f"{place}, message {k + 1}",
-        checked=False,
     )
     frame, body = found.who[0]
     made.info["topics"][name], made.info["frames"][name] = topic, frame
@@ -274,20 +266,20 @@ def _measured(made: Recording, place: str, name: str, topic: str, how: Kind, fou
         made.notes.append(note("skipped", said))
 
 
-def _stamps(place: str, name: str, found: _Messages, stamp: str, shift: int) -> np.ndarray:
+def _stamps(place: str, name: str, found: _Messages, stamp: str) -> np.ndarray:
     """The times (n,) ns of the readings.
 
     Raises:
         DataError: for stamps of the header that nobody set, and those beyond 64 bits.
     """
     times = found.header if stamp == "header" else found.bag
-    zeros, far = times.count(0), [k for k, t in enumerate(times) if not -(2**63) <= t + shift < 2**63]
+    zeros, far = times.count(0), [k for k, t in enumerate(times) if not -(2**63) <= t < 2**63]
     if far:
         raise DataError(
             "a stamp is beyond 64 bits",
             path=f"{place}, message {far[0] + 1}",
             expected="nanoseconds within 64 bits",
-            got=f"{times[far[0]]} ns" + (f", shifted by {shift} ns" if shift else ""),
+            got=f"{times[far[0]]} ns",
             fix=f"{name}.stamp=bag takes the times of recording" if stamp == "header" else "mend the bag",
         )
     unset = zeros > 1 or (zeros and max(map(abs, times)) > _STRANGE)
@@ -299,7 +291,7 @@ def _stamps(place: str, name: str, found: _Messages, stamp: str, shift: int) -> 
             got=f"{zeros} of {len(times)} are 0" if zeros else f"{times[0]} ns in all {len(times)}",
             fix=f"{name}.stamp=bag takes the times of recording; stamp=bag does so for all streams",
         )
-    return np.array(times, dtype=np.int64) + shift
+    return np.array(times, dtype=np.int64)
 
 
 def _remarks(

@@ -54,7 +54,8 @@ class Playback:
     again: Callable[[int], Result] | None
 
 
-class Astray(NamedTuple):
+@dataclass(frozen=True)
+class Astray:
     """An output or register that is not finite: `time` of the first such value in ns, and how many."""
 
     place: Place

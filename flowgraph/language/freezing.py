@@ -299,7 +299,7 @@ def _is_value(value: Any) -> bool:
     if isinstance(value, Signal) or not is_own(kind.__module__):
         return True
     if is_dataclass(value):
-        return bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
+        return bool(kind.__dataclass_params__.frozen)
     return False
 
 

@@ -8,22 +8,19 @@ from __future__ import annotations
 
 import inspect
 import os
-import re
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.joint import parts_of
 from flowgraph.data.registry import find_entry, flight_names
 from flowgraph.errors import DeclarationError
 
 __all__ = ["absolute", "beside"]
 
-_PARTS = re.compile(r"\+(?=[A-Za-z]\w*:)")
-"""Between the parts of one flight."""
-
 
 def absolute(spec: str, folder: Path) -> str:
     """A flight, such as "euroc:DIR", with what it names in `folder` by its absolute path."""
-    return "+".join(_absolute(part, folder) for part in _PARTS.split(spec))
+    return "+".join(_absolute(part, folder) for part in parts_of(spec, flight_names()))
 
 
 def _absolute(spec: str, folder: Path) -> str:

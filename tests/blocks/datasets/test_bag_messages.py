@@ -235,20 +235,35 @@ def test_what_frames_say_is_passed_on(tmp_path):
 
 def test_the_stamps_of_one_stream_can_be_those_of_the_recording(tmp_path):
     with Pen(tmp_path / "b") as pen:
-        for k, t in enumerate(TIMES):
+        for t in TIMES:
             pen.imu("/imu", t, [0, 0, 0], [0, 0, 9.8], late=7)
-            pen.pose("/pose", 5 + k * 10 * MS, [0, 0, 0], late=10**9)
-    given = {"vicon.stamp": "bag", "imu.time_offset": "0.5"}
-    flight = rosbag.load(str(tmp_path / "b"), settings=given)
-    assert flight.streams["imu"].time.tolist() == [t + 500 * MS for t in TIMES]
-    assert flight.streams["vicon"].time.tolist() == [t + 5 for t in TIMES]
-    noted(flight, "info", "imu: stamps shifted by 500000000 ns")
+            pen.pose("/pose", t + 5, [0, 0, 0], late=2 * MS)
+    given = {"vicon.stamp": "bag", "imu.time_offset": "0.005"}
+    flight = load_flight(f"rosbag:{tmp_path / 'b'}", settings=given)
+    assert flight.streams["imu"].time.tolist() == [t + 5 * MS for t in TIMES]
+    assert flight.streams["vicon"].time.tolist() == [t + 5 + 2 * MS for t in TIMES]
+    noted(flight, "info", "imu: stamps shifted by 5000000 ns")
     given = {"stamp": "bag", "vicon.stamp": "header"}
     flight = rosbag.load(str(tmp_path / "b"), settings=given)
     assert flight.streams["imu"].time.tolist() == [t + 7 for t in TIMES]
-    assert flight.streams["vicon"].time[0] == 5
+    assert flight.streams["vicon"].time[0] == TIMES[0] + 5
     refused(tmp_path / "b", "bag, header", kind=UnknownNameError, **{"imu.stamp": "mine"})
     refused(tmp_path / "b", "imu.time_offset", kind=DeclarationError, **{"imu.time_offset": "soon"})
+    for setting in ("body", "frame", "stamp", "time_offset"):
+        refused(tmp_path / "b", "'vicn'", "vicon", kind=UnknownNameError, **{f"vicn.{setting}": "1"})
+
+
+@pytest.mark.parametrize("late", [0, 10**8])
+def test_clocks_that_are_apart_are_refused_with_the_clock_of_the_recorder(tmp_path, late):
+    """An IMU of the epoch beside a motion capture that counts from its start."""
+    now = 1_700_000_000 * 10**9
+    with Pen(tmp_path / "b") as pen:
+        for t in TIMES:
+            pen.imu("/imu", now + t, [0, 0, 0], [0, 0, 9.8])
+            pen.pose("/pose", t, [0, 0, 0], late=now + late // 100)
+    refused(tmp_path / "b", "no sample of vicon lies within the span of the imu", "stamp=bag")
+    flight = rosbag.load(str(tmp_path / "b"), settings={"stamp": "bag"})
+    assert flight.streams["vicon"].time.tolist() == [now + t + late // 100 for t in TIMES]
 
 
 @pytest.mark.parametrize(
