@@ -86,7 +86,7 @@ def refuse_different(first: Trace, second: Trace, path: str) -> None:
 def line_of_step(block: Block[Any]) -> str | None:
     """module:line of a block's function."""
     code = getattr(block.step, "__code__", None)
-    return None if code is None else place(block.step.__globals__, code.co_firstlineno)  # type: ignore[attr-defined]
+    return None if code is None else place(block.step.__globals__, code.co_firstlineno)
 
 
 def _writing_line(record: Callable[[Freezer], object]) -> str | None:
