@@ -19,10 +19,14 @@ class Belief(Signal):
     position: Array = real(3, unit="m", frame="world")
 
 
+ARM = 1.0
+"""Metres a radian."""
+
+
 @block
 def predict(belief: Belief, control: Imu, *, dt) -> Belief:
     """Carry the belief to now."""
-    return Belief(belief.position + dt * control.gyro)
+    return Belief(belief.position + ARM * dt * control.gyro)
 
 
 @block

@@ -157,9 +157,10 @@ class Freezer:
         if members:
             like = {"__slots__": (), "__module__": kind.__module__, "__qualname__": kind.__qualname__}
             with contextlib.suppress(TypeError):  # a class that may have no subclass stays as it is
-                object.__setattr__(made, "__class__", type(kind)(kind.__name__, (kind,), {**members, **like}))
-        members = [pair for c in kind.__mro__ for pair in vars(c).items()]
-        lazy = {k for k, v in members if isinstance(v, functools.cached_property)}
+                meta: Any = type(kind)
+                object.__setattr__(made, "__class__", meta(kind.__name__, (kind,), {**members, **like}))
+        every = [pair for c in kind.__mro__ for pair in vars(c).items()]
+        lazy = {k for k, v in every if isinstance(v, functools.cached_property)}
         if is_own(kind.__module__):
             self._hold(
                 name,

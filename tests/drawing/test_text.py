@@ -42,21 +42,21 @@ tracker: Follows a position.
 │
 ├─ blocks, in firing order
 │   1 every   keeps a state
-│       x            ◁─ imu               Imu      fresh
-│       out          ─▷ core/control      Imu      every(5, imu)
+│       x            ◁─ imu               Imu         fresh
+│       out          ─▷ core/control      Imu         every(5, imu)
 │  ╭─ core
 │  │   2 predict   at every(5, imu) | fix
-│  │       belief    ◁╌ belief            Belief   held from the tick before
-│  │       control   ◁─ control           Imu      held
-│  │       out       ─▷ aid               Belief   at every(5, imu) | fix
+│  │       belief    ◁╌ belief            Belief      held from the tick before
+│  │       control   ◁─ control           Imu         held
+│  │       out       ─▷ aid               Belief      at every(5, imu) | fix
 │  │   3 aid
-│  │       prior     ◁─ predict           Belief   fresh
-│  │       measured  ◁─ fix               Fix      fresh or absent
-│  │       belief    ─▷ belief, ● belief  Belief   at every(5, imu) | fix
-│  │       out       ─▷ display           real[3]  at fix
+│  │       prior     ◁─ predict           Belief      fresh
+│  │       measured  ◁─ fix               Fix         fresh or absent
+│  │       belief    ─▷ belief, ● belief  Belief      at every(5, imu) | fix
+│  │       out       ─▷ display           real[3], m  at fix
 │  ╰─
 │   4 display   on the host
-│       value        ◁─ core/aid.out      real[3]  fresh
+│       value        ◁─ core/aid.out      real[3], m  fresh
 │
 ├─ registers
 │  ▪ every.state   state   int32   init 0      ◁╌ every

@@ -11,6 +11,7 @@ from flowgraph import (
     Array,
     CycleError,
     DeclarationError,
+    Run,
     Scalar,
     Signal,
     Stream,
@@ -22,10 +23,12 @@ from flowgraph import (
     every,
     graph,
     latest,
+    lower,
     merge,
     periodic,
     real,
     simulate,
+    simulate_many,
     sink,
 )
 from tests.support import pairs, scalars
@@ -468,3 +471,76 @@ def test_a_graph_without_a_flight_says_so():
 
     with pytest.raises(DeclarationError, match="g: this graph does not know how to start on a flight"):
         g.case(None)  # type: ignore[arg-type]
+
+
+def line(graph_function: Any, below: int) -> str:
+    """module:line of a line of a graph function, counted from its decorator."""
+    return f"{__name__}:{graph_function.function.__code__.co_firstlineno + below}"
+
+
+def test_what_is_seen_at_the_end_names_the_line_that_began_it():
+    @graph
+    def unfed(x: Stream[Scalar]):
+        held = delay(0.0, name="belief")
+        return add(x, held)
+
+    @graph
+    def circle(x: Stream[Scalar]):
+        held = latest(init=0.0, name="held")
+        total = add(x, held)
+        held.feed(total)
+        return total
+
+    @graph
+    def silent(x: Stream[Scalar]):
+        gain(x, k=2.0)
+
+    @graph
+    def unread(x: Stream[Scalar], y: Stream[Scalar]):
+        return x
+
+    for wrong, error, below, words in (
+        (unfed, DeclarationError, 2, "this delay is never fed"),
+        (circle, CycleError, 2, "a cycle passes through no delay"),
+        (silent, DeclarationError, 0, "this graph gives nothing"),
+        (unread, DeclarationError, 0, "this source is connected to nothing"),
+    ):
+        with pytest.raises(error, match=words) as caught:
+            wrong.build()
+        assert caught.value.line == line(wrong, below), words
+        assert caught.value.fix
+
+
+def test_a_graph_of_sinks_gives_nothing_and_is_no_mistake():
+    seen: list[float] = []
+
+    @graph
+    def g(x: Stream[Scalar]):
+        sink(x, seen.append)
+
+    simulate(g.build(), {"x": scalars([0, 1])})
+    assert seen == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda g: simulate(g, {"x": scalars([0])}),
+        lambda g: Run(g),
+        lambda g: lower(g),
+        lambda g: simulate_many(g, {"x": scalars([0])}, range(2), engine="python"),
+        lambda g: g.draw(),
+    ],
+    ids=["simulate", "Run", "lower", "simulate_many", "draw"],
+)
+def test_a_graph_that_was_not_built_says_how_to_build_it(use):
+    @graph
+    def g(x: Stream[Scalar]):
+        return x
+
+    with pytest.raises(DeclarationError, match="this graph is declared, but not built") as error:
+        use(g)
+    assert error.value.line == f"{__name__}:{use.__code__.co_firstlineno}"
+    assert "g.build(...)" in str(error.value.fix)
+    with pytest.raises(AttributeError, match="no attribute 'spelt_wrongly'"):
+        _ = g.spelt_wrongly

@@ -414,7 +414,7 @@ def two() -> float:
         (lambda s: s.speed @ np.eye(2), ["matmul", "(3,)"]),
         (lambda s: s.speed[3], ["index 3"]),
         (lambda s: s.replace(spede=s.speed).speed, ["spede"]),
-        (lambda s: s.speed * missing, ["missing"]),  # noqa: F821
+        (lambda s: s.speed * missing, ["missing"]),  # type: ignore[name-defined]  # noqa: F821
         (lambda s, *, xp: xp.sinn(s.speed), ["xp.sinn"]),
         (unpacked, ["too many values to unpack"]),
         (lambda s: two(s), ["two"]),
