@@ -54,18 +54,17 @@ class Playback:
     again: Callable[[int], Result] | None
 
 
-@dataclass(frozen=True)
-class Astray:
-    """An output or register that is not finite: `time` of the first such value in ns, and how many."""
+class Astray(NamedTuple):
+    """An output or register that is not finite: `time` of the first such value in ns, and how many rows."""
 
     place: Place
     time: int | None
-    count: int
+    rows: int
 
     def __str__(self) -> str:
         if self.time is None:
             return f"register {_named(self.place)} is not finite at the end"
-        return f"{self.count} values of {_named(self.place)} are not finite, the first at t = {self.time} ns"
+        return f"{self.rows} values of {_named(self.place)} are not finite, the first at t = {self.time} ns"
 
 
 def gaps_of(tape: Tape, names: Sequence[str]) -> dict[str, list[bool]]:
@@ -118,7 +117,7 @@ def settled(result: Result, run: Playback, diverged: str, error: RunError | None
     if found and diverged == "raise":
         raise _diverged(result, run, found)
     if found:
-        counts = {f"{_named(f.place)}.diverged": f.count for f in found}
+        counts = {f"{_named(f.place)}.diverged": f.rows for f in found}
         notes = tuple(note("diverged", str(f)) for f in found)
         result = replace(result, stats={**result.stats, **counts}, notes=(*result.notes, *notes))
     if error is not None:
@@ -234,7 +233,7 @@ class ManyTroubles:
             self.full[n] = error
         found = [
             Astray(place, None, 1)
-            for place, cell in zip(self._held, cells, strict=True)
+            for place, cell in zip(self._held, map(np.asarray, cells), strict=True)
             if cell.dtype.kind == "f" and not np.isfinite(cell).all()
         ]
         if found:

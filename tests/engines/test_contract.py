@@ -49,8 +49,8 @@ class Toy(PipelineEngine):
             player.play(runs.tape(n), runs.cells(n), seed_words(seed), None)
             for n, seed in enumerate(runs.seeds)
         ]
-        for outcome in all_:
-            runs.finish(outcome.cells)
+        for n, outcome in enumerate(all_):
+            runs.finish(n, outcome.cells)
         series = {}
         for k, port in enumerate(runs.pipeline.outputs):
             times = all_[0].outputs[k][0]
