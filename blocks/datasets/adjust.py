@@ -47,7 +47,7 @@ MEANT = {
 }
 """The settings of a stream and what they mean."""
 
-TURNED = ("attitude", "gyro", "specific_force", "field")
+TURNED = ("attitude", "gyro", "rate", "specific_force", "force", "field")
 """The fields that are of a sensor's axes."""
 
 

@@ -17,9 +17,13 @@ from flowgraph.errors import DataError
 
 __all__ = ["PLAUSIBLE", "doubtful", "geodetic", "plausible", "upright"]
 
+_FORCE = (2.0, 100.0, "m/s^2", "9.81 at rest; in g it is 1")
+_RATE = (0.0, 40.0, "rad/s", "2000 deg/s, as fast as most units go, is 35 rad/s")
 PLAUSIBLE: Mapping[str, tuple[float, float, str, str]] = {
-    "specific_force": (2.0, 100.0, "m/s^2", "9.81 at rest; in g it is 1"),
-    "gyro": (0.0, 40.0, "rad/s", "2000 deg/s, as fast as most units go, is 35 rad/s"),
+    "specific_force": _FORCE,
+    "force": _FORCE,
+    "gyro": _RATE,
+    "rate": _RATE,
     "field": (5e-6, 5e-4, "T", "the Earth's is 25e-6 to 65e-6"),
 }
 """Between what a median length must lie, of which unit, and why."""

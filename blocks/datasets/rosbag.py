@@ -1,128 +1,90 @@
-"""Bags of ROS 1 (.bag) and ROS 2 (a folder with metadata.yaml), without ROS.
-
-    sensor_msgs/Imu                    Imu                the stream imu
-    geometry_msgs/PoseStamped          Pose               vicon
-    geometry_msgs/TransformStamped     Pose               vicon
-    sensor_msgs/NavSatFix              GeodeticPosition   gps
-    sensor_msgs/MagneticField          MagneticField      magnetometer
+"""Bags of ROS 1 and ROS 2, without ROS: in all containers of `bag_file`, all messages of `bag_messages`.
 
 Where a bag has several topics of one kind, each stream is named by its topic (/left/imu becomes left_imu),
-and `topics` can name them. Only the topics of these kinds are read. Messages are read by the definitions that
-ROS publishes; those inside a bag are not run.
+and `topics` can name them. Topics that are passed over are named in a note. A stream is what one frame says
+of one body: where a topic has several, `STREAM.frame` and `STREAM.body` choose.
 
 The work is done by the `rosbags` library: pip install "flowgraph-filters[ros]".
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowgraph import Flight
+from flowgraph.blocks.datasets.bag_file import Bag
+from flowgraph.blocks.datasets.bag_messages import KINDS, TRANSFORMS, Kind, kind_of
+from flowgraph.blocks.datasets.bag_topics import named, nothing, passed_over, readable, usual, wanted
 from flowgraph.blocks.datasets.shape import (
+    MEASURED_NOISE,
     NOISE_SETTINGS,
     Recording,
     chosen,
     imu_noise,
     known,
-    number,
+    measured_noise,
     policy,
     stream_settings,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
-from flowgraph.blocks.signals import GeodeticPosition, Imu, MagneticField, Pose
-from flowgraph.errors import DataError, DeclarationError, MissingDependencyError, UnknownNameError
+from flowgraph.data.notes import note
+from flowgraph.errors import DataError, UnknownNameError
 
 __all__ = ["KINDS", "SETTINGS", "load"]
+
+_OF_A_STREAM: Mapping[str, str] = {
+    "stamp": "as `stamp`, for this stream",
+    "frame": "of which frame_id, where a topic has several",
+    "body": "of which child_frame_id, where a topic has several",
+}
 
 SETTINGS: Mapping[str, str] = {
     "topics": "NAME:TOPIC, comma-separated: which topics to read, and their streams' names; truth is one",
     "stamp": "header (when it was measured) or bag (when it was recorded)",
+    **{f"STREAM.{name}": meaning for name, meaning in _OF_A_STREAM.items()},
     **NOISE_SETTINGS,
-    "position.noise": "standard deviation of measured positions, m",
-    "attitude.noise": "standard deviation of measured attitudes, rad",
+    **MEASURED_NOISE,
     "bad_time": "messages out of order: " + ", ".join(POLICIES),
     **stream_settings("STREAM"),
 }
-"""The settings of `load` and what they mean."""
+"""The settings of `load` and what they mean. STREAM stands for the name of any."""
 
-
-class Kind(NamedTuple):
-    """A message that is read: its stream's name, the numbers in it, their fields and the signal."""
-
-    stream: str
-    numbers: Callable[[Any], list[float]]
-    fields: Mapping[str, slice]
-    signal: Any
-
-
-def _vector(v: Any) -> list[float]:
-    return [v.x, v.y, v.z]
-
-
-def _quaternion(q: Any) -> list[float]:
-    return [q.w, q.x, q.y, q.z]
-
-
-def _fix(m: Any) -> list[float]:
-    seen = m.status.status >= 0  # -1 says that there was no fix
-    return [math.radians(m.latitude), math.radians(m.longitude), m.altitude] if seen else [math.nan] * 3
-
-
-_POSE = {"position": slice(0, 3), "attitude": slice(3, 7)}
-KINDS: Mapping[str, Kind] = {
-    "sensor_msgs/msg/Imu": Kind(
-        "imu",
-        lambda m: _vector(m.angular_velocity) + _vector(m.linear_acceleration),
-        {"gyro": slice(0, 3), "specific_force": slice(3, 6)},
-        Imu,
-    ),
-    "geometry_msgs/msg/PoseStamped": Kind(
-        "vicon", lambda m: _vector(m.pose.position) + _quaternion(m.pose.orientation), _POSE, Pose
-    ),
-    "geometry_msgs/msg/TransformStamped": Kind(
-        "vicon", lambda m: _vector(m.transform.translation) + _quaternion(m.transform.rotation), _POSE, Pose
-    ),
-    "sensor_msgs/msg/NavSatFix": Kind(
-        "gps",
-        _fix,
-        {"latitude": slice(0, 1), "longitude": slice(1, 2), "height": slice(2, 3)},
-        lambda latitude, longitude, height: GeodeticPosition(
-            latitude=latitude[:, 0], longitude=longitude[:, 0], height=height[:, 0]
-        ),
-    ),
-    "sensor_msgs/msg/MagneticField": Kind(
-        "magnetometer", lambda m: _vector(m.magnetic_field), {"field": slice(0, 3)}, MagneticField
-    ),
-}
-"""What is read of a bag, by type of message."""
+STAMPS = ("header", "bag")
+_DOWN = re.compile(r"(^|_)(ned|frd|esd)($|_)", re.IGNORECASE)
+_STRANGE = 3_600 * 10**9
+"""ns: stamps that are farther from a stamp of 0 were not counted from there."""
 
 
 def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
     """Read the topics of the `KINDS` of a bag.
 
     Args:
-        argument: a .bag file, or a folder with a metadata.yaml.
+        argument: a file (.bag, .mcap, .db3), or a folder with such files or a metadata.yaml.
         seed: not used; every loader has one.
         settings: any of `SETTINGS`.
 
     Returns:
         A `Flight` with a stream a topic. truth: the topic that `topics` calls truth. info: `topics` (by
-        stream), `frames` (frame_id by stream), `absent`; with an imu `imu_noise`.
+        stream), `frames` (frame_id by stream), `bodies` (child_frame_id by stream), `absent`; with an imu
+        `imu_noise`. notes: topics and values that were passed over, and what was assumed.
 
     Raises:
         MissingDependencyError: without the rosbags library.
-        DataError: there is no such bag, it is damaged or holds none of the `KINDS`; stamps are out of order
-            (topic, message), or values cannot be of the unit that ROS gives them.
-        DeclarationError, UnknownNameError: for a setting, or a topic that is not there.
+        DataError: there is no such bag, it is damaged or holds none of the `KINDS`; a topic holds several
+            bodies, or says that nothing was measured; topics would have one name; stamps are not set or out
+            of order (topic, message), or values cannot be of the unit that ROS gives them.
+        DeclarationError, UnknownNameError: for a setting, or a topic or body that is not there.
     """
     given = settings or {}
+    asked = wanted(str(given["topics"]), given) if "topics" in given else None
     known(given, SETTINGS, "rosbag")
-    stamp = chosen(given, "stamp", ("header", "bag"), "rosbag")
+    stamp = chosen(given, "stamp", STAMPS, "rosbag")
     made = Recording(
         Path(argument).stem,
         policy(given, "rosbag"),
@@ -133,153 +95,226 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         place=argument,
     )
     path = Path(argument).expanduser()
-    wanted = _wanted(str(given["topics"])) if "topics" in given else None
-    made.info.update(topics={}, frames={})
-    with _Bag(path) as bag:
-        for name, topic, kind in _chosen(path, bag, wanted):
-            _read(made, path, bag, name, topic, kind, stamp)
-    if any("gyro" in s.leaves for s in made.streams.values()):
+    made.info.update(topics={}, frames={}, bodies={})
+    with Bag(path) as bag:
+        if len(bag.files) > 1:
+            parts = ", ".join(f.name for f in bag.files)
+            made.notes.append(note("assumed", f"the files of the folder are one recording: {parts}"))
+        types = readable(bag)
+        plan = named(bag, types, asked) if asked is not None else usual(bag, types)
+        _of_streams(given, [name for name, _ in plan])
+        for name, topic in plan:
+            _read(made, bag, name, topic, types[topic], given, asked=asked is not None)
+        if not made.streams and made.truth is None:
+            raise nothing(bag)
+        made.notes.extend(passed_over(bag, types, made.info["topics"].values()))
+    _frames_apart(made)
+    if any({"gyro", "rate"} & set(s.leaves) for s in made.streams.values()):
         made.info["imu_noise"] = imu_noise(given, "rosbag", made.notes)
-    for name in ("position", "attitude"):
-        if f"{name}.noise" in given:
-            made.info[f"{name}_noise"] = number(given, f"{name}.noise", 0.01, "rosbag")
+    measured_noise(given, "rosbag", made.info)
     return made.flight()
 
 
-class _Bag:
-    """An open bag of either version, with the definitions that ROS publishes."""
+def _of_streams(given: Mapping[str, Any], streams: Sequence[str]) -> None:
+    """Refuse a setting of a stream that is not read.
 
-    def __init__(self, path: Path) -> None:
-        try:
-            from rosbags import rosbag1, rosbag2  # optional, with what follows
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise MissingDependencyError(
-                "bags need the rosbags library",
-                path=str(path),
-                expected="the Python package rosbags",
-                got="it cannot be imported",
-                fix='pip install "flowgraph-filters[ros]"',
-            ) from None
-        self.path = path
-        if not path.exists() or not (path.is_dir() or path.suffix == ".bag"):
-            raise DataError(
-                "this is no bag",
-                path=str(path),
-                expected="a .bag file (ROS 1), or a folder with metadata.yaml (ROS 2)",
-                got="no such file or folder" if not path.exists() else f"a file {path.name}",
-                fix="check the path",
-            )
-        with self._damage():
-            self.reader: Any = rosbag2.Reader(path) if path.is_dir() else rosbag1.Reader(path)
-        self.store = get_typestore(Stores.ROS2_HUMBLE if path.is_dir() else Stores.ROS1_NOETIC)
-        self.decode = self.store.deserialize_cdr if path.is_dir() else self.store.deserialize_ros1
-
-    def __enter__(self) -> _Bag:
-        with self._damage():
-            self.reader.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.reader.close()
-
-    def connections(self) -> list[Any]:
-        return [c for c in self.reader.connections if c.msgtype in KINDS]
-
-    def messages(self, connections: list[Any]) -> Iterator[tuple[int, Any]]:
-        with self._damage():
-            for connection, time, raw in self.reader.messages(connections=connections):
-                yield time, self.decode(raw, connection.msgtype)
-
-    def _damage(self) -> _Damage:
-        return _Damage(self.path)
+    Raises:
+        UnknownNameError: listing those that are.
+    """
+    for setting in given:
+        stream, _, what = str(setting).rpartition(".")
+        if what in _OF_A_STREAM and stream and stream not in streams:
+            raise UnknownNameError("stream", stream, streams, path=f"rosbag.{setting}")
 
 
-class _Damage:
-    """What the library says against a bag becomes a `DataError`."""
+class _Messages(NamedTuple):
+    """What a topic holds: times (ns) in the header and the bag, numbers, frame and body of each reading.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    flags: how often a value was not measured. beside: how often there is what is not read. others: how many
+    readings are of frames and bodies that were not asked for.
+    """
 
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if error is None or not isinstance(error, Exception) or isinstance(error, DataError):
-            return
-        raise DataError(
-            "this bag cannot be read",
-            path=str(self.path),
-            expected="a whole bag of ROS 1 or ROS 2",
-            got=f"{type(error).__name__}: {error}"[:200],
-            fix="fetch it again, or mend it with the tools of ROS (rosbag reindex, ros2 bag reindex)",
-        ) from error
+    header: list[int]
+    bag: list[int]
+    rows: list[list[float]]
+    who: list[tuple[str, str]]
+    flags: Counter[str]
+    beside: Counter[str]
+    others: Counter[str]
 
 
-def _wanted(text: str) -> dict[str, str]:
-    """Names of streams by topic."""
-    pairs = [part.strip().partition(":") for part in text.split(",")]
-    for name, colon, topic in pairs:
-        if not name or not colon or not topic:
-            raise DeclarationError(
-                "this is no list of topics",
-                path="rosbag.topics",
-                expected="NAME:TOPIC, comma-separated",
-                got=repr(text),
-                fix="for example topics=imu:/imu0,vicon:/vicon/pose,truth:/ground_truth",
-            )
-    names = [name for name, _, _ in pairs]
-    if len({*names}) < len(names) or len({t for _, _, t in pairs}) < len(names):
-        raise DeclarationError(
-            "a stream or topic is named twice",
-            path="rosbag.topics",
-            expected="each once",
-            got=text,
-            fix="leave one of them out",
-        )
-    return {topic: name for name, _, topic in pairs}
+def _all(bag: Bag, topic: str, kind: str, how: Kind, only: Sequence[str | None]) -> _Messages:
+    """All readings of a topic of the frame and body that were asked for (None for any)."""
+    found = _Messages([], [], [], [], Counter(), Counter(), Counter())
+    for time, message in bag.messages(topic, kind):
+        for reading in how.parts(message):
+            header = reading.header
+            who = (header.frame_id.lstrip("/"), getattr(reading, "child_frame_id", "").lstrip("/"))
+            if any(w is not None and w != h for w, h in zip(only, who, strict=True)):
+                found.others[_pair(who)] += 1
+                continue
+            numbers, flags = how.read(reading)
+            found.header.append(header.stamp.sec * 10**9 + header.stamp.nanosec)
+            found.bag.append(time)
+            found.rows.append(numbers)
+            found.who.append(who)
+            found.flags.update(flags)
+            found.beside.update(how.beside(reading))
+    return found
 
 
-def _chosen(path: Path, bag: _Bag, wanted: dict[str, str] | None) -> list[tuple[str, str, Kind]]:
-    """Name, topic and kind of each stream to read."""
-    kinds = {c.topic: KINDS[c.msgtype] for c in bag.connections() if c.msgcount}
-    if not kinds:
-        held = [f"{c.topic} ({c.msgtype}, {c.msgcount})" for c in bag.reader.connections]
-        raise DataError(
-            "there is nothing to read in this bag",
-            path=str(path),
-            expected="messages of " + ", ".join(KINDS),
-            got=", ".join(held) or "an empty bag",
-            fix="record the topics of the sensors",
-        )
-    if wanted is not None:
-        for topic in wanted:
-            if topic not in kinds:
-                raise UnknownNameError("topic", topic, kinds, path=str(path))
-        return [(name, topic, kinds[topic]) for topic, name in wanted.items()]
-    usual = [kind.stream for kind in kinds.values()]
-    return [
-        (kind.stream if usual.count(kind.stream) == 1 else topic.strip("/").replace("/", "_"), topic, kind)
-        for topic, kind in kinds.items()
+def _pair(who: tuple[str, str]) -> str:
+    frame, body = who
+    return f"{frame!r}" + (f" -> {body!r}" if body else "")
+
+
+def _read(
+    made: Recording,
+    bag: Bag,
+    name: str,
+    topic: str,
+    kind: str,
+    given: Mapping[str, Any],
+    *,
+    asked: bool,
+) -> None:
+    """One stream, into the recording."""
+    place, how = f"{bag.path}: {topic}", kind_of(kind, name)
+    only = [
+        str(given[key]).lstrip("/") if (key := f"{name}.{part}") in given else None
+        for part in ("frame", "body")
     ]
-
-
-def _read(made: Recording, path: Path, bag: _Bag, name: str, topic: str, kind: Kind, stamp: str) -> None:
-    times, rows, frames = [], [], set()
-    for time, message in bag.messages([c for c in bag.connections() if c.topic == topic]):
-        header = message.header
-        times.append(header.stamp.sec * 10**9 + header.stamp.nanosec if stamp == "header" else time)
-        rows.append(kind.numbers(message))
-        frames.add(header.frame_id)
-    place = f"{path}: {topic}"
-    table = np.array(rows, dtype=float)
-    columns = {field: table[:, part] for field, part in kind.fields.items()}
+    found = _all(bag, topic, kind, how, only)
+    pairs = Counter(found.who)
+    if not pairs:
+        if found.others:
+            missing = " -> ".join(repr(w) if w is not None else "any" for w in only)
+            raise UnknownNameError("frame and body", missing, list(found.others), path=place)
+        if asked:
+            raise _empty(place, kind)
+        return
+    if len(pairs) > 1:
+        if kind in TRANSFORMS and not asked and made.streams:  # a robot's tree, which nobody asked for
+            text = ", ".join(_pair(p) for p in sorted(pairs))
+            made.notes.append(
+                note("skipped", f"{topic}: transforms of several bodies ({text}); {name}.body=... chooses")
+            )
+            return
+        raise _several(place, name, topic, pairs)
+    _measured(made, place, name, topic, how, found)
+    stamp = chosen(given, f"{name}.stamp" if f"{name}.stamp" in given else "stamp", STAMPS, "rosbag")
+    table = np.array(found.rows, dtype=float)
     made.add(
         name,
         place,
-        np.array(times, dtype=np.int64),
-        columns,
-        kind.signal,
+        _stamps(place, name, found, stamp),
+        {field: table[:, part] for field, part in how.fields.items()},
+        how.signal,
         row=lambda k: f"{place}, message {k + 1}",
     )
-    made.info["topics"][name], made.info["frames"][name] = topic, ", ".join(sorted(frames))
+    frame, body = found.who[0]
+    made.info["topics"][name], made.info["frames"][name] = topic, frame
+    if body:
+        made.info["bodies"][name] = body
+    _remarks(made, name, topic, kind, frame, found, asked=asked)
+
+
+def _empty(place: str, kind: str) -> DataError:
+    return DataError(
+        "this topic holds no messages",
+        path=place,
+        expected=f"messages of {kind}",
+        got="none",
+        fix="leave it out",
+    )
+
+
+def _several(place: str, name: str, topic: str, pairs: Counter[tuple[str, str]]) -> DataError:
+    """That a topic holds several bodies or frames, and how to choose."""
+    bodies, frames = ({p[i] for p in pairs} for i in (1, 0))
+    part, values = ("body", sorted(bodies)) if len(bodies) > 1 else ("frame", sorted(frames))
+    return DataError(
+        "one topic holds several bodies or frames",
+        path=place,
+        expected="one frame, and one body in it, for a stream",
+        got=", ".join(f"{_pair(who)} ({n})" for who, n in pairs.items()),
+        fix=f"choose: {name}.{part}={values[0]}; or a stream each, for example "
+        f"topics={name}:{topic},truth:{topic} with {name}.{part}={values[0]} and truth.{part}={values[1]}",
+    )
+
+
+def _measured(made: Recording, place: str, name: str, topic: str, how: Kind, found: _Messages) -> None:
+    """Notes on flags that say 'not measured'; an error where all messages say so.
+
+    Raises:
+        DataError: naming the field.
+    """
+    for flag, count in found.flags.items():
+        if count == len(found.rows):
+            what = "gyroscope" if "angular" in flag else "accelerometer" if "linear" in flag else "reading"
+            other = {"gyroscope": "accelerometer", "accelerometer": "gyro"}.get(what)
+            raise DataError(
+                f"all messages of this topic say that there is no {what}",
+                path=place,
+                expected="a reading in some message",
+                got=f"{flag}, 'not measured', in all of {count}",
+                fix=f"topics={other}:{topic},... reads the other part of it"
+                if other and name not in ("gyro", "accelerometer")
+                else "leave the topic out, or take one that measured",
+            )
+        said = f"{name}: {count} of {len(found.rows)} messages of {topic} were not measured: {flag}"
+        made.notes.append(note("skipped", said))
+
+
+def _stamps(place: str, name: str, found: _Messages, stamp: str) -> np.ndarray:
+    """The times (n,) ns of the readings.
+
+    Raises:
+        DataError: for stamps of the header that nobody set, and those beyond 64 bits.
+    """
+    times = found.header if stamp == "header" else found.bag
+    zeros, far = times.count(0), [k for k, t in enumerate(times) if not -(2**63) <= t < 2**63]
+    if far:
+        raise DataError(
+            "a stamp is beyond 64 bits",
+            path=f"{place}, message {far[0] + 1}",
+            expected="nanoseconds within 64 bits",
+            got=f"{times[far[0]]} ns",
+            fix=f"{name}.stamp=bag takes the times of recording" if stamp == "header" else "mend the bag",
+        )
+    unset = zeros > 1 or (zeros and max(map(abs, times)) > _STRANGE)
+    if stamp == "header" and (unset or (len(times) > 1 and len(set(times)) == 1)):
+        raise DataError(
+            "the stamps of the headers are not set",
+            path=f"{place}, message {times.index(0 if zeros else times[0]) + 1}",
+            expected="when each message was measured",
+            got=f"{zeros} of {len(times)} are 0" if zeros else f"{times[0]} ns in all {len(times)}",
+            fix=f"{name}.stamp=bag takes the times of recording; stamp=bag does so for all streams",
+        )
+    return np.array(times, dtype=np.int64)
+
+
+def _remarks(
+    made: Recording, name: str, topic: str, kind: str, frame: str, found: _Messages, *, asked: bool
+) -> None:
+    """Notes on what a topic holds beside what was read, and on its frame."""
+    for what in found.beside:
+        made.notes.append(note("skipped", f"{name}: the {what} in the messages of {topic}"))
+    if found.others:
+        others = ", ".join(f"{who} ({n})" for who, n in sorted(found.others.items()))
+        made.notes.append(note("skipped", f"{name}: others of {topic}: {others}"))
+    if name == "truth" and not asked:
+        made.notes.append(note("assumed", f"{topic} is the truth, by its name"))
+    if "Twist" in kind:
+        made.notes.append(note("assumed", f"{name}: in the axes of the world; its frame is {frame!r}"))
+    if _DOWN.search(frame) and kind != "sensor_msgs/msg/Imu":
+        made.notes.append(note("warning", f"{name}: its frame is {frame!r}; here the world has z up"))
+
+
+def _frames_apart(made: Recording) -> None:
+    """A note where positions are given in frames of several names."""
+    series = {**made.streams, **({"truth": made.truth} if made.truth is not None else {})}
+    frames = {n: made.info["frames"][n] for n, s in series.items() if "position" in s.leaves}
+    if len({f for f in frames.values() if f}) > 1:
+        text = ", ".join(f"{n} in {f!r}" for n, f in frames.items())
+        made.notes.append(note("assumed", f"these frames are one: {text}"))

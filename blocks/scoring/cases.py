@@ -138,6 +138,7 @@ def on_flight(
         prepare.__signature__ = signature  # type: ignore[attr-defined]
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
         prepare.__doc__ = known.documentation
+        prepare.scoring = known.scoring  # type: ignore[attr-defined]
         return graph.on_flight(prepare)
 
     return register
@@ -154,6 +155,7 @@ class Scored(Settings):
         settle: seconds at the start that the errors leave out.
     """
 
+    judges = True
     settle: NotNegative = 1.0
 
     def score(
@@ -182,6 +184,7 @@ class Smoothed(Scored):
         lag: s; also scores the run smoothed with a fixed lag.
     """
 
+    judges = True
     smooth: Annotated[str, one_of("none", "rts")] = "none"
     lag: NotNegative | None = None
 

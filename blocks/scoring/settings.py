@@ -98,12 +98,23 @@ def named(kind: str, words: Iterable[str]) -> Check:
 
 @dataclass(frozen=True)
 class Settings:
-    """A group of settings. A class of several groups has the settings of all, from left to right."""
+    """A group of settings. A class of several groups has the settings of all, from left to right.
+
+    Where a class says `judges = True`, its own settings change how a run is scored, and not the run: they are
+    no parameters of a filter, and are not tuned.
+    """
+
+    judges = False
 
     @classmethod
     def names(cls) -> list[str]:
         """The settings: a class's own first, then those of its bases."""
         return list(dict.fromkeys(n for c in cls.__mro__ for n in inspect.get_annotations(c)))
+
+    @classmethod
+    def scoring(cls) -> frozenset[str]:
+        """Those of the settings that change how a run is scored."""
+        return frozenset(n for c in cls.__mro__ if vars(c).get("judges") for n in inspect.get_annotations(c))
 
 
 @dataclass(frozen=True)
@@ -121,6 +132,11 @@ class Spliced:
     checks: Mapping[str, tuple[Check, ...]]
     groups: Mapping[str, type[Settings]]
     documentation: str
+
+    @property
+    def scoring(self) -> frozenset[str]:
+        """The settings that change how a run is scored, and not the run."""
+        return frozenset[str]().union(*(group.scoring() for group in self.groups.values()))
 
     def check(self, graph: str, values: Mapping[str, Any]) -> None:
         """Refuse values that settings may not have.

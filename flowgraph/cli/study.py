@@ -99,6 +99,10 @@ def report(
     ] = None,
     metric: Annotated[str | None, typer.Option(help="To draw and rank by; the first if left out.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For a comparison; B if left out.")] = None,
+    across: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A setting of the flight in which pairs may differ; repeatable."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write what a study found as an HTML page and pictures, or compare two studies."""
@@ -112,15 +116,17 @@ def report(
             got="both" if folder is not None else "neither",
             fix="flowgraph report DIR",
         )
-    rows: Any
+    notes: tuple[str, ...] = ()
     if compare is not None:
-        page, rows = write_comparison(*compare, out or compare[1], metric=metric)
+        page, rows, notes = write_comparison(*compare, out or compare[1], metric=metric, across=across or ())
     else:
         found = write_report(folder or "", metric=metric)
         page, rows = found.page, found.summary
     if as_json:
-        return print_json({"page": str(page), "rows": rows})
+        return print_json({"page": str(page), "rows": rows, "notes": list(notes)})
     print_whole(table([{n: _short(v) for n, v in row.items()} for row in rows]))
+    for one in notes:
+        err_console.print(f"note: {one}", markup=False)
     err_console.print(f"wrote {page}", markup=False)
 
 

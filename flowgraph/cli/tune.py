@@ -21,6 +21,7 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError
 
 if TYPE_CHECKING:
@@ -88,9 +89,13 @@ def tune(
         out_console.print(f"after, without fold {k}: {_said(part.parameters)}", markup=False)
     whole = "of all: " if found.folds else "after: "
     out_console.print(whole + " ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()))
+    for said in _notes(found):
+        err_console.print(f"note: {said}", markup=False)
     bounds = {f.name: {"low": f.low, "high": f.high} for f in fits}
     for label, one in _searches(found):
         for name, side in one.at_bound.items():
+            if name in found.without_effect:
+                continue
             err_console.print(
                 f"note: {name} ended at its {side} bound, {bounds[name][side]:g}{label}: the least lies"
                 f" beyond it, or {name} hardly matters; widen --fit {name}=... to see",
@@ -102,6 +107,17 @@ def tune(
                 f" {one.message}",
                 markup=False,
             )
+
+
+def _notes(found: Tuned) -> list[str]:
+    """On parameters that do nothing."""
+    what = found.metric if found.measure == "error" else "likelihood"
+    return [
+        note(
+            "warning", f"{name} has no effect on the {what} of these recordings: its value is where it began"
+        )
+        for name in found.without_effect
+    ]
 
 
 def _searches(found: Tuned) -> list[tuple[str, Found]]:
@@ -167,6 +183,7 @@ def _report(found: Tuned) -> dict[str, Any]:
     return {
         "graph": found.graph, "start": found.start, "measure": found.measure, "metric": found.metric,
         **search(found), "folds": [search(part) for part in found.folds], "recordings": rows,
+        "without_effect": list(found.without_effect), "notes": _notes(found),
         "mean": {n: dict(zip(three, m, strict=True)) for n, m in means.items() if m is not None},
     }  # fmt: skip
 

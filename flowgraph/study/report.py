@@ -14,13 +14,15 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from flowgraph.data.notes import note
+from flowgraph.data.registry import flight_settings
 from flowgraph.errors import UnknownNameError
 from flowgraph.study.spec import text
-from flowgraph.study.statistics import compared, finite_values, grouped, metrics_of, quantiles
+from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
 from flowgraph.study.store import Store, read_study, read_table, write_atomically
 
 WORST = 10
@@ -92,10 +94,25 @@ def write_report(folder: str | Path, *, metric: str | None = None) -> Reported:
     return Reported(target / PAGE, tuple(files), summary)
 
 
+class Comparison(NamedTuple):
+    """What was written: the page, a row a graph and metric, and notes on what differs and is left out."""
+
+    page: Path
+    rows: list[dict[str, Any]]
+    notes: tuple[str, ...]
+
+
 def write_comparison(
-    a: str | Path, b: str | Path, out: str | Path, *, metric: str | None = None
-) -> tuple[Path, list[dict[str, Any]]]:
+    a: str | Path, b: str | Path, out: str | Path, *, metric: str | None = None, across: Sequence[str] = ()
+) -> Comparison:
     """Compare two studies run by run; writes `comparison.html` and `figures/ratio.png` into `out`.
+
+    Args:
+        a, b: their folders.
+        out: a folder.
+        metric: only this one; all that both have if left out.
+        across: settings of the flight in which runs of a pair may differ. Otherwise another setting is
+            another flight.
 
     Raises:
         DataError: where a study has no results, or the two have no runs in common.
@@ -105,7 +122,17 @@ def write_comparison(
     metrics = [m for m in metrics_of(theirs, names) if m in metrics_of(ours, names)]
     if metric is not None and metric not in metrics:
         raise UnknownNameError("metric", metric, metrics, path=f"{a}, {b}")
-    table = compared(theirs, ours, [metric] if metric else metrics, names)
+    flown = {n for spec in {r["data"] for r in (*ours, *theirs)} for n in flight_settings(spec)}
+    for name in across:
+        if name not in names or name not in flown:
+            raise UnknownNameError(
+                "setting of the flight", name, [n for n in names if n in flown], path="across"
+            )
+    table = compared(
+        theirs, ours, [metric] if metric else metrics, names,
+        flight=[n for n in names if n in flown and n not in across],
+    )  # fmt: skip
+    notes = _compared_notes(table, differing(theirs, ours, names))
     image = _png(lambda figure: _draw_ratios(figure, table))
     write_atomically(Path(out) / FIGURES / "ratio.png", image)
     code = base64.b64encode(image).decode()
@@ -115,12 +142,32 @@ def write_comparison(
         " bootstrap interval. Below 1 the second has less; in what part of the runs it does is under"
         " <em>less</em>. Of an error less is better, of a count or of a share within a bound it need not"
         " be.</p>",
+        *(f"<p>{_safe(one)}</p>" for one in notes),
         f'<img alt="ratios" src="data:image/png;base64,{code}">',
         _table(_shown(table)),
     ]
     page = Path(out) / "comparison.html"
     write_atomically(page, _page("Comparison", parts).encode())
-    return page, table
+    return Comparison(page, table, notes)
+
+
+def _compared_notes(
+    table: Sequence[Mapping[str, Any]], apart: Mapping[str, tuple[str, str]]
+) -> tuple[str, ...]:
+    """Sentences on the settings that differ, and on runs that no ratio stands for, once for alike lines."""
+    notes = [
+        note("warning", f"{n} differs: {x} in the first, {y} in the second") for n, (x, y) in apart.items()
+    ]
+    left: dict[tuple[str, str], list[str]] = {}
+    for line in table:
+        counts = [(line["failed"], "failed"), (line["unusable"], "zero, negative or no number")]
+        counts.append((line["unpaired"], "without their like in the other study"))
+        if said := ", ".join(f"{n} {what}" for n, what in counts if n):
+            left.setdefault((line["graph"], said), []).append(line["metric"])
+    for (graph, said), metrics in left.items():
+        shown = ", ".join(metrics[:4]) + (f" and {len(metrics) - 4} more" if len(metrics) > 4 else "")
+        notes.append(note("skipped", f"{graph}, {shown}: runs left out: {said}"))
+    return tuple(notes)
 
 
 # -- pictures ------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from flowgraph.data.registry import find_graph, flight_names, flight_settings, p
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.study.places import absolute, beside
 
 Value = bool | int | float | str
 Point = Mapping[str, Value]
@@ -45,7 +46,7 @@ class Study:
 
     Args:
         graphs: names, as `flowgraph list` gives them.
-        data: flights, such as "sim" or "euroc:PATH".
+        data: flights, such as "sim" or "euroc:PATH"; kept with absolute paths.
         seeds: how many (0, 1, ...), or which.
         parameters: settings of graphs or flights by name: one value, a list, `{"linspace": [first, last,
             count]}` or `{"logspace": [first, last, count]}`, whose ends are values. All combinations are run.
@@ -79,7 +80,7 @@ class Study:
     def __post_init__(self) -> None:
         put: Callable[[str, Any], None] = functools.partial(object.__setattr__, self)
         put("graphs", _names("graphs", self.graphs))
-        put("data", _names("data", self.data))
+        put("data", tuple(absolute(spec, Path.cwd()) for spec in _names("data", self.data)))
         put("seeds", _seeds(self.seeds))
         put("metrics", None if self.metrics is None else _names("metrics", self.metrics))
         _one_of("engine", self.engine, engine_names())
@@ -95,7 +96,7 @@ class Study:
         if self.out is not None and not isinstance(self.out, str):
             raise _wrong("out", "the name of a folder", self.out)
         points = [_point(f"points[{k}]", p) for k, p in enumerate(_listed("points", self.points))]
-        put("points", tuple(points + _drawn(self.sample)))
+        put("points", _different(points + _drawn(self.sample)))
         put("sample", None)
         grid = _grid(self.parameters, self.graphs)
         put("parameters", grid)
@@ -164,7 +165,7 @@ class Study:
 
     @classmethod
     def load(cls, file: str | Path) -> Study:
-        """Read a study from a `.toml` file, or from the `.json` of a resolved one.
+        """Read a study from a `.toml` file, or from the `.json` of a resolved one. Its paths start there.
 
         Raises:
             DataError: where it cannot be read; DeclarationError, UnknownNameError: naming the key.
@@ -183,6 +184,11 @@ class Study:
             ) from None
         if not isinstance(found, dict):
             raise _wrong(str(path), "a table of keys", type(found).__name__)
+        folder = path.resolve().parent
+        if isinstance(found.get("data"), list):
+            found["data"] = [beside(spec, folder) for spec in found["data"]]
+        if isinstance(found.get("out"), str):
+            found["out"] = str(folder / found["out"])
         return cls.from_mapping(found)
 
     @classmethod
@@ -321,15 +327,38 @@ def _axis(key: str, given: Any) -> tuple[Value, ...]:
             raise _wrong(key, "a count from 1", numbers[2])
         if kind == "logspace" and min(numbers[:2]) <= 0:
             raise _wrong(key, "positive ends, which are values and not exponents", ends)
-        made = (np.linspace if kind == "linspace" else np.geomspace)(*numbers)
-        return tuple(made.tolist())
+        made = (np.linspace if kind == "linspace" else np.geomspace)(*numbers).tolist()
+        if len(set(made)) < len(made):
+            raise _wrong(key, "ends that differ, or a count of 1", ends)
+        return tuple(made)
     if isinstance(given, np.ndarray):
         given = given.tolist()
     values = [given] if isinstance(given, str) or not isinstance(given, Sequence) else list(given)
     found = tuple(_value(key, v) for v in values)
-    if not found or len(set(map(text, found))) < len(found):
+    if not found or len(set(map(_same, found))) < len(found):
         raise _wrong(key, "values that differ, one or more", given)
     return found
+
+
+def _same(value: Value) -> object:
+    """What two values have in common that mean the same: 1, 1.0 and "1" are one number."""
+    written = text(value)
+    for kind in (int, float):
+        try:
+            return kind(written)
+        except ValueError:
+            pass
+    return written
+
+
+def _different(points: list[dict[str, Value]]) -> tuple[dict[str, Value], ...]:
+    """Points, of which each would be run, and counted, as often as it is there."""
+    seen: dict[Any, int] = {}
+    for k, point in enumerate(points):
+        first = seen.setdefault(frozenset((n, _same(v)) for n, v in point.items()), k)
+        if first != k:
+            raise _wrong(f"points[{k}]", f"each point once; points[{first}] is the same", point)
+    return tuple(points)
 
 
 def _number(x: object) -> bool:

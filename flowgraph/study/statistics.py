@@ -98,7 +98,7 @@ def quantiles(
 
 def compared(
     a: Sequence[Row], b: Sequence[Row], metrics: Sequence[str], parameters: Iterable[str] = (), *,
-    level: float = 0.95, seed: int = 0,
+    flight: Iterable[str] = (), level: float = 0.95, seed: int = 0,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Two studies run by run: for each graph of b beside that of a, and each metric, the ratio b / a.
 
@@ -107,49 +107,91 @@ def compared(
     are paired by those `parameters` too that take the same values in both; of runs that even then cannot be
     told apart the median counts.
 
+    Args:
+        a, b: rows of the tables.
+        metrics: columns.
+        parameters: the columns that are settings.
+        flight: those of them that are settings of the flight, as its duration: another value is another
+            flight.
+        level: of the interval.
+        seed: of its draws.
+
     Returns:
         For each, `pairs`, the `ratio` (the median of the pairs' ratios) and its bootstrap interval `low` to
-        `high`, and `less`: the share of pairs in which b is less.
+        `high`, and `less`: the share of pairs in which b is less. What the ratio leaves out is counted, in
+        runs of both studies: `failed`, `unusable` (zero, negative or no number, of which there is no ratio)
+        and `unpaired` (the other study has no such run that can be used).
 
     Raises:
-        DataError: where nothing can be paired.
+        DataError: where nothing can be paired, saying what was left out and which settings differ.
     """
     table = []
-    by = ["data", "seed"]
-    if any(len({(r["graph"], r["data"], r["seed"]) for r in rows}) < len(rows) for rows in (a, b)):
-        by += [n for n in dict.fromkeys(parameters) if {r.get(n) for r in a} == {r.get(n) for r in b}]
+    by = ["data", "seed", *dict.fromkeys(flight)]
+    if any(len({(r["graph"], *(r.get(n) for n in by)) for r in rows}) < len(rows) for rows in (a, b)):
+        by += [
+            n for n in dict.fromkeys(parameters)
+            if n not in by and {r.get(n) for r in a} == {r.get(n) for r in b}
+        ]  # fmt: skip
     graphs_a, graphs_b = ({r["graph"]: None for r in rows} for rows in (a, b))
     lone = len(graphs_a) == len(graphs_b) == 1
     for graph in graphs_b:
         other = next(iter(graphs_a)) if lone else graph
+        pair = [r for r in b if r["graph"] == graph], [r for r in a if r["graph"] == other]
         for metric in metrics:
-            ours = _by_run([r for r in b if r["graph"] == graph], by, metric)
-            theirs = _by_run([r for r in a if r["graph"] == other], by, metric)
-            pairs = [(theirs[k], y) for k, y in ours.items() if k in theirs]
-            if not pairs:
+            ours, theirs = (_by_run(rows, by, metric) for rows in pair)
+            both = [k for k in ours if k in theirs]
+            if not both:
                 continue
-            logs = np.log([y / x for x, y in pairs])
+            logs = np.log([float(np.median(ours[k]) / np.median(theirs[k])) for k in both])
             low, high = bootstrap_median(logs, level=level, seed=seed)
+            usable = [len(v) for found in (ours, theirs) for v in found.values()]
+            paired = [len(found[k]) for found in (ours, theirs) for k in both]
+            failed = sum(r.get("error") is not None for rows in pair for r in rows)
             table.append(
                 {
                     "graph": graph if graph == other else f"{graph} / {other}",
                     "metric": metric,
-                    "pairs": len(pairs),
+                    "pairs": len(both),
                     "ratio": float(np.exp(np.median(logs))),
                     "low": math.exp(low),
                     "high": math.exp(high),
                     "less": float(np.mean(logs < 0)),
+                    "failed": failed,
+                    "unusable": sum(map(len, pair)) - failed - sum(usable),
+                    "unpaired": sum(usable) - sum(paired),
                 }
             )
     if not table:
+        apart = differing(a, b, parameters)
+        said = [
+            f"{sum(r.get('error') is not None for r in rows)} of {len(rows)} runs failed" for rows in (a, b)
+        ]
         raise DataError(
             "these studies have no runs in common",
             path="--compare",
-            expected="runs of the same flight with the same seed",
-            got=f"{len(a)} and {len(b)} runs",
-            fix="run both over the same data and seeds",
+            expected="runs of the same flight, at the same settings of it, with the same seed",
+            got="; ".join([*said, *(f"{n}: {x} and {y}" for n, (x, y) in apart.items())]),
+            fix="run both over the same data, seeds and settings of the flight, or name those settings in which"
+            " runs of a pair may differ: --across NAME",
         )
     return table
+
+
+def differing(a: Sequence[Row], b: Sequence[Row], parameters: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """The settings that do not take the same values in two studies, and the values of each as text."""
+    found = {}
+    for name in dict.fromkeys(parameters):
+        values = [list(dict.fromkeys(r.get(name) for r in rows)) for rows in (a, b)]
+        if set(values[0]) != set(values[1]):
+            found[name] = (_few(values[0]), _few(values[1]))
+    return found
+
+
+def _few(values: Sequence[Any], most: int = 6) -> str:
+    """Some values as text; None is what is not set."""
+    shown = ["not set" if v is None else f"{v:g}" if isinstance(v, float) else str(v) for v in values[:most]]
+    more = f", ... ({len(values)} values)" if len(values) > most else ""
+    return ", ".join(shown) + more
 
 
 def bootstrap_median(values: np.ndarray, *, level: float, seed: int) -> tuple[float, float]:
@@ -161,7 +203,7 @@ def bootstrap_median(values: np.ndarray, *, level: float, seed: int) -> tuple[fl
     return float(low), float(high)
 
 
-def _by_run(rows: Sequence[Row], by: Sequence[str], metric: str) -> dict[tuple[Any, ...], float]:
-    """The metric of each run, where it is positive, by what tells runs apart."""
+def _by_run(rows: Sequence[Row], by: Sequence[str], metric: str) -> dict[tuple[Any, ...], np.ndarray]:
+    """The values of a metric that have a logarithm, by what tells runs apart; none where there are none."""
     found = {k: finite_values(members, metric) for k, members in grouped(rows, by).items()}
-    return {k: float(np.median(v)) for k, v in found.items() if len(v) and (v > 0).all()}
+    return {k: v[v > 0] for k, v in found.items() if (v > 0).any()}

@@ -21,7 +21,7 @@ from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.study.spec import Value, text
 from flowgraph.study.tasks import flight_part
-from flowgraph.study.trials import Judged, Recording, Trials, surprise
+from flowgraph.study.trials import ASTRAY, Judged, Recording, Trials, surprise
 
 __all__ = ["MEASURES", "METHODS", "Fit", "Found", "Judged", "Recording", "Tuned", "surprise", "tune"]
 
@@ -70,6 +70,7 @@ class Tuned(Found):
         judged: each recording before and after. Where there are folds, each once, held out of its own.
         folds: what each search found that left a part of the recordings out; `parameters` are of the search
             over all.
+        without_effect: parameters whose farther bound gives the same measure on every recording fitted to.
     """
 
     graph: str
@@ -78,6 +79,7 @@ class Tuned(Found):
     metric: str | None
     judged: tuple[Judged, ...]
     folds: tuple[Found, ...] = ()
+    without_effect: tuple[str, ...] = ()
 
     def mean(self, *, held_out: bool) -> tuple[float, float, float] | None:
         """The measure before, after and of the graph's own, over the recordings of one kind; None without.
@@ -161,7 +163,20 @@ def tune(
     return Tuned(
         found.parameters, found.evaluations, found.converged, found.message, found.at_bound,
         graph, start, measure, problem.metric, tuple(judged), tuple(parts),
+        _without_effect(problem, fits, found.parameters, whole),
     )  # fmt: skip
+
+
+def _without_effect(
+    problem: Trials, fits: Sequence[Fit], found: Mapping[str, float], places: Sequence[int]
+) -> tuple[str, ...]:
+    """The parameters that move no measure to the last bit, from what was found to the farther bound."""
+    far = [{f.name: f.high if found[f.name] ** 2 < f.low * f.high else f.low} for f in fits]
+    base, *moved = problem.measured([dict(found), *({**found, **one} for one in far)], places)
+    works = base < ASTRAY
+    return tuple(
+        f.name for f, row in zip(fits, moved, strict=True) if works.any() and (row == base)[works].all()
+    )
 
 
 def _start(graph: str, fit: Fit) -> float:
@@ -268,6 +283,10 @@ def _check(
             raise _wrong(f"fit {fit.name}", "0 < low <= start <= high, low < high", fit)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
             raise _wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
+        if fit.name in getattr(prepare, "scoring", ()):
+            raise _wrong(
+                f"fit {fit.name}", "a setting of the filter; this one changes how a run is scored", fit.name
+            )
         if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
             raise _wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
         if prepare is not None:

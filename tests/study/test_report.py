@@ -13,7 +13,7 @@ from flowgraph import DataError, UnknownNameError
 from flowgraph.cli import app
 from flowgraph.study import Study, run_study
 from flowgraph.study.report import write_comparison, write_report
-from flowgraph.study.statistics import compared, quantiles, summarised
+from flowgraph.study.statistics import compared, differing, quantiles, summarised
 
 pytest.importorskip("pyarrow")
 FLIGHT = {"duration": 1.5, "imu.rate": 50}
@@ -136,3 +136,90 @@ def test_unknown_names_and_missing_results_are_errors(folder, tmp_path):
         write_comparison(folder, folder, tmp_path, metric="speed")
     with pytest.raises(DataError):
         write_comparison(folder, tmp_path, tmp_path)
+
+
+# What a comparison leaves out
+
+
+@pytest.mark.parametrize(
+    ("b", "failed", "unusable", "unpaired", "pairs"),
+    [
+        ([run("x", 0, 1.0), {**run("x", 1, None), "error": "no"}, run("x", 2, 1.0)], 1, 0, 1, 2),
+        ([run("x", 0, 1.0), run("x", 1, 0.0), run("x", 2, -1.0)], 0, 2, 2, 1),
+        ([run("x", 0, 1.0), run("x", 1, float("nan")), run("x", 2, None)], 0, 2, 2, 1),
+        ([run("x", 0, 1.0), run("x", 7, 1.0), run("x", 8, 1.0)], 0, 0, 4, 1),
+        ([run("x", 0, 1.0), run("x", 1, 1.0), run("x", 2, 1.0)], 0, 0, 0, 3),
+        ([run("x", 0, 1.0), {**run("x", 0, 2.0), "error": "no"}, run("x", 0, 3.0)], 1, 0, 2, 1),
+    ],
+)
+def test_what_a_ratio_leaves_out_is_counted_by_reason(b, failed, unusable, unpaired, pairs):
+    a = [run("x", k, 1.0) for k in range(3)]
+    for first, second in ((a, b), (b, a)):
+        (line,) = compared(first, second, ["e"])
+        assert (line["failed"], line["unusable"], line["unpaired"], line["pairs"]) == (
+            failed, unusable, unpaired, pairs,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("values", [(1.5, 4.0), (None, 4.0), (1.5, "long")])
+def test_flights_of_other_settings_are_other_flights(values):
+    a, b = ([run("x", k, 1.0 + k, d=v) for k in range(3)] for v in values)
+    with pytest.raises(DataError, match="no runs in common(?s:.*)d: .* and (4|long)(?s:.*)across"):
+        compared(a, b, ["e"], ["d"], flight=["d"])
+    (line,) = compared(a, [*b, run("x", 1, 6.0, d=values[0])], ["e"], ["d"], flight=["d"])
+    assert (line["pairs"], line["ratio"], line["unpaired"]) == (1, pytest.approx(3.0), 5)
+    (line,) = compared(a, b, ["e"], ["d"])  # a setting of the filter may be what is compared
+    assert line["pairs"] == 3
+
+
+def test_nothing_to_compare_says_how_many_failed():
+    failed = [{**run("x", k, None), "error": "no"} for k in range(3)]
+    with pytest.raises(DataError, match="0 of 1 runs failed; 3 of 3 runs failed"):
+        compared([run("x", 0, 1.0)], failed, ["e"])
+
+
+def test_settings_that_differ_are_named_with_their_values():
+    a = [run("x", k, 1.0, p=p, q=1) for k in range(2) for p in (0.5, 1.0)]
+    b = [run("x", k, 1.0, p=1.0, q=1.0, r=None, s=k) for k in range(9)]
+    assert differing(a, b, ["p", "q", "r", "s", "p"]) == {
+        "p": ("0.5, 1", "1"),
+        "s": ("not set", "0, 1, 2, 3, 4, 5, ... (9 values)"),
+    }
+
+
+@pytest.fixture(scope="module")
+def studies(tmp_path_factory):
+    """Three of one filter: a flight, a longer one, and settings with which most runs fail."""
+    root = tmp_path_factory.mktemp("studies")
+    for name, length, noises in (
+        ("one", 1.5, 0.01), ("long", 2.0, 0.01), ("bad", 1.5, [-0.01, 0.01, 0]), ("other", 1.5, 0.02),
+    ):  # fmt: skip
+        parameters = {"duration": length, "imu.rate": 50, "position_noise": noises}
+        run_study(Study(graphs=["ekf"], data=["sim"], parameters=parameters), root / name)
+    return root
+
+
+def test_a_comparison_says_what_failed_and_what_differs(studies, tmp_path):
+    found = write_comparison(studies / "one", studies / "bad", tmp_path, metric="position_rmse_m")
+    assert (found.rows[0]["pairs"], found.rows[0]["failed"]) == (1, 2)
+    assert found.notes[0].startswith("warning: position_noise differs: 0.01 in the first, -0.01, 0.01, 0")
+    assert found.notes[1] == "skipped: ekf, position_rmse_m: runs left out: 2 failed"
+    page = found.page.read_text()
+    assert all(part in page for part in ("position_noise differs", "2 failed", "<th>unpaired</th>"))
+    told = invoke("report", "--compare", studies / "one", studies / "other", "--out", tmp_path)
+    assert "note: warning: position_noise differs: 0.01 in the first, 0.02 in the second" in told.stderr
+    alike = invoke("report", "--compare", studies / "one", studies / "one", "--out", tmp_path, "--json")
+    assert json.loads(alike.stdout)["notes"] == []
+
+
+def test_flights_of_other_lengths_are_compared_only_when_it_is_asked_for(studies, tmp_path):
+    both = ("report", "--compare", studies / "one", studies / "long", "--out", tmp_path)
+    done = invoke(*both)
+    assert done.exit_code == 1
+    assert "duration: 1.5 and 2" in done.stderr
+    asked = json.loads(invoke(*both, "--across", "duration", "--json").stdout)
+    assert asked["rows"][0]["pairs"] == 1
+    assert "warning: duration differs: 1.5 in the first, 2 in the second" in asked["notes"]
+    wrong = invoke(*both, "--across", "position_noise")
+    assert wrong.exit_code == 2
+    assert "duration" in wrong.stderr

@@ -528,3 +528,31 @@ def test_a_folder_is_needed():
         run_study(small())
     with pytest.raises(DataError, match="no results"):
         read_table("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("given", "place"),
+    [
+        ({"parameters": {"gate": [1, 1.0]}}, "parameters.gate"),
+        ({"parameters": {"gate": ["1", 1]}}, "parameters.gate"),
+        ({"parameters": {"gate": [0.1, 1e-1]}}, "parameters.gate"),
+        ({"parameters": {"gate": {"linspace": [2, 2, 3]}}}, "parameters.gate.linspace"),
+        ({"parameters": {"gate": {"logspace": [2, 2.0, 2]}}}, "parameters.gate.logspace"),
+        ({"parameters": {"ekf": {"gate": {"linspace": [1, 1 + 1e-16, 2]}}}}, "parameters.ekf.gate.linspace"),
+        ({"points": [{"gate": 1}, {"gate": 2}, {"gate": 1.0}]}, "points[2]"),
+        ({"points": [{"gate": 1, "settle": 2}, {"settle": 2.0, "gate": "1"}]}, "points[1]"),
+    ],
+)
+def test_what_would_run_and_count_twice_is_refused(given, place):
+    with pytest.raises(DeclarationError) as caught:
+        Study(graphs=["ekf"], data=["sim"], **given)
+    assert caught.value.path == place
+
+
+def test_values_that_only_look_alike_are_kept():
+    study = Study(
+        graphs=["ekf"], data=["sim"],
+        parameters={"gate": [1, 1.5], "position_noise": {"linspace": [0.01, 0.01, 1]}},
+        points=[{"settle": 1}, {"settle": 2}, {"settle": 1, "gyro_factor": 2}],
+    )  # fmt: skip
+    assert len(list(study.combinations("ekf"))) == 6

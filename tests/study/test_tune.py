@@ -255,3 +255,32 @@ def test_a_file_is_one_recording_whatever_its_seed(tmp_path):
     one, again = Recording(f"ese650:{tmp_path}:1"), Recording(f"ese650:{tmp_path}/.:1", seed=1)
     with pytest.raises(DeclarationError, match="recordings that differ"):
         tune("quaternion_ukf", [Fit("force_noise", 0.1, 10.0)], [one], [again], measure="error")
+
+
+@pytest.mark.parametrize(
+    ("graph", "name"), [("ekf", "settle"), ("kalman", "settle"), ("ekf", "lag"), ("marg", "settle")]
+)
+def test_a_setting_of_the_scoring_is_not_tuned(graph, name):
+    """Errors get smaller by leaving more of them out, which makes no filter better."""
+    with pytest.raises(DeclarationError, match="changes how a run is scored"):
+        tune(graph, [Fit(name, 0.1, 2.0)], [Recording("sim")], measure="error", settings=PERFECT)
+
+
+def test_a_parameter_without_effect_is_said(tmp_path):
+    """A gate that refuses nothing, whatever it is; of the other the measure depends."""
+    fits = [Fit("gate", 1e4, 1e8, 1e5), Fit("position_noise", 5e-3, 0.1)]
+    found = tune("ekf", fits, [Recording("sim")], settings=PERFECT, most=12)
+    assert found.without_effect == ("gate",)
+    words = ["tune", "ekf", "--data", "sim", "--fit", "gate=1e4:1e8", "--most", "4"]
+    words += [w for n, v in PERFECT.items() for w in ("--set", f"{n}={v}")]
+    done = CliRunner(env={"COLUMNS": "300", "NO_COLOR": "1"}).invoke(app, words)
+    assert "note: warning: gate has no effect on the likelihood" in done.stderr
+    as_json = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)
+    assert as_json["without_effect"] == ["gate"]
+    assert as_json["notes"][0].startswith("warning: gate has no effect")
+
+
+def test_a_parameter_that_matters_on_one_recording_has_an_effect():
+    flights = [Recording("sim", 0), Recording("sim", 1)]
+    found = tune("ekf", [Fit("gyro_factor", 0.1, 10.0)], flights, settings=PERFECT, most=6)
+    assert found.without_effect == ()

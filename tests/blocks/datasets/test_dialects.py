@@ -118,9 +118,8 @@ def test_what_was_found_out_is_said(tmp_path, dialect, said):
 
 def test_words_for_what_was_not_measured(tmp_path):
     words = ["NA", "N/A", "#N/A", "null", "None", "-", "1.#QNAN", "-nan(ind)", "<NA>", "NaN", ""]
-    rows = [
-        [str(START + 1_000_000 * k), "0", "0", "0", w, "0", "9.8"] for k, w in enumerate([*words, "1", "2", "3", "4"])
-    ]
+    column = [*words, "1", "2", "3", "4"]
+    rows = [[str(START + 1_000_000 * k), "0", "0", "0", w, "0", "9.8"] for k, w in enumerate(column)]
     flight = load(tmp_path, text(rows))
     assert len(flight.streams["imu"]) == 4
     assert flight.info["absent"]["imu"] == len(words)

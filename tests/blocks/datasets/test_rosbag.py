@@ -4,89 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from flowgraph import Flight, find_graph, load_flight, simulate
 from flowgraph.blocks.datasets import rosbag
-from flowgraph.errors import DataError, DeclarationError, MissingDependencyError, UnknownNameError
+from flowgraph.errors import DeclarationError, MissingDependencyError, UnknownNameError
+from tests.blocks.datasets.bags import MS, Pen, refused
 
 pytest.importorskip("rosbags", reason="needs the extra ros")
-
-MS = 1_000_000
-
-
-class Pen:
-    """Writes messages into a bag of either version."""
-
-    def __init__(self, path: Path, version: int = 2) -> None:
-        from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
-
-        self.version = version
-        self.store = get_typestore(Stores.ROS2_HUMBLE if version == 2 else Stores.ROS1_NOETIC)
-        self.writer: Any = rosbag2.Writer(path, version=9) if version == 2 else rosbag1.Writer(path)
-        self.connections: dict[str, Any] = {}
-        self.count = 0
-
-    def __enter__(self) -> Pen:
-        self.writer.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.writer.close()
-
-    def make(self, name: str, *parts: Any) -> Any:
-        return self.store.types[name](*parts)
-
-    def header(self, t: int) -> Any:
-        time = self.make("builtin_interfaces/msg/Time", t // 10**9, t % 10**9)
-        first = () if self.version == 2 else (self.count,)
-        return self.make("std_msgs/msg/Header", *first, time, "body")
-
-    def vector(self, v: Any, kind: str = "Vector3") -> Any:
-        return self.make(f"geometry_msgs/msg/{kind}", *map(float, v))
-
-    def quaternion(self, q: Any) -> Any:
-        w, x, y, z = map(float, q)
-        return self.make("geometry_msgs/msg/Quaternion", x, y, z, w)
-
-    def write(self, topic: str, kind: str, t: int, *parts: Any, late: int = 0) -> None:
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
-        message = self.make(kind, self.header(t), *parts)
-        pack = self.store.serialize_cdr if self.version == 2 else self.store.serialize_ros1
-        self.writer.write(self.connections[topic], t + late, pack(message, kind))
-        self.count += 1
-
-    def imu(self, topic: str, t: int, gyro: Any, force: Any, late: int = 0) -> None:
-        none = np.zeros(9)
-        at = (self.quaternion([1, 0, 0, 0]), none, self.vector(gyro), none, self.vector(force), none)
-        self.write(topic, "sensor_msgs/msg/Imu", t, *at, late=late)
-
-    def pose(self, topic: str, t: int, p: Any, q: Any) -> None:
-        pose = self.make("geometry_msgs/msg/Pose", self.vector(p, "Point"), self.quaternion(q))
-        self.write(topic, "geometry_msgs/msg/PoseStamped", t, pose)
-
-    def transform(self, topic: str, t: int, p: Any, q: Any) -> None:
-        turn = self.make("geometry_msgs/msg/Transform", self.vector(p), self.quaternion(q))
-        self.write(topic, "geometry_msgs/msg/TransformStamped", t, "child", turn)
-
-    def fix(self, topic: str, t: int, status: int, lat: float, lon: float, height: float) -> None:
-        state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
-        self.write(topic, "sensor_msgs/msg/NavSatFix", t, state, lat, lon, height, np.zeros(9), 0)
-
-    def field(self, topic: str, t: int, v: Any) -> None:
-        self.write(topic, "sensor_msgs/msg/MagneticField", t, self.vector(v), np.zeros(9))
-
-
-def refused(path: Path, *parts: str, kind: type = DataError, **settings: str) -> None:
-    with pytest.raises(kind) as caught:
-        rosbag.load(str(path), settings=settings)
-    for part in (*parts, "expected:", "got:", "fix:"):
-        assert part in str(caught.value)
 
 
 def recorded(flight: Flight, path: Path, version: int = 2) -> None:
@@ -188,8 +115,10 @@ def test_a_bag_without_anything_to_read_is_named(tmp_path):
         pass
     refused(tmp_path / "empty.bag", "nothing to read in this bag")
     with Pen(tmp_path / "other") as pen:
-        pen.write("/p", "geometry_msgs/msg/PointStamped", 0, pen.vector([1, 2, 3], "Point"))
-    refused(tmp_path / "other", "nothing to read in this bag", "/p (geometry_msgs/msg/PointStamped, 1)")
+        pen.write("/p", "geometry_msgs/msg/Vector3Stamped", 0, pen.vector([1, 2, 3]))
+    refused(
+        tmp_path / "other", "nothing to read in this bag", "/p (geometry_msgs/msg/Vector3Stamped, 1 message)"
+    )
 
 
 def test_a_damaged_bag_is_named_and_nothing_of_it_is_returned(tmp_path):
@@ -197,7 +126,7 @@ def test_a_damaged_bag_is_named_and_nothing_of_it_is_returned(tmp_path):
     (tmp_path / "x.txt").write_text("x")
     refused(tmp_path / "x.txt", "this is no bag", "x.txt")
     (tmp_path / "folder").mkdir()
-    refused(tmp_path / "folder", "this bag cannot be read")
+    refused(tmp_path / "folder", "this is no bag", "nothing in it")
     with Pen(tmp_path / "one.bag", version=1) as pen:
         for k in range(50):
             pen.imu("/imu", k * MS, [0, 0, 0], [0, 0, 9.8])
@@ -218,6 +147,7 @@ def test_wrong_units_in_a_bag_are_named(tmp_path):
         for k in range(4):
             pen.imu("/imu", k * MS, [0, 0, 0], [0, 0, 1.0])
     refused(tmp_path / "g", "/imu: imu.specific_force", "not in the unit", "in g it is 1")
+    refused(tmp_path / "g", "accelerometer.force", "in g it is 1", topics="accelerometer:/imu")
     with Pen(tmp_path / "q") as pen:
         pen.pose("/pose", 0, [0, 0, 0], [0, 0, 0, 0])
     refused(tmp_path / "q", "/pose", "not a unit quaternion")
