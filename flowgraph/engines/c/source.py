@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -130,12 +131,12 @@ class _File:
             entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
         ]
         text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
-        parts = [self.pipeline, self.names, self.real, self.patterns, self.pool]
-        said = hashlib.sha256(f"{header(*parts, '')}{text}".encode()).hexdigest()[:8]
+        head = partial(header, self.pipeline, self.names, self.real, self.patterns, self.pool)
+        said = hashlib.sha256(f"{head('')}{text}".encode()).hexdigest()[:8]
         return Source(
             self.names,
             self.real,
-            header(*parts, said),
+            head(said),
             text,
             None if self.patterns is None else tuple(self.patterns),
             self.presence,
