@@ -130,3 +130,13 @@ def test_threads_that_push_lose_nothing_in_silence():
     assert pushed == [300] * 3
     assert run.result()["total"].value.tolist() == [float(k) for k in range(1, 901)]
     assert run.ticks == 900
+
+
+def test_sources_may_have_any_name():
+    @graph
+    def g(run: Stream[Scalar], args: Stream[Scalar]):
+        return {"run_out": run, "args_out": args}
+
+    live = Run(g.build())
+    live.push(0, run=1.0, args=2.0)
+    assert live.result()["run_out"].value.tolist() == [1.0]

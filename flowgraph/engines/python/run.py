@@ -35,7 +35,7 @@ def _alone(method: _F) -> _F:
     """A run is for one thread: a method that would enter it while it is in a tick is refused."""
 
     @wraps(method)
-    def entered(run: Run, *args: Any, **keywords: Any) -> Any:
+    def entered(run: Run, /, *args: Any, **keywords: Any) -> Any:
         with run._entered(method.__name__):
             return method(run, *args, **keywords)
 
