@@ -170,6 +170,7 @@ def claimed(file: Path, *, by: str) -> Iterator[str | None]:
     Raises:
         OutputError: where it cannot be made.
     """
+    holder: str | None = None
     with writes(file):
         while True:
             descriptor = os.open(file, os.O_CREAT | os.O_RDWR | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -181,7 +182,6 @@ def claimed(file: Path, *, by: str) -> Iterator[str | None]:
                     if os.path.samestat(os.stat(file), os.fstat(descriptor)):
                         os.ftruncate(descriptor, 0)
                         os.pwrite(descriptor, by.encode(), 0)
-                        holder = None
                         break
             except BaseException:
                 os.close(descriptor)

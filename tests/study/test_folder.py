@@ -188,7 +188,7 @@ def test_a_trajectory_that_is_none_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "text", ["a" + ".a" * 100_000 + " = 1", "[" + "a." * 5000 + "a]", "x = {" + "'a'.\"b\"." * 300 + "c = 1}",
-             "x = " + "[" * 100_000, "a = 2001-99-99", "a = " + "9" * 5000],
+             "x = " + "[" * 100_000, "a = 2001-99-99", "a = " + "9" * 5000, "a = 1979-05-27T07:32:00+99:99"],
 )  # fmt: skip
 def test_a_study_that_only_takes_time_is_refused_at_once(tmp_path, text):
     (tmp_path / "s.toml").write_text(text)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from flowgraph import MissingDependencyError, OutputError
+from flowgraph.data.files import lock
 from flowgraph.engines.c import compile as compiling
 from flowgraph.engines.c.compile import CompileError, build, cache_folder, load
 
@@ -135,7 +136,7 @@ def test_without_a_usable_home_another_place_is_taken_and_said(home, tmp_path, m
     for name in ("FLOWGRAPH_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(compiling, "_home", lambda: "")
-    monkeypatch.setattr(compiling.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     if home == "none":
         monkeypatch.delenv("HOME", raising=False)
     else:
@@ -205,7 +206,7 @@ def test_what_a_killed_process_left_is_swept_and_what_another_uses_is_not(cache)
         (cache / f"work-{k}" / "made.so").write_text("half")
     (cache / ".abc.so.part").write_text("half")
     used = os.open(cache / "work-1", os.O_RDONLY)
-    assert compiling.lock(used, wait=False)
+    assert lock(used, wait=False)
     library = build(TEXT)
     assert sorted(f.name for f in cache.iterdir()) == sorted([library.name, "work-1"])
     os.close(used)
