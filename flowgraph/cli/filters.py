@@ -86,7 +86,7 @@ def run(
         make_ready(out)
     case, flight = case_of(graph, data, settings, seed)
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json)
-    notes = dict.fromkeys((*flight.notes, *case.notes, *result.notes))
+    notes = dict.fromkeys((*flight.notes, *case.remarks(result)))
     for note in notes:
         err_console.print(f"note: {note}", markup=False)
     report = {**row, "data": data, "flight": flight.name, "seed": seed, "settings": list(settings or [])}

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph.data.inputs import Inputs
+from flowgraph.data.notes import said
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError, PluginError, UnknownNameError
@@ -38,7 +39,8 @@ class Case:
         graph: built, with the start and the noise for this flight.
         inputs: the flight's streams by source name.
         score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
-            the names of the streams that it looks at; then a study of many runs at once keeps only those.
+            the names of the streams that it looks at; then a study of many runs at once keeps only those. It
+            may have a method `remarks(result)`, notes on what the figures do not tell.
         estimate: name of the collected stream that the score and the pictures are of.
         notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
     """
@@ -48,6 +50,11 @@ class Case:
     score: Callable[[Result], dict[str, float]]
     estimate: str = "belief"
     notes: tuple[str, ...] = ()
+
+    def remarks(self, result: Result) -> tuple[str, ...]:
+        """All notes on a run: the case's, the result's, and those of the score."""
+        tell = getattr(self.score, "remarks", None)
+        return said((*self.notes, *result.notes, *(tell(result) if tell is not None else ())))
 
 
 @dataclass(frozen=True)
