@@ -12,7 +12,7 @@ import pytest
 from flowgraph import DataError, Flight, Series, find_graph, load_flight, simulate
 from flowgraph.blocks.kalman import Held, bridge
 from flowgraph.blocks.signals import Attitude, Gaussian, Pose, Position, Velocity
-from tests.graphs.library import engines_agree, is_lowered_and_drawn
+from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
 GATED = ("ins_eskf", "ekf", "ukf", "ins_ekf_pose", "ins_ukf_pose")
 """Filters of a pose that can refuse a measurement."""
