@@ -28,6 +28,7 @@ from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
+from flowgraph.blocks.scoring.start import Started, StartPose
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
 from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
@@ -314,7 +315,7 @@ class PoseAided(Factors, PoseNoises, Scored):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, Gated):
+class PoseFilter(PoseAided, Gated, Started):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 
@@ -364,10 +365,12 @@ def on_capture(
         steps: what a smoother needs of a result.
         settings: of the graph itself.
     """
-    first, info = on.inputs["vicon"][0], on.flight.info
+    vicon, info = on.inputs["vicon"], on.flight.info
+    first = vicon[0]
+    pose = filter.pose(on, int(vicon.time[0]), first.position, first.attitude, usual="file")
     return on.case(
         filter.score(on, pose_errors, steps=steps),
-        start=start(first.position, first.attitude),
+        start=_started(start, pose),
         noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
         **filter.measured(on),
         lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
@@ -377,3 +380,9 @@ def on_capture(
         **filter.gating(),
         **settings,
     )
+
+
+def _started(start: Callable[..., Any], pose: StartPose) -> Any:
+    """What the graph starts from; with a heading of which nothing is known, as wide about all axes."""
+    more = {} if pose.heading is None else {"attitude_deviation": pose.heading}
+    return start(pose.position, pose.attitude, **more)

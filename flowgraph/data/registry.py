@@ -211,10 +211,11 @@ def parsed_settings(
     mine: dict[str, Any] = {}
     rest: dict[str, str] = {}
     for key, text in given.items():
+        name = key.replace(".", "_")  # start.heading is the argument start_heading
         if key in also:
             rest[key] = text
-        elif key in own:
-            mine[key] = _parse(text, hints.get(key, str), f"{path}.{key}")
+        elif name in own:
+            mine[name] = _parse(text, hints.get(name, str), f"{path}.{key}")
         else:
             raise UnknownNameError("setting", key, [*own, *also], path=path)
     return mine, rest
