@@ -17,6 +17,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
@@ -36,6 +37,8 @@ def async_kalman(
     velocity_noise: float = 0.1,
     control: str = "instant",
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """Kalman filter of position and velocity whose control and measurements keep clocks of their own.
 
@@ -49,16 +52,24 @@ def async_kalman(
     now = latest(acceleration, init=WorldAcceleration.at_rest(), at=ticks, name="control")
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
+    if held is not None:
+        prior = bridge(prior, acceleration, held=held, position=0, velocity=3)
     posterior, innovation = update_linear(
         prior, position.map(lambda z: z.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
     )
     collect(innovation, "position_innovation")
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=6)
     if velocity is not None:
         posterior, innovation = update_linear(
             posterior, velocity.map(lambda z: z.velocity),
             H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate,
         )  # fmt: skip
         collect(innovation, "velocity_innovation")
+        if gate is not None:
+            posterior = find_back(
+                posterior, innovation, patience=patience, moving=6, name="find_back_velocity"
+            )
     belief.feed(posterior)
     last.feed(now)
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}

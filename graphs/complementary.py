@@ -97,7 +97,7 @@ def for_flight(
         noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start)
     return on.case(
         scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
-        start=first_attitude(flight, gyro, push["force"][0]),
+        start=first_attitude(flight, gyro, on.first_up("accelerometer", push["force"])),
         alpha=alpha,
         covariance=noise,
     )

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.pose import (
     between_imu,
     pose_belief,
@@ -44,6 +45,8 @@ def ekf(
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     reading: str = "instant",
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
     gravity: tuple[float, float, float] = GRAVITY,
 ):
     """Extended Kalman filter of velocity, position and quaternion: IMU control, motion capture pose.
@@ -59,9 +62,13 @@ def ekf(
     control = latest(imu, init=Imu.at_rest(), at=imu | vicon, name="control")
     drive = control if reading == "mean" else between_imu(last, control)
     prior = predict_pose(belief, drive, noise=noise, gravity=gravity)
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=3, velocity=0, attitude=6)
     posterior, innovation = update_pose(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=10)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")

@@ -14,6 +14,7 @@ from typing import Any
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.euler_ins import (
     euler_angles,
     navigation_belief,
@@ -38,6 +39,8 @@ def ins_ekf_pose(
     order: str = "zxy",
     factor: float = 1.0,
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """15-state extended Kalman filter with Euler angles: IMU control, camera pose.
 
@@ -47,9 +50,13 @@ def ins_ekf_pose(
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
     prior = predict_extended(belief, between_imu(last, control), order=order, noise=noise, name="predict")
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(
         prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
     )
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=9)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
@@ -71,4 +78,6 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags), gate=filter.gate)
+    poses = poses_of(on.name, on.flight, tags=filter.tags)
+    held = filter.held(on, on.inputs["imu"])
+    return on_measured_pose(on, filter, poses, held=held, **filter.gating())

@@ -17,6 +17,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
@@ -44,6 +45,8 @@ def ins_ukf_pose(
     order: str = "zxy",
     factor: float = 1.0,
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera pose.
 
@@ -56,9 +59,13 @@ def ins_ukf_pose(
         belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(
         prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
     )
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=9)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
@@ -80,4 +87,6 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags), gate=filter.gate)
+    poses = poses_of(on.name, on.flight, tags=filter.tags)
+    held = filter.held(on, on.inputs["imu"])
+    return on_measured_pose(on, filter, poses, held=held, **filter.gating())

@@ -19,6 +19,7 @@ import numpy as np
 
 from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -51,6 +52,8 @@ def ins_ukf_velocity(
     rate: str = "gyro",
     order: str = "zyx",
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
 
@@ -63,10 +66,14 @@ def ins_ukf_velocity(
         belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_camera_velocity(
         prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
         rate_noise=rate_noise, rate=rate, gate=gate, name="update",
     )  # fmt: skip
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=9)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
@@ -101,12 +108,12 @@ def for_flight(
         DataError: where the flight lacks a stream or the truth.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    if on.flight.truth is None:
+    if on.flight.truth is None or not {"position", "attitude"} <= set(on.flight.truth.leaves):
         raise DataError(
             "this flight does not tell where ins_ukf_velocity starts",
             path=on.flight.name,
-            expected="a truth",
-            got="none",
+            expected="a truth of position and attitude",
+            got="none" if on.flight.truth is None else ", ".join(on.flight.truth.leaves),
             fix="build the graph with a start of your own: start_gaussian(position, attitude, order=...)",
         )
     first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
@@ -120,5 +127,6 @@ def for_flight(
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         order=order,
-        gate=gated.gate,
+        held=factors.held(on, on.inputs["imu"]),
+        **gated.gating(),
     )

@@ -21,7 +21,7 @@ import math
 import numpy as np
 
 from flowgraph import Case, Stream, delay, graph, latest
-from flowgraph.blocks.inertial.alignment import static_alignment
+from flowgraph.blocks.inertial.alignment import static_alignment, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
@@ -117,7 +117,7 @@ def for_flight(
     return on.case(
         scored.score(on, counted_errors(on.flight), innovations=False),
         start=start_level(found),
-        heading=start_heading(found, field["field"][0]),
+        heading=start_heading(found, field["field"][int(np.argmax(usable(field["field"], 0.0)))]),
         noise=on.flight.info.get("imu_noise", UNIT),
         speed=speed,
         speed_memory=speed_memory,

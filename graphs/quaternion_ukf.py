@@ -22,6 +22,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
+from flowgraph.blocks.kalman.lost import PATIENCE, find_back
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -55,6 +56,7 @@ def quaternion_ukf(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     frozen: float = 0.0,
     gate: float | None = None,
+    patience: int = PATIENCE,
 ):
     """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
 
@@ -87,6 +89,8 @@ def quaternion_ukf(
         points=points,
         gate=gate,
     )
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=6)
     belief.feed(posterior)
     collect(innovation, "innovation")
     return {"belief": named_orientation(posterior)}
@@ -134,5 +138,5 @@ def for_flight(
         still=begin.still,
         up=begin.up,
         frozen=frozen,
-        gate=gated.gate,
+        **gated.gating(),
     )

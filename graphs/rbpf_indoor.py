@@ -163,7 +163,7 @@ def for_flight(
     imu, vicon = on.inputs.values()
     info, simulated = on.flight.info, "position_noise" in on.flight.info
     still = given(still, info.get("still", 1.0 if simulated else 0.0))
-    attitude = None if unknown_yaw else _first_attitude(imu, vicon, still)
+    attitude = None if unknown_yaw else _first_attitude(on, imu, vicon, still)
     up = np.array([0.0, 0.0, 1.0]) if attitude is None else to_matrix(attitude, xp=np)[2]
     place, spread = vicon["position"][0], StartSpread()
     return on.case(
@@ -178,9 +178,9 @@ def for_flight(
     )
 
 
-def _first_attitude(imu: Series, vicon: Series, still: float) -> np.ndarray:
+def _first_attitude(on: OnFlight, imu: Series, vicon: Series, still: float) -> np.ndarray:
     """The mean attitude (4) measured at rest; without a rest the first one, levelled with the force."""
     if still <= 0.0:
-        return np.asarray(level(vicon["attitude"][0], imu["specific_force"][0], xp=np))
+        return np.asarray(level(vicon["attitude"][0], on.first_up("imu", imu["specific_force"]), xp=np))
     seen = vicon["attitude"][vicon.time - vicon.time[0] <= round(still * 1e9)]
     return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), seen[0], xp=np))

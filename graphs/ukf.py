@@ -25,6 +25,7 @@ import numpy as np
 
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.pose import POSE, between_imu
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -63,6 +64,8 @@ def ukf(
     reading: str = "instant",
     points: SigmaPoints = GAUSSIAN,
     gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """Unscented Kalman filter of position, velocity and quaternion: IMU control, motion capture pose.
 
@@ -80,6 +83,8 @@ def ukf(
         space=STATE,
         points=points,
     )
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = update_unscented(
         prior,
         vicon.map(stacked_pose, name="pose"),
@@ -90,6 +95,8 @@ def ukf(
         points=points,
         gate=gate,
     )
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=9)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")

@@ -15,10 +15,12 @@ from flowgraph.blocks.inertial.alignment import (
     StartSpread,
     align_static,
     level_attitude,
+    need_usable,
     orientation_start,
     rest_seconds,
     start_belief,
     static_alignment,
+    usable,
 )
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
@@ -34,6 +36,8 @@ from flowgraph.blocks.inertial.imu_calibration import (
 )
 
 __all__ = [
+    "need_usable",
+    "usable",
     "GRAVITY",
     "ImuNoise",
     "predict",

@@ -4,8 +4,15 @@ Each block takes a prior and an optional measurement. Without one the prior pass
 innovation; an entry that is NaN was not measured, and the others correct alone. With one, the error state is
 estimated by a Kalman update in Joseph form, folded into the nominal state, and reset.
 
-Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, sec. 7:
-update eqs. 275-276, injection eq. 283, reset eqs. 286-287 for the right (local) attitude error.
+An `invariant` correction takes the error as one of the group SE_2(3) of attitude, velocity and position: what
+was not known of the position turns with the attitude that is corrected, the correction moves along the arc
+(`_carried`), and there is no reset. The equations of the error then hold for errors of any size, and a filter
+finds a heading of which nothing was known.
+
+Sources: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE Trans. on
+Automatic Control 62(4), 2017 (the left-invariant error). J. Solà, "Quaternion kinematics for the error-state
+Kalman filter", arXiv:1711.02508, 2017, sec. 7: update eqs. 275-276, injection eq. 283, reset eqs. 286-287 for
+the right (local) attitude error.
 """
 
 from __future__ import annotations
@@ -57,6 +64,7 @@ def aid_position(
     noise: Spread,
     lever: tuple[float, float, float] = ORIGIN,
     gate: float | None = None,
+    invariant: bool = False,
     xp: Any,
 ) -> tuple[Belief, KalmanInnovation | None]:
     """Correct a belief with the measured position of a point fixed to the body.
@@ -70,6 +78,8 @@ def aid_position(
         lever: the point in body coordinates, m.
         gate: when given, a measurement that is too far off changes nothing; see `update_linear`. (For three
             axes a nis of 16.3 is 99.9 %.)
+        invariant: take the error as one of the group SE_2(3), in which that of an attitude may be large, as
+            that of a start of which the heading is not known; see the head of this module.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a measurement.
@@ -82,7 +92,7 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, xp)
+    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
 
 
 @block
@@ -93,6 +103,7 @@ def aid_attitude(
     noise: Spread,
     mount: tuple[float, float, float, float] = ALIGNED,
     gate: float | None = None,
+    invariant: bool = False,
     xp: Any,
 ) -> tuple[Belief, KalmanInnovation | None]:
     """Correct a belief with a measured attitude.
@@ -104,7 +115,7 @@ def aid_attitude(
         attitude: z, a unit quaternion, sensor to world; or absent.
         noise: standard deviation about the body axes, rad.
         mount: the sensor's attitude in the body, a unit quaternion.
-        gate: as in `aid_position`.
+        gate, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (rad, body) where there was a measurement.
@@ -115,7 +126,26 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, xp)
+    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+
+
+def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:
+    """What a correction of the attitude by `turn` (rad, body) does to errors in the world: J (3, 3), by which
+    those of position and velocity are folded in, and the rotation (3, 3) with which they turn.
+
+        J(u) = I + (1 - cos a)/a^2 [u]x + (a - sin a)/a^3 [u]x^2        u = R turn, a = |u|
+    """
+    R = to_matrix(q, xp=xp)
+    u = (R @ turn[..., None])[..., 0]
+    square = xp.linalg.vecdot(u, u)
+    near = square < 1e-6
+    safe = xp.where(near, 1.0 + 0.0 * square, square)
+    a = xp.sqrt(safe)
+    first = xp.where(near, 0.5 - square / 24.0, (1.0 - xp.cos(a)) / safe)[..., None, None]
+    second = xp.where(near, 1.0 / 6.0 - square / 120.0, (a - xp.sin(a)) / (safe * a))[..., None, None]
+    S = skew(u, xp=xp)
+    push = xp.eye(3, dtype=q.dtype) + first * S + second * (S @ S)
+    return push, R @ to_matrix(from_rotation_vector(turn, xp=xp), xp=xp) @ R.mT
 
 
 def _variance(noise: Spread, kind: Any, xp: Any) -> Array:
@@ -131,7 +161,7 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
 
 
 def _correct(
-    prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, xp: Any
+    prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
 ) -> tuple[Belief, KalmanInnovation]:
     """The update every measurement shares: the posterior and the innovation, of the known entries."""
     P = prior.covariance
@@ -148,15 +178,25 @@ def _correct(
     if gate is not None:
         K = K * xp.astype(accepted, K.dtype)[..., None, None]
     d = (K @ column)[..., 0]
-    one = xp.eye(15, dtype=P.dtype)
     turn = d[..., 6:9]
-    reset = xp.reshape(turn @ xp.asarray(_RESET, dtype=P.dtype), (*d.shape[:-1], 15, 15)) + one
+    if invariant:
+        push, swing = _carried(prior.attitude, turn, xp)
+        moved = push @ xp.concat([d[..., 0:3, None], d[..., 3:6, None]], axis=-1)
+        to_place, to_speed = moved[..., 0], moved[..., 1]
+        none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=P.dtype)
+        diagonal = (swing, swing, stay, stay, stay)
+        rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
+        reset = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+    else:
+        to_place, to_speed = d[..., 0:3], d[..., 3:6]
+        one = xp.eye(15, dtype=P.dtype)
+        reset = xp.reshape(turn @ xp.asarray(_RESET, dtype=P.dtype), (*d.shape[:-1], 15, 15)) + one
     gain = reset @ K
     A = reset - gain @ H
     P = A @ P @ A.mT + gain @ R @ gain.mT
     posterior = Belief(
-        position=prior.position + d[..., 0:3],
-        velocity=prior.velocity + d[..., 3:6],
+        position=prior.position + to_place,
+        velocity=prior.velocity + to_speed,
         attitude=multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
         gyro_bias=prior.gyro_bias + d[..., 9:12],
         accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],

@@ -24,17 +24,52 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
 )
 from flowgraph.blocks.signals import Alignment, Attitude, Belief, Imu, MagneticField, SpecificForce
+from flowgraph.errors import DataError
 
 __all__ = [
     "Start",
     "StartSpread",
     "align_static",
+    "need_usable",
     "level_attitude",
     "orientation_start",
     "rest_seconds",
     "start_belief",
     "static_alignment",
+    "usable",
 ]
+
+
+_LEAST_FORCE = 1.0  # m/s^2: a unit that reads less is in free fall, or has not started
+
+
+def usable(readings: npt.NDArray[np.float64], least: float = _LEAST_FORCE) -> npt.NDArray[np.bool_]:
+    """Which of the readings (n, 3) of an accelerometer show where up is: finite, and not of nearly no length.
+
+    Args:
+        least: the shortest that does; 0 for a magnetic field, of which only zero shows nothing.
+    """
+    with np.errstate(invalid="ignore"):
+        size = np.linalg.norm(readings, axis=-1)
+        return np.asarray(np.isfinite(size) & (size > least))
+
+
+def need_usable(readings: npt.NDArray[np.float64], path: str) -> npt.NDArray[np.bool_]:
+    """Which of the readings (n, 3) of an accelerometer are `usable`.
+
+    Raises:
+        DataError: where none is.
+    """
+    shown = usable(readings)
+    if not shown.any():
+        raise DataError(
+            "no reading of the accelerometer shows where up is",
+            path=path,
+            expected=f"a finite specific force longer than {_LEAST_FORCE:g} m/s^2",
+            got=f"none in {len(readings)} readings",
+            fix="check the columns of the accelerometer and their unit",
+        )
+    return shown
 
 
 @block
@@ -124,12 +159,14 @@ def static_alignment(
     last tick of rest.
 
     Where the body rests for less than `least` seconds, the first reading alone gives the attitude, the bias
-    is zero, and `resting` is 0.
+    is zero, and `resting` is 0. Readings that show no direction (`usable`) are passed over.
 
     Args:
         imu: a series of `Imu`. field: of `MagneticField`.
         north, nearest: as in `align_static`.
     """
+    imu = imu[need_usable(imu["specific_force"], imu.name)]
+    field = None if field is None else field[usable(field["field"], 0.0)]
     end = imu.time[0] + round(seconds * 1e9)
     part = imu[imu.time <= end]
     near = None if field is None else field[field.time <= end]
@@ -193,19 +230,26 @@ def orientation_start(flight: Flight, imu: Series, still: float | None = None) -
     """Level by the mean specific force at rest, or by the first reading, with the heading of the truth's
     first attitude; without a truth that of the world.
 
+    Readings that show no direction (`usable`) are passed over.
+
     Args:
         still: seconds of rest at the start; those that the flight tells, or that its readings show, if left
             out.
+
+    Raises:
+        DataError: where no reading shows where up is.
     """
     found = flight.info.get("still") if still is None else still
     still = rest_seconds(imu) if found is None else float(found)
     nearest = np.array([1.0, 0.0, 0.0, 0.0])
-    if flight.truth is not None:
+    if flight.truth is not None and "attitude" in flight.truth.leaves:
         q = flight.truth["attitude"]
         q = q[np.isfinite(q).all(axis=-1)]
         nearest = q[0] if len(q) else nearest
     push = imu["specific_force"]
-    mean = push[imu.time - imu.time[0] <= round(still * 1e9)].mean(axis=0)
+    shown = need_usable(push, flight.name)
+    first = int(np.argmax(shown))
+    mean = push[shown & (imu.time - imu.time[first] <= round(still * 1e9))].mean(axis=0)
     x, y, z = (mean / np.linalg.norm(mean)).tolist()
     q = aligned(mean, np.zeros(3), north=0.0, nearest=nearest, xp=np)
     return Start(np.asarray(q), still, (x, y, z))

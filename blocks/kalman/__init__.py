@@ -2,9 +2,9 @@
 
 `linear` is motion in continuous time and its exact steps over any dt. `filters` predicts and corrects with
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
-its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `smoothing`
-goes back over a run and adds to each state what later measurements say of it. What moves and what is measured
-is not said here: see `models`.
+its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
+for controls that do not come and gates that do not open. `smoothing` goes back over a run and adds to each
+state what later measurements say of it. What moves and what is measured is not said here: see `models`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from flowgraph.blocks.kalman.filters import (
     update_linear,
 )
 from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.kalman.roots import (
     lower_root,
     predict_root,
@@ -29,6 +30,10 @@ from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "PATIENCE",
+    "Held",
+    "bridge",
+    "find_back",
     "LinearModel",
     "Correction",
     "Vector",

@@ -15,7 +15,7 @@ from flowgraph.blocks.metrics.chi_square import (
     gate_table,
     inside,
 )
-from flowgraph.blocks.metrics.consistency import nis_summary, point_errors, state_nees
+from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary, point_errors, state_nees
 from flowgraph.blocks.metrics.errors import (
     attitude_errors,
     error_summary,
@@ -29,6 +29,7 @@ from flowgraph.blocks.metrics.errors import (
     state_error,
     within_truth,
 )
+from flowgraph.blocks.metrics.truth import known, truth_remarks
 
 __all__ = [
     "chi_square",
@@ -47,6 +48,9 @@ __all__ = [
     "pose_errors",
     "state_error",
     "within_truth",
+    "known",
+    "truth_remarks",
+    "nis_remarks",
     "nis_summary",
     "point_errors",
     "state_nees",

@@ -16,9 +16,11 @@ import numpy as np
 
 from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
-from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error, within_truth
+from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
+from flowgraph.blocks.metrics.truth import interpolate, within_truth
+from flowgraph.data.notes import note
 
-__all__ = ["nis_summary", "point_errors", "state_nees"]
+__all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
 
 
 def state_nees(estimate: Series, truth: Series) -> np.ndarray:
@@ -41,6 +43,8 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
         nis_inside, the fraction of single values in their own band; nis_count; and, where the innovations say
         what a gate `accepted`, nis_rejected.
     """
+    if "parts" in innovation.leaves:
+        innovation = innovation[innovation["parts"] > 0.0]  # where nothing was measured, nothing was said
     values = innovation["nis"]
     width = innovation["residual"].shape[-1]
     parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), float(width))
@@ -59,21 +63,52 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     return found
 
 
+IN_A_ROW = 5
+"""Refusals in a row from which on a gate may be shut upon an honest sensor."""
+
+
+def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
+    """A note where a gate refused `IN_A_ROW` measurements or more in a row.
+
+    Args:
+        name: of what was measured; empty where there is one kind.
+    """
+    if "accepted" not in innovation.leaves:
+        return ()
+    edges = np.diff(np.concatenate([[0], ~innovation["accepted"], [0]]).astype(int))
+    first = np.flatnonzero(edges > 0)
+    rows = np.flatnonzero(edges < 0) - first
+    if not len(rows) or rows.max() < IN_A_ROW:
+        return ()
+    k = int(rows.argmax())
+    seconds = (innovation.time[first[k]] - innovation.time[0]) * 1e-9
+    what = f"{name}: " if name else ""
+    said = (
+        f"{what}{rows[k]} measurements in a row, from {seconds:.3g} s after the first on; {rows.sum()} in all"
+    )
+    return (note("refused", said),)
+
+
 def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
     """Compare beliefs about a point with the truth, where it covers them and after `settle` seconds.
 
     Returns:
         position_rmse_m, position_mean_m, position_max_m, velocity_rmse_mps, the `nees_summary` (6 on average
-        in a consistent filter) and compared_ticks.
+        in a consistent filter) and compared_ticks; of the position alone where the truth has no velocity.
 
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
+    if "position" not in truth.leaves:
+        return {}
     chosen = within_truth(estimate, truth, settle)
+    if "velocity" not in truth.leaves:
+        off = interpolate(truth, "position", chosen.time) - chosen["position"]
+        place = {f"position_{name}_m": value for name, value in error_summary(off).items()}
+        return place | {"compared_ticks": float(len(chosen))}
     error = state_error(chosen.time, truth, chosen["position"], chosen["velocity"])
-    place = error_summary(error[:, :3])
     return {
-        **{f"position_{name}_m": value for name, value in place.items()},
+        **{f"position_{name}_m": value for name, value in error_summary(error[:, :3]).items()},
         "velocity_rmse_mps": error_summary(error[:, 3:])["rmse"],
         **nees_summary(error, chosen["covariance"]),
         "compared_ticks": float(len(chosen)),

@@ -3,7 +3,7 @@
 Position errors are in metres, velocity errors in m/s; attitude errors geodesic, in degrees, with tilt and
 heading apart. Where there is a covariance, the NEES, the squared error in deviations of the filter's own,
 tells whether it is honest; see `consistency`. For a pose it is taken in the tangent space: position, velocity
-(world) and a rotation vector (body), nine numbers.
+(world) and a rotation vector (body), nine numbers. What the truth does not have is left out of the figures.
 
 Source of the NEES: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
 Navigation", 2001, sec. 5.4.2.
@@ -20,14 +20,13 @@ from flowgraph.blocks.geometry.rotations import (
     conjugate,
     geodesic_angle,
     multiply,
-    slerp,
     tilt_and_heading,
     to_matrix,
     to_rotation_vector,
     world_error,
 )
 from flowgraph.blocks.metrics.chi_square import chi_square_band, inside
-from flowgraph.errors import DataError
+from flowgraph.blocks.metrics.truth import interpolate, interpolate_pose, within_truth
 
 __all__ = [
     "attitude_errors",
@@ -42,60 +41,6 @@ __all__ = [
     "state_error",
     "within_truth",
 ]
-
-
-def interpolate_pose(truth: Series, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The truth's position (n, 3) and attitude (n, 4) at `time` (n,) int64 ns: `interpolate` of both."""
-    return interpolate(truth, "position", time), interpolate(truth, "attitude", time)
-
-
-def interpolate(truth: Series, name: str, time: np.ndarray) -> np.ndarray:
-    """A field of the truth at `time` (n,) int64 ns: linear, and slerp for the attitude.
-
-    A time outside the truth gets its first or last value.
-    """
-    right = np.clip(np.searchsorted(truth.time, time), 1, max(len(truth) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(truth) - 1)
-    span = np.maximum(truth.time[right] - truth.time[left], 1)
-    part = np.clip((time - truth.time[left]) / span, 0.0, 1.0)  # integer differences: exact before dividing
-    x = truth[name]
-    if name == "attitude":
-        return slerp(x[left], x[right], part)
-    return np.asarray(x[left] + (x[right] - x[left]) * part[:, None])
-
-
-def within_truth(estimate: Series, truth: Series, settle: float) -> Series:
-    """The ticks of an estimate that can be compared: `settle` seconds or more after the first, and covered by
-    a truth that is not NaN there.
-
-    Raises:
-        DataError: when there is none.
-    """
-    time = estimate.time
-    held = time - time[:1] >= round(settle * 1e9)
-    if len(truth):
-        held &= (time >= truth.time[0]) & (time <= truth.time[-1])
-        for name in {"position", "attitude"} & set(truth.leaves):
-            if not np.isfinite(truth[name]).all():  # unknown at some time, and so between its neighbours
-                held[held] = np.isfinite(interpolate(truth, name, time[held])).all(axis=-1)
-    chosen = estimate[_rows(held)]
-    if not len(truth) or not len(chosen):
-        raise DataError(
-            "no tick of the estimate lies within the truth",
-            path=estimate.name,
-            expected=f"ticks {settle} s or more after the first, where the truth is known",
-            got=f"{estimate!r}, {truth!r}",
-            fix="check the time offsets, or make settle smaller",
-        )
-    return chosen
-
-
-def _rows(held: np.ndarray) -> slice | np.ndarray:
-    """The rows of a mask, as a slice where nothing lies between them: that copies nothing."""
-    rows = np.flatnonzero(held)
-    whole = len(rows) and rows[-1] - rows[0] + 1 == len(rows)
-    return slice(int(rows[0]), int(rows[-1]) + 1) if whole else held
 
 
 def error_summary(error: npt.ArrayLike) -> dict[str, float]:
@@ -124,9 +69,10 @@ def state_error(
         position, velocity: (..., n, 3).
         attitude: (..., n, 4).
     """
-    p, q = interpolate_pose(truth, time)
+    p = interpolate(truth, "position", time)
     parts = [p - position, _true_velocity(truth, time) - velocity]
     if attitude is not None:
+        q = interpolate(truth, "attitude", time)
         parts.append(_turn(attitude, np.broadcast_to(q, attitude.shape)))
     return np.concatenate(parts, axis=-1)
 
@@ -168,7 +114,7 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
     Args:
         estimate: with fields `position` and `attitude`, perhaps `velocity`, and perhaps the `covariance` of
             a `Belief` or `PoseBelief`.
-        truth: with fields `position` and `attitude`, and perhaps `velocity`.
+        truth: with fields `position` and `attitude`, or one of them, and perhaps `velocity`.
         settle: seconds after the estimate's first tick that are left out.
 
     Returns:
@@ -181,24 +127,31 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
         DataError: when no tick of the estimate lies within the truth.
     """
     chosen = within_truth(estimate, truth, settle)
-    position, attitude = interpolate_pose(truth, chosen.time)
-    error = chosen["position"] - position
-    found = {f"position_{name}_m": value for name, value in error_summary(error).items()}
-    found.update(_angles(chosen["attitude"], attitude))
-    moving = "velocity" in chosen.leaves and "velocity" in truth.leaves
+    has, whole = set(truth.leaves), "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9
+    moving = "velocity" in has and "velocity" in chosen.leaves
+    P = chosen["covariance"][:, :9, :9] if whole else np.empty((len(chosen), 0, 0))
+    found: dict[str, float] = {}
+    parts = []
+    if "position" in has:
+        error = chosen["position"] - interpolate(truth, "position", chosen.time)
+        found.update({f"position_{name}_m": value for name, value in error_summary(error).items()})
+        if whole:
+            at = np.sqrt(np.einsum("nii->ni", P[:, :3, :3]))
+            found["position_3sigma"] = float(np.mean(np.abs(error) <= 3.0 * at))
+        parts.append(-error)
     if moving:
         speed = chosen["velocity"] - _true_velocity(truth, chosen.time)
         found["velocity_rmse_mps"] = error_summary(speed)["rmse"]
-    found["compared_ticks"] = float(len(chosen))
-    if "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9:
-        P = chosen["covariance"][:, :9, :9]
-        at = np.sqrt(np.einsum("nii->ni", P[:, :3, :3]))
-        found["position_3sigma"] = float(np.mean(np.abs(error) <= 3.0 * at))
-        found.update(_turn_3sigma(chosen["attitude"], attitude, P[:, 6:9, 6:9]))
-        if moving:
-            turn = _turn(chosen["attitude"], attitude)
-            found.update(nees_summary(np.concatenate([-error, -speed, turn], axis=-1), P))
-    return found
+        parts.append(-speed)
+    if "attitude" in has:
+        attitude = interpolate(truth, "attitude", chosen.time)
+        found.update(_angles(chosen["attitude"], attitude))
+        if whole:
+            found.update(_turn_3sigma(chosen["attitude"], attitude, P[:, 6:9, 6:9]))
+        parts.append(_turn(chosen["attitude"], attitude))
+    if whole and len(parts) == 3:
+        found.update(nees_summary(np.concatenate(parts, axis=-1), P))
+    return found | {"compared_ticks": float(len(chosen))} if parts else {}
 
 
 def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
@@ -211,6 +164,8 @@ def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dic
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
+    if "position" not in truth.leaves:
+        return {}
     chosen = within_truth(estimate, truth, settle)
     error = interpolate(truth, "position", chosen.time) - chosen["position"]
     return {
@@ -231,6 +186,8 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
+    if "attitude" not in truth.leaves:
+        return {}
     chosen = within_truth(estimate, truth, settle)
     q, attitude = chosen["attitude"], interpolate(truth, "attitude", chosen.time)
     found = {
@@ -291,6 +248,8 @@ def orientation_errors(estimate: Series, truth: Series, *, settle: float = 1.0) 
     Raises:
         DataError: when no tick of the estimate lies within the truth.
     """
+    if "attitude" not in truth.leaves:
+        return {}
     chosen = within_truth(estimate, truth, settle)
     q = interpolate(truth, "attitude", chosen.time)
     return {**_axes_and_parts(chosen["attitude"], q), "compared_ticks": float(len(chosen))}

@@ -13,6 +13,7 @@ from __future__ import annotations
 from flowgraph.blocks.scoring.cases import (
     Factors,
     Gated,
+    HeldControl,
     OnFlight,
     Particles,
     PoseAided,
@@ -53,6 +54,7 @@ __all__ = [
     "on_capture",
     "Factors",
     "Gated",
+    "HeldControl",
     "Particles",
     "PoseAided",
     "PoseFilter",

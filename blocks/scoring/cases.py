@@ -14,23 +14,30 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
+
 from flowgraph import Case, Flight, Result, Series, clocks_of
+from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
+from flowgraph.blocks.scoring.start import Started, StartPose
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
 from flowgraph.blocks.signals import GRAVITY
+from flowgraph.data.notes import note, said
 from flowgraph.language.declare import GraphFunction
 
 __all__ = [
     "Factors",
     "Gated",
+    "HeldControl",
     "OnFlight",
     "Particles",
     "PoseAided",
@@ -43,6 +50,9 @@ __all__ = [
     "on_flight",
 ]
 
+GAP = 4.0
+"""A control is old after so many of its median steps."""
+
 Score = Callable[[Result], dict[str, float]]
 
 
@@ -54,11 +64,13 @@ class OnFlight:
         graph: who asks, in what is refused.
         flight: as it was loaded, or as `told` has completed it.
         inputs: the streams that were needed, by name.
+        notes: what is assumed while the case is made; see `note`.
     """
 
     graph: GraphFunction
     flight: Flight
     inputs: dict[str, Series]
+    notes: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -68,6 +80,21 @@ class OnFlight:
     def need(self, *streams: str, fix: str = "choose another flight") -> dict[str, Series]:
         """`Flight.need` of the graph."""
         return self.flight.need(self.name, *streams, fix=fix)
+
+    def note(self, word: str, sentence: str) -> None:
+        """Add a note of a kind to the case; see `flowgraph.data.notes`."""
+        self.notes.append(note(word, sentence))
+
+    def first_up(self, stream: str, readings: np.ndarray) -> np.ndarray:
+        """The first reading (3) of an accelerometer's (n, 3) that shows where up is; see `usable`.
+
+        Raises:
+            DataError: where none does.
+        """
+        row = int(np.argmax(need_usable(readings, f"{self.flight.name}: {stream}")))
+        if row:
+            self.note("skipped", f"{stream}: {row} readings before the first that shows where up is")
+        return np.asarray(readings[row])
 
     def noise(self, name: str, setting: float | None, otherwise: float | None = None) -> float:
         """A standard deviation or density: `noise_of` of the graph."""
@@ -92,7 +119,9 @@ class OnFlight:
         """
         inputs = dict(self.inputs if inputs is None else inputs)
         built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
-        return Case(built, inputs, score, given(estimate, getattr(score, "estimate", "belief")))
+        return Case(
+            built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
+        )
 
 
 def on_flight(
@@ -198,13 +227,48 @@ class Gated(Settings):
 
     Args:
         gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
+        patience: how many refusals in a row are taken for outliers; then the gate opens again (`find_back`).
     """
 
     gate: Positive | None = None
+    patience: Annotated[int, count(1, 1_000_000)] = PATIENCE
+
+    def gating(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {"gate": self.gate, "patience": self.patience}
 
 
 @dataclass(frozen=True)
-class Factors(Settings):
+class HeldControl(Settings):
+    """What the age of a control does.
+
+    Args:
+        held_noise: grow, and a control that has not come for four of its periods makes the prediction less
+            sure by its age (`bridge`); or keep, and it counts as fresh.
+    """
+
+    held_noise: Annotated[str, one_of("keep", "grow")] = "grow"
+
+    def held(self, on: OnFlight, control: Series) -> Held | None:
+        """From which age on the control of a flight is old; None where it never is, or that is kept.
+
+        A gap is a note of the case.
+        """
+        steps = np.diff(control.time) * 1e-9
+        if not len(steps):
+            return None
+        usual = float(np.median(steps))
+        wide = steps[steps > GAP * usual]
+        if not len(wide):
+            return None
+        many = "a gap of" if len(wide) == 1 else f"{len(wide)} gaps, the longest of"
+        many = f"{many} {wide.max():.3g} s"
+        on.note("bridged", f"{control.name}: {many} (median step {usual:.3g} s)")
+        return Held(after=GAP * usual) if self.held_noise == "grow" else None
+
+
+@dataclass(frozen=True)
+class Factors(HeldControl):
     """How far the densities of an IMU are believed.
 
     Args:
@@ -254,7 +318,7 @@ class PoseAided(Factors, PoseNoises, Scored):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, Gated):
+class PoseFilter(PoseAided, Gated, Started):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 
@@ -304,15 +368,24 @@ def on_capture(
         steps: what a smoother needs of a result.
         settings: of the graph itself.
     """
-    first, info = on.inputs["vicon"][0], on.flight.info
+    vicon, info = on.inputs["vicon"], on.flight.info
+    first = vicon[0]
+    pose = filter.pose(on, int(vicon.time[0]), first.position, first.attitude, usual="file")
     return on.case(
         filter.score(on, pose_errors, steps=steps),
-        start=start(first.position, first.attitude),
+        start=_started(start, pose),
         noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
         **filter.measured(on),
         lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
         reading=reading_of(on.flight),
         gravity=info.get("gravity", GRAVITY),
-        gate=filter.gate,
+        held=filter.held(on, on.inputs["imu"]),
+        **filter.gating(),
         **settings,
     )
+
+
+def _started(start: Callable[..., Any], pose: StartPose) -> Any:
+    """What the graph starts from; with a heading of which nothing is known, as wide about all axes."""
+    more = {} if pose.heading is None else {"attitude_deviation": pose.heading}
+    return start(pose.position, pose.attitude, **more)

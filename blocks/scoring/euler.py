@@ -17,6 +17,7 @@ from flowgraph.blocks.geometry.euler import ORDERS
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
 from flowgraph.blocks.scoring.cases import Factors, OnFlight, PoseAided, PoseFilter, Scored
+from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian
@@ -107,16 +108,26 @@ def on_measured_pose(
     )
 
 
-def euler_score(on: OnFlight, scored: Scored, order: str) -> Callable[[Result], dict[str, float]]:
+@dataclass(frozen=True)
+class EulerScore:
     """The score of a run: errors and consistency, as every filter has them, and how near the attitude came to
     the singularity (a warning, if near)."""
-    usual = scored.score(on, pose_errors)
 
-    def score(result: Result) -> dict[str, float]:
+    usual: Scorer
+    order: str
+
+    def __call__(self, result: Result) -> dict[str, float]:
         cosine = result["angles"]["cosine"]
-        said = singularity_warning(cosine, order)
+        said = singularity_warning(cosine, self.order)
         if said:
             warnings.warn(said, SingularityWarning, stacklevel=2)
-        return usual(result) | {"least_cosine": float(np.abs(cosine).min(initial=1.0))}
+        return self.usual(result) | {"least_cosine": float(np.abs(cosine).min(initial=1.0))}
 
-    return score
+    def remarks(self, result: Result) -> tuple[str, ...]:
+        """Those of every filter."""
+        return self.usual.remarks(result)
+
+
+def euler_score(on: OnFlight, scored: Scored, order: str) -> EulerScore:
+    """The score of a run on that flight."""
+    return EulerScore(scored.score(on, pose_errors), order)

@@ -14,7 +14,7 @@ import numpy as np
 from flowgraph import Case, DataError, Flight, Series, arrays
 from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Smoothed
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
@@ -24,7 +24,7 @@ __all__ = ["PointFilter", "on_point", "positions", "readings"]
 
 
 @dataclass(frozen=True)
-class PointFilter(Gated, Smoothed):
+class PointFilter(HeldControl, Gated, Smoothed):
     """What is set of a linear filter of a point.
 
     Args:
@@ -53,7 +53,8 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
         noise=density,
         position_noise=on.noise("position_noise", filter.position_noise),
         control=reading_of(on.flight),
-        gate=filter.gate,
+        held=filter.held(on, on.inputs["imu"]),
+        **filter.gating(),
     )
 
 

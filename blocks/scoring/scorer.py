@@ -14,7 +14,8 @@ from typing import Any
 
 from flowgraph import Graph, Result, Series
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
-from flowgraph.blocks.metrics.consistency import nis_summary
+from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
+from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.types import leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
@@ -34,7 +35,8 @@ SMOOTHED = (
 
 @dataclass(frozen=True)
 class Scorer:
-    """The `score` of a `Case`, which says what streams it reads, so that a run of many need not keep others.
+    """The `score` of a `Case`, which says what streams it reads, so that a run of many need not keep others,
+    and has `remarks` on a result: what was not compared, and what a gate refused in a row.
 
     Args:
         truth: with which the estimate is compared; without one there are innovations only.
@@ -87,6 +89,16 @@ class Scorer:
                 better = self._compared(named(series))
                 found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
         return found
+
+    def remarks(self, result: Result) -> tuple[str, ...]:
+        """Notes on a run that the figures do not tell."""
+        found: list[str] = []
+        if self.truth is not None and self.estimate in result.series:
+            found += truth_remarks(result[self.estimate], self.truth, self.settle)
+        for name, series in result.series.items():
+            if self._sums_up(series.leaves):
+                found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+        return tuple(found)
 
     def _sums_up(self, leaves: Mapping[str, object]) -> bool:
         return self.innovations and "nis" in leaves

@@ -35,6 +35,7 @@ __all__ = [
     "Settings",
     "Spliced",
     "count",
+    "left_out_or",
     "named",
     "not_negative",
     "one_of",
@@ -83,6 +84,11 @@ def one_of(*words: str) -> Check:
             )
 
     return check
+
+
+def left_out_or(check: Check) -> Check:
+    """A check that None passes."""
+    return lambda graph, name, value: None if value is None else check(graph, name, value)
 
 
 def named(kind: str, words: Iterable[str]) -> Check:

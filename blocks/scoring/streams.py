@@ -13,7 +13,7 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import level, to_matrix
-from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.metrics.truth import interpolate
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import GRAVITY, Attitude, Gyro, SpecificForce, WorldAcceleration
 from flowgraph.errors import DataError
@@ -28,7 +28,7 @@ def told_acceleration(flight: Flight) -> Series:
         DataError: for a flight without an IMU or without a truth.
     """
     imu, truth = flight.streams.get("imu"), flight.truth
-    if imu is None or truth is None:
+    if imu is None or truth is None or "attitude" not in truth.leaves:
         raise DataError(
             "the acceleration in the world is not known",
             path=flight.name,
@@ -37,7 +37,7 @@ def told_acceleration(flight: Flight) -> Series:
             fix="choose a simulated flight, or give the filter accelerations of your own",
         )
     half = flight.info["imu_period_ns"] // 2 if reading_of(flight) == "mean" else 0
-    attitude = interpolate_pose(truth, imu.time - half)[1]  # of a mean, that of its middle
+    attitude = interpolate(truth, "attitude", imu.time - half)  # of a mean, that of its middle
     force = imu["specific_force"]
     if "accelerometer_bias" in truth.leaves:
         last = np.maximum(np.searchsorted(truth.time, imu.time, side="right") - 1, 0)
@@ -95,6 +95,6 @@ def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:
     Args:
         force: m/s^2, body: the direction that is up at the start. Its heading is taken as zero.
     """
-    if flight.truth is not None:
-        return Attitude(attitude=interpolate_pose(flight.truth, gyro.time[:1])[1][0])
+    if flight.truth is not None and "attitude" in flight.truth.leaves:
+        return Attitude(attitude=interpolate(flight.truth, "attitude", gyro.time[:1])[0])
     return Attitude(attitude=np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np)))

@@ -113,7 +113,7 @@ def run(
     spec = one_flight(data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged)
-    say(result.notes)
+    say(case.remarks(result))
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)

@@ -21,6 +21,7 @@ from typing import Any
 
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, parts_of, shared, with_truth
+from flowgraph.data.notes import said
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
 from flowgraph.errors import DataError, DeclarationError, FlowgraphError, PluginError, UnknownNameError
@@ -39,7 +40,8 @@ class Case:
         graph: built, with the start and the noise for this flight.
         inputs: the flight's streams by source name.
         score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
-            the names of the streams that it looks at; then a study of many runs at once keeps only those.
+            the names of the streams that it looks at; then a study of many runs at once keeps only those. It
+            may have a method `remarks(result)`, notes on what the figures do not tell.
         estimate: name of the collected stream that the score and the pictures are of.
         notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
     """
@@ -49,6 +51,11 @@ class Case:
     score: Callable[[Result], dict[str, float]]
     estimate: str = "belief"
     notes: tuple[str, ...] = ()
+
+    def remarks(self, result: Result) -> tuple[str, ...]:
+        """All notes on a run: the case's, the result's, and those of the score."""
+        tell = getattr(self.score, "remarks", None)
+        return said((*self.notes, *result.notes, *(tell(result) if tell is not None else ())))
 
 
 @dataclass(frozen=True)
@@ -243,10 +250,11 @@ def parsed_settings(
     mine: dict[str, Any] = {}
     rest: dict[str, str] = {}
     for key, text in given.items():
+        name = key.replace(".", "_")  # start.heading is the argument start_heading
         if key in also:
             rest[key] = text
-        elif key in own:
-            mine[key] = _parse(text, hints.get(key, str), f"{path}.{key}")
+        elif name in own:
+            mine[name] = _parse(text, hints.get(name, str), f"{path}.{key}")
         elif "STREAM." + key.rpartition(".")[2] in also:  # a setting that streams of any name have
             rest[key] = text
         else:

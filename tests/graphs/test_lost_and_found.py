@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Flight, Series, find_graph, load_flight, simulate
+from flowgraph import DataError, Flight, Series, find_graph, load_flight, simulate
+from flowgraph.blocks.kalman import Held, bridge
+from flowgraph.blocks.signals import Attitude, Gaussian, Pose, Position, Velocity
+from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 
 GATED = ("ins_eskf", "ekf", "ukf", "ins_ekf_pose", "ins_ukf_pose")
 """Filters of a pose that can refuse a measurement."""
@@ -59,3 +62,240 @@ def test_a_count_knows_of_positions_and_attitudes_apart():
     case = find_graph("ins_eskf").case(made, gate=0.9999999)
     score = case.score(simulate(case.graph, case.inputs))
     assert (score["position_nis_rejected"], score["attitude_nis_rejected"]) == (0.0, 2.0)
+
+
+def refused_in_a_row(name: str, rows: int) -> tuple[str, ...]:
+    case = find_graph(name).case(outliers(flight(), slice(-rows, None), 30.0), gate=0.9999999)
+    return tuple(n for n in case.remarks(simulate(case.graph, case.inputs)) if n.startswith("refused:"))
+
+
+@pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose"])
+def test_refusals_in_a_row_are_a_note(name):
+    assert refused_in_a_row(name, 3) == ()
+    (said,) = refused_in_a_row(name, 6)
+    assert "measurements in a row" in said
+
+
+# -- truths with gaps, and truths of a part --------------------------------------------------------------
+
+
+def masked(base: Flight, rows: slice, fields: tuple[str, ...]) -> Flight:
+    """The flight whose truth is NaN in some rows."""
+    assert base.truth is not None
+    new = {name: np.array(base.truth[name]) for name in fields}
+    for values in new.values():
+        values[rows] = np.nan
+    return replace(base, truth=changed(base.truth, **new))
+
+
+def cut(base: Flight, rows: slice) -> Flight:
+    """The flight whose truth lacks some rows."""
+    assert base.truth is not None
+    kept = np.ones(len(base.truth), dtype=bool)
+    kept[rows] = False
+    return replace(base, truth=base.truth[kept])
+
+
+GAP = slice(600, 900)  # of a truth at 200 Hz: 1.5 s
+
+
+@pytest.mark.parametrize("hole", [
+    lambda base: cut(base, GAP),
+    lambda base: masked(base, GAP, ("position",)),
+    lambda base: masked(base, GAP, ("attitude",)),
+])  # fmt: skip
+@pytest.mark.parametrize("name", ["ins_eskf", "ekf", "gyro_integration"])
+def test_nothing_is_compared_across_a_gap_of_the_truth(name, hole):
+    case = find_graph(name).case(hole(flight()))
+    whole = find_graph(name).case(flight())
+    result = simulate(case.graph, case.inputs)
+    score, full = case.score(result), whole.score(simulate(whole.graph, whole.inputs))
+    for key in ("position_rmse_m", "attitude_rmse_deg", "total_rmse_deg"):
+        if key in score:
+            assert score[key] < 1.2 * full[key]
+    left = int(full["compared_ticks"] - score["compared_ticks"])
+    assert left in (300, 301)  # the row after one that is NaN is not told from its neighbours
+    assert any(n.startswith(f"skipped: truth: {left} ticks (1.5") for n in case.remarks(result))
+
+
+def test_a_truth_of_few_rows_is_compared_all_along():
+    base = flight()
+    assert base.truth is not None
+    sparse = replace(base, truth=base.truth[::100])  # 2 Hz
+    case = find_graph("ins_eskf").case(sparse)
+    result = simulate(case.graph, case.inputs)
+    assert case.score(result)["compared_ticks"] == 1001
+    assert not [n for n in case.remarks(result) if "truth:" in n]
+
+
+def told(base: Flight, *fields: str) -> Flight:
+    """The flight with a truth of these fields alone."""
+    kinds: dict[str, Any] = {"attitude": Attitude, "position": Position, "velocity": Velocity}
+    assert base.truth is not None
+    if fields == ("position", "attitude"):
+        values: Any = Pose(base.truth["position"], base.truth["attitude"])
+    else:
+        values = kinds[fields[0]](base.truth[fields[0]])
+    return replace(base, truth=Series(base.truth.time, values, name="truth"))
+
+
+FIGURES = {"position": "position_rmse_m", "attitude": "attitude_rmse_deg", "velocity": "velocity_rmse_mps"}
+
+
+@pytest.mark.parametrize("fields", [("attitude",), ("position",), ("velocity",), ("position", "attitude")])
+@pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ukf", "ins_ukf_pose", "complementary", "async_kalman"])
+def test_a_truth_of_a_part_is_compared_in_that_part(name, fields):
+    if name == "async_kalman" and "attitude" not in fields:
+        with pytest.raises(DataError, match="the acceleration in the world is not known"):
+            find_graph(name).case(told(flight(), *fields))
+        return
+    case = find_graph(name).case(told(flight(), *fields))
+    result = simulate(case.graph, case.inputs)
+    score, notes = case.score(result), case.remarks(result)
+    has = set(result[case.estimate].leaves)
+    for name_, figure in FIGURES.items():
+        assert (figure in score) == (name_ in fields and name_ in has), figure
+    for name_ in {"position", "attitude"} & has - set(fields):
+        assert f"skipped: the truth has no {name_}: errors of it are left out" in notes
+
+
+# -- first readings that cannot start a filter -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("reading", [0.0, 1e-9])
+@pytest.mark.parametrize("name", ["ins_eskf", "gyro_integration", "complementary", "quaternion_ukf"])
+def test_a_first_reading_of_no_force_is_passed_over(name, reading, rows):
+    base = flight(3.0)
+    force = np.array(base.streams["imu"]["specific_force"])
+    force[:rows] = reading
+    case = find_graph(name).case(with_stream(base, "imu", changed(base.streams["imu"], specific_force=force)))
+    whole = find_graph(name).case(base)
+    key = "attitude_rmse_deg" if name in ("ins_eskf", "complementary") else "total_rmse_deg"
+    scores = [c.score(simulate(c.graph, c.inputs))[key] for c in (case, whole)]
+    assert scores[0] == pytest.approx(scores[1], abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["ins_eskf", "gyro_integration", "complementary"])
+def test_no_force_at_all_is_refused(name):
+    base = flight(3.0)
+    force = np.zeros((len(base.streams["imu"]), 3))
+    with pytest.raises(DataError, match="no reading of the accelerometer shows where up is"):
+        find_graph(name).case(with_stream(base, "imu", changed(base.streams["imu"], specific_force=force)))
+
+
+def test_a_first_field_of_zero_is_passed_over():
+    base = load_flight("sim:thesis", seed=1, settings={"sensors": "all", "duration": "3"})
+    field = np.array(base.streams["magnetometer"]["field"])
+    field[0] = 0.0
+    case = find_graph("marg").case(
+        with_stream(base, "magnetometer", changed(base.streams["magnetometer"], field=field))
+    )
+    found = simulate(case.graph, case.inputs)["belief"]
+    assert np.isfinite(found["attitude"]).all()
+    assert np.isfinite(found["covariance"]).all()
+
+
+# -- controls that do not come ---------------------------------------------------------------------------
+
+
+AIDED = (*GATED, "kalman", "async_kalman")
+
+
+def without(base: Flight, first: float, last: float, *more: tuple[float, float]) -> Flight:
+    """The flight without the readings of its IMU between these times, s."""
+    imu = base.streams["imu"]
+    t = imu.time * 1e-9
+    kept = np.ones(len(imu), dtype=bool)
+    for a, b in ((first, last), *more):
+        kept &= (t <= a) | (t >= b)
+    found = with_stream(base, "imu", imu[kept])
+    vicon = found.streams["vicon"]
+    on_imu = np.isin(vicon.time, found.streams["imu"].time)  # kalman wants both at once
+    return with_stream(found, "vicon", vicon[on_imu])
+
+
+@pytest.mark.parametrize("gate", [None, 0.999])
+@pytest.mark.parametrize("name", AIDED)
+@pytest.mark.parametrize("gap", [((2.0, 3.0),), ((2.0, 2.3), (4.0, 4.5)), ((1.5, 4.0),)])
+def test_after_a_gap_of_the_imu_a_filter_is_where_it_was(name, gap, gate):
+    """Half a second after the last gap the error is as if there had been none, and the gap is a note."""
+    made = without(flight(), *gap[0], *gap[1:])
+    case = find_graph(name).case(made, gate=gate, settle=gap[-1][1] + 0.5)
+    whole = find_graph(name).case(flight(), gate=gate, settle=gap[-1][1] + 0.5)
+    result = simulate(case.graph, case.inputs)
+    score, usual = case.score(result), whole.score(simulate(whole.graph, whole.inputs))
+    assert score["position_rmse_m"] < 3.0 * usual["position_rmse_m"] + 0.05
+    longest = max(b - a for a, b in gap)
+    (said,) = [n for n in case.remarks(result) if n.startswith("bridged:")]
+    assert f"{longest:g} s (median step 0.005 s)" in said
+
+
+@pytest.mark.parametrize("name", GATED)
+def test_the_noise_of_a_held_control_can_be_kept(name):
+    made = without(flight(), 2.0, 3.0)
+    grown, kept = (find_graph(name).case(made, held_noise=how) for how in ("grow", "keep"))
+    wide, narrow = (simulate(c.graph, c.inputs)[c.estimate] for c in (grown, kept))
+    before = wide.time < 2.0e9
+    for field in ("position", "covariance"):
+        np.testing.assert_array_equal(wide[field][before], narrow[field][before])
+    at = int(np.searchsorted(wide.time, 3.0e9))
+    assert wide["covariance"][at, 0, 0] > 10.0 * narrow["covariance"][at, 0, 0]
+
+
+@pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose", "async_kalman"])
+def test_engines_agree_over_a_gap_and_a_shut_gate(name):
+    made = outliers(without(flight(), 2.0, 2.5), slice(14, 22), 20.0)
+    case = find_graph(name).case(made, gate=0.999)
+    engines_agree(case.graph, case.inputs)
+    is_lowered_and_drawn(case, "bridge", "find_back")
+
+
+def test_fresh_controls_are_bridged_to_the_bit():
+    """A filter that could bridge, over controls that come as they should."""
+    made = find_graph("ins_eskf").case(flight())
+    assert "bridge" not in {call.path for _, call in made.graph.calls}
+    prior = Gaussian(np.zeros(6), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.3)
+    age = np.float64(0.0)
+    for k in range(5):
+        age, after = bridge.step(
+            age, prior, None if k % 2 else 1.0, held=Held(0.05), position=0, velocity=3, dt=0.02, xp=np
+        )
+        np.testing.assert_array_equal(after.covariance, prior.covariance)
+    _, after = bridge.step(
+        np.float64(0.2), prior, 1.0, held=Held(0.05), position=0, velocity=3, dt=0.3, xp=np
+    )
+    np.testing.assert_allclose(np.diag(after.covariance - prior.covariance)[3:], 25.0 * 2 * 0.35 * 0.3)
+    assert np.linalg.eigvalsh(after.covariance).min() > 0.0
+
+
+# -- a gate that has shut --------------------------------------------------------------------------------
+
+
+def spiked(base: Flight, row: int, field: str, by: float) -> Flight:
+    values = np.array(base.streams["imu"][field])
+    values[row, 0] += by
+    return with_stream(base, "imu", changed(base.streams["imu"], **{field: values}))
+
+
+@pytest.mark.parametrize("made", [
+    pytest.param(lambda: spiked(flight(12.0), 500, "specific_force", 2000.0), id="a spike of the force"),
+    pytest.param(lambda: spiked(flight(12.0), 500, "gyro", 200.0), id="a spike of the rate"),
+    pytest.param(lambda: outliers(flight(12.0), slice(8, 20), 50.0), id="a run of outliers"),
+])  # fmt: skip
+@pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ukf", "ins_ukf_pose"])
+def test_a_gate_opens_again(name, made):
+    """From nine seconds on the error is again that of a flight without a fault."""
+    case = find_graph(name).case(made(), gate=0.999, settle=9.0)
+    whole = find_graph(name).case(flight(12.0), gate=0.999, settle=9.0)
+    score, usual = (c.score(simulate(c.graph, c.inputs)) for c in (case, whole))
+    assert score["position_rmse_m"] < 2.0 * usual["position_rmse_m"]
+    assert refused(score) >= 5
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_a_few_outliers_change_nothing_but_that_they_are_not_used(rows):
+    made = outliers(flight(), slice(10, 10 + rows), 50.0)
+    patient, never = (find_graph("ekf").case(made, gate=0.999, patience=p) for p in (5, 1000))
+    a, b = (simulate(c.graph, c.inputs)["belief"] for c in (patient, never))
+    np.testing.assert_array_equal(a["covariance"], b["covariance"])
