@@ -19,14 +19,26 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
-from flowgraph.blocks.datasets.shape import Recording, known, number, the_file, unit_quaternions
+from flowgraph.blocks.datasets.shape import (
+    NOISE_SETTINGS,
+    Recording,
+    imu_noise,
+    known,
+    number,
+    stream_settings,
+    the_file,
+)
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, MagneticField, Pose
 from flowgraph.errors import DataError
 
 __all__ = ["NOISE", "SETTINGS", "load"]
 
-SETTINGS: Mapping[str, str] = {"duration": "s, only the first; 0 is all"}
+SETTINGS: Mapping[str, str] = {
+    "duration": "s, only the first; 0 is all",
+    **NOISE_SETTINGS,
+    **stream_settings("imu", "magnetometer", "truth"),
+}
 """The settings of `load` and what they mean. Samples come at the file's rate, so their order is given."""
 
 NOISE = ImuNoise(gyro=1e-3, accelerometer=5e-3, gyro_bias=1e-4, accelerometer_bias=1e-3)
@@ -87,16 +99,17 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         n = min(n, int(duration * rate) + 1)
         fields = {name: array[:n] for name, array in fields.items()}
     time = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
-    made = Recording(file.stem)
+    made = Recording(file.stem, kind="broad", given=given)
     imu = {"gyro": fields["imu_gyr"], "specific_force": fields["imu_acc"]}
     made.add("imu", f"{file}: imu_gyr, imu_acc", time, imu, Imu)
     made.add("magnetometer", f"{file}: imu_mag", time, {"field": fields["imu_mag"] * 1e-6}, MagneticField)
     seen = np.isfinite(fields["opt_quat"]).all(axis=1) & np.isfinite(fields["opt_pos"]).all(axis=1)
     pose = {
         "position": fields["opt_pos"],
-        "attitude": unit_quaternions(fields["opt_quat"], f"{file}: opt_quat"),
+        "attitude": fields["opt_quat"],
     }
     made.add("truth", f"{file}: opt_pos, opt_quat", time, pose, Pose)
     made.info["scored"] = Series(time, seen & (fields["movement"] != 0), name="scored")
-    made.info["imu_noise"], made.info["imu_period_ns"] = NOISE, round(1e9 / rate)
+    made.info["imu_noise"] = imu_noise(given, "broad", made.notes, NOISE)
+    made.info["imu_period_ns"] = round(1e9 / rate)
     return made.flight()

@@ -26,6 +26,7 @@ from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import CameraMotion
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.motion import camera_motion_of
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError
 
 __all__ = ["SETTINGS", "Motion", "load", "motion", "see", "simulated_content"]
@@ -48,8 +49,8 @@ DEFAULTS: Mapping[str, float] = {
 the camera's velocity, as optical flow would give it: Hz, m/s and rad/s."""
 
 SETTINGS: Mapping[str, str] = {
-    **{name: f"{value:g} if left out" for name, value in DEFAULTS.items()},
     **READING,
+    **{name: f"{value:g} if left out" for name, value in DEFAULTS.items()},
 }
 """The settings of `load`: `DEFAULTS`, and those of studentdata."""
 
@@ -194,14 +195,15 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
             fix="leave the settings out",
         )
     content = simulated_content(seed, **{name.replace(".", "_"): value for name, value in ours.items()})
-    rest = {name: value for name, value in given.items() if name in READING}
-    flight = flight_of(content, Parameters.of_the_course(), Path(f"course-{seed}"), rest)
+    rest = {name: value for name, value in given.items() if name in READING and name not in DEFAULTS}
     use = {**DEFAULTS, **ours}
     unit = ImuNoise(
         use["gyro.noise"], use["accelerometer.noise"], use["gyro.walk"], use["accelerometer.walk"]
     )
+    flight = flight_of(content, Parameters.of_the_course(), Path(f"course-{seed}"), rest, unit)
     streams = {**flight.streams, "motion": _optical_flow(flight, seed, use)}
-    return Flight(flight.name, streams, flight.truth, {**flight.info, "imu_noise": unit}, flight.notes)
+    notes = (note("info", f"simulated with seed {seed}"), *flight.notes)
+    return Flight(flight.name, streams, flight.truth, flight.info, notes)
 
 
 def _optical_flow(flight: Flight, seed: int, use: Mapping[str, float]) -> Series:

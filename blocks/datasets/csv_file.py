@@ -20,15 +20,16 @@ from flowgraph import Flight
 from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
 from flowgraph.blocks.datasets.shape import (
+    MEASURED_NOISE,
     NOISE_SETTINGS,
     Recording,
     chosen,
     imu_noise,
     known,
-    number,
+    measured_noise,
     policy,
+    stream_settings,
     the_file,
-    unit_quaternions,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.datasets.turns import ORDERS, from_angles, from_matrices
@@ -120,8 +121,8 @@ SETTINGS: Mapping[str, str] = {
         for stream in ("vicon", "truth")
     },
     **NOISE_SETTINGS,
-    "position.noise": "standard deviation of measured positions, m",
-    "attitude.noise": "standard deviation of measured attitudes, rad",
+    **MEASURED_NOISE,
+    **stream_settings(*STREAMS),
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
 }
 """The settings of `load` and what they mean."""
@@ -149,7 +150,13 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     given = {name: str(value) for name, value in (settings or {}).items()}
     known(given, SETTINGS, "csv")
     mapped = _mapped(given)
-    made = Recording(Path(argument).stem, policy(given, "csv"))
+    made = Recording(
+        Path(argument).stem,
+        policy(given, "csv"),
+        kind="csv",
+        given=given,
+        units="say its unit with {stream}.{field}.unit={unit}, or convert the file to SI units",
+    )
     file = the_file(argument, kind="csv", what="table")
     sheet = _sheet(file, given, mapped)
     made.notes.extend(sheet.notes)
@@ -165,7 +172,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     decimal, said = decimal_mark(list(cells.values()), sheet.where, mark)
     if said:
         made.notes.append(said.replace("numbers", f"{file.name}: numbers"))
-    unit = _time_unit(sheet, given, clock, made.notes)
+    made.unit = unit = _time_unit(sheet, given, clock, made.notes)
     time, said = stamps(cells[clock], sheet.where, unit=unit, decimal=decimal)
     if said:
         made.notes.append(said.replace("stamps", f"{file.name}: stamps"))
@@ -188,9 +195,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         )
     if "imu" in made.streams:
         made.info["imu_noise"] = imu_noise(given, "csv", made.notes)
-    for name in ("position", "attitude"):
-        if f"{name}.noise" in given:
-            made.info[f"{name}_noise"] = number(given, f"{name}.noise", 0.01, "csv")
+    measured_noise(given, "csv", made.info)
     return made.flight()
 
 
@@ -400,9 +405,7 @@ def _converted(
     key = f"{stream}.{field}.{_said_by(field)}"
     unit = chosen(given, key, list(units), "csv")
     if field == "attitude":
-        return field, unit_quaternions(
-            values[:, [3, 0, 1, 2]] if unit == "xyzw" else values, f"{sheet.file}: {stream}"
-        )
+        return field, values[:, [3, 0, 1, 2]] if unit == "xyzw" else values
     if field == "matrix":
         return "attitude", from_matrices(values, sheet.where, by_rows=unit == "rows")
     said = _units(sheet, given, key, places, units, notes)

@@ -18,17 +18,26 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
-from flowgraph.blocks.datasets.shape import Recording, known, offset, policy
+from flowgraph.blocks.datasets.shape import (
+    NOISE_SETTINGS,
+    Recording,
+    imu_noise,
+    known,
+    policy,
+    stream_settings,
+)
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.inertial.imu_calibration import CountsCalibration, calibrated, fit_counts, windows_of
 from flowgraph.blocks.signals import Attitude, Imu, ImuCounts
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["DATA_SHEET", "LATE", "NOISE", "SETTINGS", "load", "sets_in"]
@@ -50,8 +59,11 @@ gyroscope and half the range for the accelerometer."""
 
 SETTINGS: Mapping[str, str] = {
     "calibration": "whose recordings calibrate: others (all other sets), data_sheet, or numbers such as 1+3",
-    "truth.time_offset": f"s, added to the stamps of the motion capture; {LATE} if left out",
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
+    **NOISE_SETTINGS,
+    **stream_settings("imu", "truth"),
+    **stream_settings("counts", only=("time_offset", "every")),
+    "truth.time_offset": f"s, added to the stamps of the motion capture; {LATE} if left out",
 }
 """The settings of `load` and what they mean."""
 
@@ -73,7 +85,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             rotation, stamps are out of order, or no other set is there to calibrate with.
         DeclarationError, UnknownNameError: for a setting.
     """
-    given = settings or {}
+    given = {"truth.time_offset": LATE, **(settings or {})}
     known(given, SETTINGS, "ese650")
     folder_text, colon, n_text = argument.rpartition(":")
     if not colon or not n_text.isdecimal():
@@ -86,7 +98,6 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         )
     folder, n = Path(folder_text).expanduser(), int(n_text)
     bad_time = policy(given, "ese650")
-    late = offset({"truth.time_offset": LATE, **given}, "truth.time_offset", "ese650")
     if n not in sets_in(folder):
         raise DataError(
             f"there is no set {n}",
@@ -95,17 +106,16 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             got="sets " + (", ".join(map(str, sets_in(folder))) or "none"),
             fix="check the folder and the number",
         )
-    calibration, by = _calibration(folder, n, str(given.get("calibration", "others")), late, bad_time)
-    made = _set(folder, n, late, bad_time)
+    calibration, by = _calibration(folder, n, str(given.get("calibration", "others")), given, bad_time)
+    made = _set(folder, n, given, bad_time)
     counts = made.streams["counts"]
     reading = calibrated.step(counts.values, calibration=calibration, xp=np)
     columns = {"gyro": reading.gyro, "specific_force": reading.specific_force}
     made.add("imu", str(folder / f"imuRaw{n}.mat"), counts.time, columns, Imu)
-    made.info.update(imu_noise=NOISE, calibration=calibration, calibrated_by=by)
+    made.info.update(calibration=calibration, calibrated_by=by)
+    made.info["imu_noise"] = imu_noise(given, "ese650", made.notes, NOISE)
     source = f"sets {', '.join(map(str, by))}" if by else "the data sheet"
-    made.notes.append(f"imu: calibrated by {source}")
-    if late:
-        made.notes.append(f"truth: stamps shifted by {late} ns")
+    made.notes.append(note("info", f"imu: calibrated by {source}"))
     return made.flight()
 
 
@@ -117,7 +127,7 @@ def sets_in(folder: Path) -> list[int]:
 
 
 def _calibration(
-    folder: Path, n: int, rule: str, late: int, bad_time: str
+    folder: Path, n: int, rule: str, given: Mapping[str, Any], bad_time: str
 ) -> tuple[CountsCalibration, tuple[int, ...]]:
     if rule == "data_sheet":
         return DATA_SHEET, ()
@@ -143,7 +153,7 @@ def _calibration(
         )
     windows = []
     for m in by:
-        other = _set(folder, m, late, bad_time)
+        other = _set(folder, m, given, bad_time)
         counts, truth = other.streams["counts"], other.truth
         assert truth is not None
         truth = truth[np.isfinite(truth["attitude"]).all(axis=1)]
@@ -152,14 +162,14 @@ def _calibration(
     return fit_counts(windows, aligned=True), tuple(by)
 
 
-def _set(folder: Path, n: int, late: int, bad_time: str) -> Recording:
+def _set(folder: Path, n: int, given: Mapping[str, Any], bad_time: str) -> Recording:
     """The counts and the truth of one set."""
-    made = Recording(f"set{n}", bad_time)
+    made = Recording(f"set{n}", bad_time, kind="ese650", given=given)
     file = folder / f"imuRaw{n}.mat"
     raw = read_mat(file, {"vals": (6, None), "ts": (None,)})
     vals = raw["vals"].T
     columns = {"gyro": vals[:, [4, 5, 3]], "force": vals[:, :3]}
-    made.add("counts", str(file), _stamps(raw["ts"], len(vals), file), columns, ImuCounts, checked=False)
+    made.add("counts", str(file), _stamps(raw["ts"], len(vals), file), columns, ImuCounts, raw=True)
     if vals.min() < 0 or vals.max() > 1023:
         raise DataError(
             "these are no counts of a 10-bit converter",
@@ -173,7 +183,7 @@ def _set(folder: Path, n: int, late: int, bad_time: str) -> Recording:
     rots = np.moveaxis(seen["rots"], 2, 0)
     time = _stamps(seen["ts"], len(rots), file)
     attitude = {"attitude": _attitudes(rots, file)}
-    made.add("truth", str(file), time + late, attitude, Attitude)
+    made.add("truth", str(file), time, attitude, Attitude, exact=True)
     return made
 
 

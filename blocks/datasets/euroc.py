@@ -1,4 +1,4 @@
-"""Flights of the EuRoC MAV dataset, read from its ASL folders with integer time stamps.
+"""Flights of the EuRoC MAV dataset, and of recorders that write folders of the same shape.
 
     MH_01_easy/mav0/imu0/data.csv, sensor.yaml      t[ns], gyro xyz, specific force xyz
                     leica0/data.csv                 t[ns], position xyz of a prism
@@ -7,26 +7,43 @@
                                                     t[ns], p, q wxyz, v, gyro bias, accelerometer bias
     MH_01_easy/groundtruth.tum                      t[s], p, q xyzw (beside mav0 or in it)
 
+Stamps are read as integers, exactly. Of the relatives: mocap0 in place of vicon0, imu0.csv in place of a
+folder, a truth of fewer columns, no sensor.yaml or Kalibr's, and quaternions with the scalar last where the
+names of the columns say so.
+
 Source: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-from scipy.spatial.transform import Rotation
-
-from flowgraph import Flight, Series
-from flowgraph.blocks.datasets.shape import MOST_OFFSET, known, offset, policy, present
+from flowgraph import Flight
+from flowgraph.blocks.datasets.sensor_yaml import (
+    UNMOUNTED,
+    described,
+    extrinsics,
+    period_of,
+    rigid,
+    unit_noise,
+)
+from flowgraph.blocks.datasets.shape import (
+    MEASURED_NOISE,
+    NOISE_SETTINGS,
+    Recording,
+    chosen,
+    known,
+    measured_noise,
+    policy,
+    stream_settings,
+)
+from flowgraph.blocks.datasets.stamps import UNITS
 from flowgraph.blocks.datasets.tables import POLICIES, read_table
-from flowgraph.blocks.geometry.rotations import conjugate, multiply
-from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose, Position
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["LEICA_LEVER", "SETTINGS", "load"]
@@ -35,22 +52,18 @@ LEICA_LEVER = (0.0749, -0.0185, -0.1201)
 """The Leica prism in the body, m, where the sequence has no leica0/sensor.yaml of its own."""
 
 SETTINGS: Mapping[str, str] = {
-    "imu.time_offset": "s, added to the stamps of imu0",
-    "leica.time_offset": "s, added to the stamps of leica0 (-0.135 fits MH_01)",
-    "vicon.time_offset": "s, added to the stamps of vicon0",
-    "truth.time_offset": "s, added to the stamps of the ground truth",
+    **stream_settings("imu", "leica", "vicon", "truth"),
+    "time.unit": "of the stamps in the folders: ns if left out; " + ", ".join(UNITS),
     "bad_time": "rows out of order: " + ", ".join(POLICIES),
+    **NOISE_SETTINGS,
+    **MEASURED_NOISE,
 }
-"""The settings of `load` and what they mean. An offset is rounded to nanoseconds once."""
+"""The settings of `load` and what they mean. leica.time_offset=-0.135 fits MH_01."""
 
-_RATES = (1e-3, 1e6)  # Hz
-
-_NOISE = {
-    "gyro": "gyroscope_noise_density",
-    "accelerometer": "accelerometer_noise_density",
-    "gyro_bias": "gyroscope_random_walk",
-    "accelerometer_bias": "accelerometer_random_walk",
-}
+_READINGS = {"gyro": [0, 1, 2], "specific_force": [3, 4, 5]}
+_POSE = {"position": [0, 1, 2], "attitude": [3, 4, 5, 6]}
+_STATE = {**_POSE, "velocity": [7, 8, 9], "gyro_bias": [10, 11, 12], "accelerometer_bias": [13, 14, 15]}
+_TRUTHS = ("state_groundtruth_estimate0", "ground_truth0", "groundtruth0", "gt0")
 
 
 def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
@@ -63,106 +76,96 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         settings: any of `SETTINGS`.
 
     Returns:
-        A `Flight`. truth: `NavigationState` from state_groundtruth_estimate0, else `Pose` from
-        groundtruth.tum, else None. info: `imu_noise` (`ImuNoise`), `imu_period_ns`, `leica_lever` (m, body),
-        `vicon_lever` (m, body) and `vicon_mount` (quaternion, sensor to body), which is already
-        taken out of the attitudes: they are the body's. `absent`: by stream, how many rows held NaN.
+        A `Flight`. truth: by the columns of state_groundtruth_estimate0 a `NavigationState`, `Pose` or
+        `Position`, else `Pose` from groundtruth.tum, else None. info: `imu_noise` (`ImuNoise`),
+        `imu_period_ns`, `leica_lever` (m, body), `vicon_lever` (m, body) and `vicon_mount` (quaternion,
+        sensor to body), which is already taken out of the attitudes: they are the body's. The body's axes are
+        those that T_BS of imu0 turns the readings into, its origin is the IMU. `absent`: by stream, how many
+        rows held NaN.
 
     Raises:
-        DataError: a folder or file is missing, a row is malformed (file, line) or out of order, or no aiding
-            sample is left within the IMU's span.
+        DataError: a folder or file is missing, a row is malformed (file, line) or out of order, stamps or
+            units cannot be, or no aiding sample is left within the IMU's span.
         DeclarationError: for a setting that is not usable.
         UnknownNameError: for a setting or policy that is not there; lists the valid ones.
     """
-    given = settings or {}
+    given = dict(settings or {})
     known(given, SETTINGS, "euroc")
-    bad_time = policy(given, "euroc")
-    offsets = {n.split(".")[0]: offset(given, n, "euroc") for n in SETTINGS if n.endswith(".time_offset")}
-    mav = _find(Path(argument).expanduser())
-    notes: list[str] = []
-
-    def table(name: str, file: Path, columns: int, **more: Any) -> tuple[np.ndarray, np.ndarray]:
-        time, numbers, said = read_table(file, columns=columns, bad_time=bad_time, gaps=True, **more)
-        notes.extend(said)
-        time, numbers = present(name, str(file), time, numbers, notes, absent)
-        if offsets[name]:
-            notes.append(f"{name}: stamps shifted by {offsets[name]} ns")
-            reach = 2**63 - 1 - MOST_OFFSET * 10**9
-            if not -reach <= time[0] <= time[-1] <= reach:
-                raise DataError(
-                    "shifted stamps do not fit 64 bits",
-                    path=str(file),
-                    expected=f"stamps between {-reach} and {reach} ns",
-                    got=f"{time[0]} to {time[-1]} ns, shifted by {offsets[name]} ns",
-                    fix=f"leave {name}.time_offset out, and mend the stamps",
-                )
-        return time + offsets[name], numbers
-
-    absent: dict[str, int] = {}
-    info: dict[str, Any] = {"absent": absent}
-    time, u = table("imu", _need(mav / "imu0" / "data.csv", "the IMU's data"), 6)
-    streams = {"imu": Series(time, Imu(gyro=u[:, :3], specific_force=u[:, 3:]), name="imu")}
-    info["imu_noise"], info["imu_period_ns"] = _imu_info(mav / "imu0" / "sensor.yaml")
-    first, last = time[0], time[-1]
-
-    def aid(name: str, stamps: np.ndarray, values: Any) -> None:
-        series = Series(stamps, values, name=name)
-        kept = series[stamps >= first]
-        if not len(kept) or kept.time[0] > last:
-            raise DataError(
-                f"no sample of {name} lies within the span of the imu",
-                path=f"{mav}: {name}",
-                expected=f"stamps from {first} to {last} ns",
-                got=f"{stamps[0]} to {stamps[-1]} ns, with {name}.time_offset={offsets[name] / 1e9:g}"
-                f" and imu.time_offset={offsets['imu'] / 1e9:g}",
-                fix=f"check {name}.time_offset and imu.time_offset, which are in seconds",
-            )
-        early = len(series) - len(kept)
-        if early:
-            notes.append(f"{name}: {early} samples from before the first imu sample left out")
-        streams[name] = kept
-
-    if (mav / "leica0").is_dir():
-        time, z = table("leica", _need(mav / "leica0" / "data.csv", "the prism's positions"), 3)
-        aid("leica", time, Position(position=z))
-        extrinsics = _extrinsics(mav / "leica0" / "sensor.yaml")
-        info["leica_lever"] = extrinsics[0] if extrinsics else LEICA_LEVER
-    if (mav / "vicon0").is_dir():
-        time, z = table("vicon", _need(mav / "vicon0" / "data.csv", "the motion capture"), 7, quaternion=3)
-        unmounted = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        info["vicon_lever"], info["vicon_mount"] = _extrinsics(mav / "vicon0" / "sensor.yaml") or unmounted
-        to_sensor = conjugate(np.asarray(info["vicon_mount"]), xp=np)
-        aid("vicon", time, Pose(position=z[:, :3], attitude=multiply(z[:, 3:], to_sensor, xp=np)))
-    truth = None
-    asl = mav / "state_groundtruth_estimate0" / "data.csv"
-    tum = next((f for f in (mav / "groundtruth.tum", mav.parent / "groundtruth.tum") if f.is_file()), None)
-    if asl.is_file():
-        time, x = table("truth", asl, 16, quaternion=3)
-        state = NavigationState(
-            position=x[:, :3],
-            attitude=x[:, 3:7],
-            velocity=x[:, 7:10],
-            gyro_bias=x[:, 10:13],
-            accelerometer_bias=x[:, 13:16],
-        )
-        truth = Series(time, state, name="truth", gaps=True)
-    elif tum is not None:
-        time, x = table("truth", tum, 7, delimiter=None, seconds=True, quaternion=3)
-        truth = Series(time, Pose(position=x[:, :3], attitude=x[:, [6, 3, 4, 5]]), name="truth", gaps=True)
-    else:
-        notes.append("no ground truth: no state_groundtruth_estimate0/data.csv and no groundtruth.tum")
+    unit = chosen({"time.unit": "ns", **given}, "time.unit", list(UNITS), "euroc")
+    mav, imu0 = _find(Path(argument).expanduser())
     name = mav.parent.name if mav.name == "mav0" else mav.name
-    return Flight(name=name, streams=streams, truth=truth, info=info, notes=tuple(notes))
+    made = Recording(
+        name, policy(given, "euroc"), kind="euroc", given=given, unit=unit, begins="imu", place=str(mav)
+    )
+    info = made.info
+
+    def add(stream: str, file: Path, fields: Mapping[str, list[int]], signal: Any, **more: Any) -> None:
+        lines: list[int] = []
+        width = more.pop("width", max(map(max, fields.values())) + 1)
+        reading = {k: more.pop(k, v) for k, v in (("unit", unit), ("delimiter", ","))}
+        time, x, said = read_table(file, columns=width, gaps=True, lines=lines, **reading)
+        made.notes.extend(said)
+        columns = {field: x[:, part] for field, part in fields.items()}
+        made.add(stream, str(file), time, columns, signal, row=lambda k: f"{file}, line {lines[k]}", **more)
+
+    found = described(mav, imu0)
+    at, turn = UNMOUNTED
+    if found is not None and "T_BS" in found[1]:
+        at, turn = rigid(found[1]["T_BS"], found[0])
+    as_it_is = turn == UNMOUNTED[1]
+    if not as_it_is:
+        made.notes.append(note("info", "imu: readings turned into the body's axes by T_BS of imu0"))
+    table = _need(imu0 if imu0.is_file() else imu0 / "data.csv", "the IMU's data")
+    add("imu", table, _READINGS, Imu, mount=None if as_it_is else turn)
+    info["imu_noise"] = unit_noise(found, given, made.notes)
+    info["imu_period_ns"] = period_of(found, made.streams["imu"].time, made.notes)
+    if any(at):
+        place = ", ".join(f"{x:g}" for x in at)
+        made.notes.append(note("info", f"imu: sits at ({place}) m in the body by T_BS; levers are from it"))
+    leica, vicon = mav / "leica0", _motion_capture(mav, made.notes)
+    if leica.is_dir():
+        add("leica", _need(leica / "data.csv", "the prism's positions"), {"position": [0, 1, 2]}, Position)
+        placed = extrinsics(leica / "sensor.yaml")
+        info.setdefault("leica_lever", _from(placed[0] if placed else LEICA_LEVER, at))
+    if vicon is not None:
+        lever, mount = extrinsics(vicon / "sensor.yaml") or UNMOUNTED
+        data = _need(vicon / "data.csv", "the motion capture")
+        add("vicon", data, _POSE, Pose, mount=mount, scalar_last=_scalar_last(data, made.notes))
+        info.setdefault("vicon_lever", _from(lever, at))
+        info.setdefault("vicon_mount", mount)
+    asl = next((f for n in _TRUTHS if (f := mav / n / "data.csv").is_file()), None)
+    tum = next((f for f in (mav / "groundtruth.tum", mav.parent / "groundtruth.tum") if f.is_file()), None)
+    if asl is not None:
+        width, fields, signal = _truth_of(asl, made.notes)
+    elif tum is not None:
+        width, fields, signal = 7, _POSE, Pose
+    if (asl or tum) is None:
+        made.notes.append(note("info", f"no ground truth: no {_TRUTHS[0]}/data.csv and no groundtruth.tum"))
+    else:
+        if any(at) and "attitude" in fields:
+            made.given.setdefault("truth.lever", [-x for x in at])
+        how: dict[str, Any] = {"unit": "s", "delimiter": None, "scalar_last": True}
+        if asl is not None:
+            how = {"scalar_last": "attitude" in fields and _scalar_last(asl, made.notes)}
+        add("truth", asl or tum, fields, signal, width=width, **how)  # type: ignore[arg-type]
+    measured_noise(given, "euroc", info)
+    _passed_over(mav, {imu0, leica, vicon, asl and asl.parent}, made.notes)
+    return made.flight()
 
 
-def _find(folder: Path) -> Path:
-    """The folder that holds imu0."""
+def _find(folder: Path) -> tuple[Path, Path]:
+    """The folder that holds the sensors', and the IMU's: imu0, whatever its case, or a table imu0.csv."""
     for mav in (folder / "mav0", folder):
         if (mav / "imu0").is_dir():
-            return mav
+            return mav, mav / "imu0"
+        inside = sorted(mav.iterdir()) if mav.is_dir() else []
+        for name in ("imu0", "imu", "imu0.csv", "imu.csv"):
+            for found in inside:
+                if found.name.lower() == name and (found.is_file() or (found / "data.csv").is_file()):
+                    return mav, found
     if folder.is_dir():
-        inside = ", ".join(sorted(f.name for f in folder.iterdir())[:8])
-        got = f"a folder with {inside or 'nothing in it'}"
+        inside_it = ", ".join(sorted(f.name for f in folder.iterdir())[:8])
+        got = f"a folder with {inside_it or 'nothing in it'}"
     else:
         got = "no such folder"
     raise DataError(
@@ -172,6 +175,73 @@ def _find(folder: Path) -> Path:
         got=got,
         fix="give the sequence's folder (the one that holds mav0) or mav0 itself",
     )
+
+
+def _motion_capture(mav: Path, notes: list[str]) -> Path | None:
+    """The folder of the stream vicon."""
+    if (mav / "vicon0").is_dir():
+        return mav / "vicon0"
+    if (mav / "mocap0").is_dir():
+        notes.append(note("assumed", "mocap0 is the stream vicon"))
+        return mav / "mocap0"
+    return None
+
+
+def _names(file: Path) -> list[str]:
+    """The names that the first row gives the columns, without their units; none where it has numbers."""
+    with file.open(encoding="utf-8-sig", errors="replace") as text:
+        first = next((line for line in text if line.strip()), "")
+    cells = [re.sub(r"[\[(].*", "", c).strip().lower() for c in first.lstrip("#").strip().split(",")]
+    return cells if not any(re.fullmatch(r"[-+\d.e]+", c) for c in cells) else []
+
+
+def _scalar_last(file: Path, notes: list[str]) -> bool:
+    """Whether the names of a table's columns say that its quaternions are x, y, z, w."""
+    ends = [re.sub(r".*?_?q_?(?:rs_)?([wxyz])$", r"\1", n) for n in _names(file)][4:8]
+    last = ends == ["x", "y", "z", "w"]
+    if last:
+        notes.append(note("info", f"{file.parent.name}: quaternions with the scalar last, by their names"))
+    return last
+
+
+def _truth_of(file: Path, notes: list[str]) -> tuple[int, Mapping[str, list[int]], Any]:
+    """How many numbers follow the stamp of a truth, and what they are."""
+    with file.open(encoding="utf-8-sig", errors="replace") as text:
+        rows = (line.strip() for line in text)
+        row = next((line for line in rows if re.match(r"[-+]?\d", line)), "")
+    width = len(row.rstrip(",").split(",")) - 1
+    if width in (3, 7, 10):
+        what = "positions" if width == 3 else "poses"
+        notes.append(note("info", f"truth: {what}, of a table of {width + 1} columns"))
+    if width == 3:
+        return 3, {"position": [0, 1, 2]}, Position
+    if width == 10:
+        notes.append(note("skipped", "truth: the velocities, for want of biases beside them"))
+    if width in (7, 10):
+        return width, _POSE, Pose
+    if row and width != 16:
+        raise DataError(
+            "wrong number of columns",
+            path=str(file),
+            expected="17 (stamp, position, quaternion, velocity, both biases), 11 (no biases), 8 (poses) or "
+            "4 (positions)",
+            got=f"{width + 1}: {row[:60]!r}",
+            fix="restore the file, or leave out what is beyond the pose",
+        )
+    return 16, _STATE, NavigationState
+
+
+def _from(lever: tuple[float, ...], at: tuple[float, ...]) -> tuple[float, ...]:
+    """A lever from the inertial unit in place of the body's origin."""
+    return tuple(x - o for x, o in zip(lever, at, strict=True)) if any(at) else lever
+
+
+def _passed_over(mav: Path, used: set[Path | None], notes: list[str]) -> None:
+    """A note on the folders that are not read."""
+    folders = {*mav.iterdir()} - {f for f in used if f is not None}
+    rest = sorted(f.name for f in folders if f.is_dir() and (f / "data.csv").is_file())
+    if rest:
+        notes.append(note("skipped", f"{', '.join(rest)}: not read"))
 
 
 def _need(file: Path, what: str) -> Path:
@@ -184,92 +254,3 @@ def _need(file: Path, what: str) -> Path:
             fix="unpack the whole sequence, or give another folder",
         )
     return file
-
-
-class _Loader(yaml.SafeLoader):
-    """The safe loader, which takes OpenCV's matrices for the mappings that they are."""
-
-
-def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
-
-
-def _yaml(file: Path) -> dict[str, Any]:
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-        if text.startswith("%YAML:"):  # as OpenCV writes it; YAML itself has a space there
-            text = text.partition("\n")[2]
-        content = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(
-            "this is not readable as YAML",
-            path=str(file),
-            expected="a mapping, as EuRoC's sensor.yaml",
-            got=str(error).splitlines()[0],
-            fix="restore the file of the sequence",
-        ) from error
-    if not isinstance(content, dict):
-        raise DataError(
-            "this is no sensor description",
-            path=str(file),
-            expected="a mapping, as EuRoC's sensor.yaml",
-            got=type(content).__name__,
-            fix="restore the file of the sequence",
-        )
-    return content
-
-
-def _number(content: Mapping[str, Any], name: str, file: Path) -> float:
-    value = content.get(name)
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]  # YAML 1.1 reads 1e-4 as a string
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number) or number <= 0.0:
-        raise DataError(
-            f"{name!r} is missing or not a positive number",
-            path=str(file),
-            expected=f"{name}: a positive number; of " + ", ".join([*_NOISE.values(), "rate_hz"]),
-            got=repr(value),
-            fix="restore the file of the sequence",
-        )
-    return number
-
-
-def _imu_info(file: Path) -> tuple[ImuNoise, int]:
-    content = _yaml(_need(file, "the IMU's noise densities"))
-    noise = ImuNoise(**{ours: _number(content, theirs, file) for ours, theirs in _NOISE.items()})
-    rate = _number(content, "rate_hz", file)
-    if not _RATES[0] <= rate <= _RATES[1]:
-        raise DataError(
-            "'rate_hz' is no rate of an IMU",
-            path=str(file),
-            expected=f"from {_RATES[0]:g} to {_RATES[1]:g} Hz",
-            got=f"{rate:g}",
-            fix="restore the file of the sequence",
-        )
-    return noise, round(1e9 / rate)
-
-
-def _extrinsics(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Where and how a sensor sits in the body, from T_BS: (position in m, quaternion sensor to body)."""
-    if not file.is_file():
-        return None
-    content = _yaml(file)
-    try:
-        T = np.array(content["T_BS"]["data"], dtype=float).reshape(4, 4)
-        if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)):
-            raise ValueError("its 3 x 3 part is no rotation")
-        w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)[[3, 0, 1, 2]].tolist()
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            "T_BS is missing or malformed",
-            path=str(file),
-            expected="T_BS: data: 16 numbers, a rigid transform, row by row",
-            got=str(error),
-            fix="restore the file of the sequence",
-        ) from error
-    return tuple(T[:3, 3].tolist()), (w, x, y, z)

@@ -17,6 +17,7 @@ import numpy as np
 
 from flowgraph.blocks.vision.camera import COURSE_CAMERA, COURSE_MOUNT, Camera, Mount, course_mount
 from flowgraph.blocks.vision.tags import TagMap, course_map, grid_map
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["Parameters", "parse_parameters"]
@@ -103,7 +104,7 @@ def parse_parameters(file: str | Path) -> Parameters:
         ("tag ids", "ids" in found),
     ):
         if not there:
-            notes.append(f"{file.name}: no {what}; that of the course is taken")
+            notes.append(note("assumed", f"{file.name}: no {what}; that of the course is taken"))
     return Parameters(tag_map, camera, mount, tuple(notes))
 
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -29,7 +28,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
-from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
+from flowgraph.blocks.datasets.shape import (
+    NOISE_SETTINGS,
+    Recording,
+    chosen,
+    imu_noise,
+    known,
+    number,
+    split_argument,
+    stream_settings,
+)
 from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.geometry.euler import quaternion_from_angles
 from flowgraph.blocks.geometry.rotations import multiply
@@ -38,6 +46,7 @@ from flowgraph.blocks.signals import CameraMotion, Imu, MotionTruth
 from flowgraph.blocks.vision.camera import COURSE_MOUNT
 from flowgraph.blocks.vision.motion import find_delay, velocity_error
 from flowgraph.blocks.vision.pnp import as_measurements
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["NOISE", "SETTINGS", "derived_imu", "load"]
@@ -46,6 +55,8 @@ SETTINGS: Mapping[str, str] = {
     "frame": "registered: poses taken into the motion capture's world; raw: as recorded",
     "delay": "s by which the camera velocity is late; found from the motion capture if left out",
     "imu.window": "s, of the local parabolas behind the derived IMU",
+    **NOISE_SETTINGS,
+    **stream_settings("pose", "motion", "imu", "truth", only=("time_offset", "every")),
 }
 """The settings of `load` and what they mean."""
 
@@ -104,32 +115,39 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     attitude = np.asarray(quaternion_from_angles(table["angle"][keep], order="zyx", xp=np))
     if frame == "registered":
         position, attitude = _registered(position, attitude)
-        notes.append(f"poses taken into the motion capture's frames: shift {SHIFT} m, turn {TURN:g} rad")
+        sentence = f"poses taken into the motion capture's frames: shift {SHIFT} m, turn {TURN:g} rad"
+        notes.append(note("info", sentence))
     pose = Series.from_seconds(seconds[keep], as_measurements(position, attitude), name="pose")
     motion = Series(
         pose.time, CameraMotion(velocity=table["linearVel"][keep], rate=table["angVel"][keep]), name="motion"
     )
-    streams = {"pose": pose}
-    info: dict[str, Any] = {"mount": COURSE_MOUNT, "imu_noise": NOISE, **POSE_NOISE}
+    made = Recording(file.stem, kind="rob6213", given=given, place=str(file))
+    made.notes += notes
+    notes = made.notes
+    made.take(pose, str(file))
+    made.info.update(mount=COURSE_MOUNT, **POSE_NOISE)
     truth = None
     csv = csv or _beside(file)
     delay = USUAL_DELAY
     if csv is None:
-        notes.append("no motion capture beside the file: no truth and no IMU")
+        notes.append(note("info", "no motion capture beside the file: no truth and no IMU"))
     else:
         truth = _truth(csv)
         window = number(given, "imu.window", 0.11, "rob6213", positive=True)
-        streams["imu"] = derived_imu(truth, window)
-        notes.append("imu: derived from the motion capture, not recorded")
+        derived = derived_imu(truth, window)
+        notes.append(note("info", "imu: derived from the motion capture, not recorded"))
         delay = find_delay(motion, truth, COURSE_MOUNT)
     delay = number(given, "delay", delay, "rob6213", signed=True)
     if truth is not None:
         error = velocity_error(motion, truth, COURSE_MOUNT, delay)
-        notes.append(f"motion: {delay:.3f} s late; then {error:.4f} m/s RMS from the motion capture")
+        sentence = f"motion: {delay:.3f} s late; then {error:.4f} m/s RMS from the motion capture"
+        notes.append(note("info" if "delay" in given else "assumed", sentence))
+        made.take(derived, str(csv))
+        made.take(truth, str(csv))
     late = motion.time - round(delay * 1e9)
-    streams["motion"] = Series(late, motion.values, name="motion")
-    info["delay"] = delay
-    return Flight(name=file.stem, streams=streams, truth=truth, info=info, notes=tuple(notes))
+    made.take(Series(late, motion.values, name="motion"), str(file))
+    made.info.update(delay=delay, imu_noise=imu_noise(given, "rob6213", notes, NOISE))
+    return made.flight()
 
 
 def _registered(position: np.ndarray, attitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

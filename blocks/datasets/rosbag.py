@@ -30,9 +30,8 @@ from flowgraph.blocks.datasets.shape import (
     imu_noise,
     known,
     number,
-    plausible,
     policy,
-    unit_quaternions,
+    stream_settings,
 )
 from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.signals import GeodeticPosition, Imu, MagneticField, Pose
@@ -47,6 +46,7 @@ SETTINGS: Mapping[str, str] = {
     "position.noise": "standard deviation of measured positions, m",
     "attitude.noise": "standard deviation of measured attitudes, rad",
     "bad_time": "messages out of order: " + ", ".join(POLICIES),
+    **stream_settings("STREAM"),
 }
 """The settings of `load` and what they mean."""
 
@@ -123,7 +123,15 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     given = settings or {}
     known(given, SETTINGS, "rosbag")
     stamp = chosen(given, "stamp", ("header", "bag"), "rosbag")
-    made = Recording(Path(argument).stem, policy(given, "rosbag"))
+    made = Recording(
+        Path(argument).stem,
+        policy(given, "rosbag"),
+        kind="rosbag",
+        given=given,
+        clock="stamp=bag takes the clock of the recorder" if stamp == "header" else "check the bag",
+        units="mend the driver: ROS has SI units",
+        place=argument,
+    )
     path = Path(argument).expanduser()
     wanted = _wanted(str(given["topics"])) if "topics" in given else None
     made.info.update(topics={}, frames={})
@@ -266,15 +274,6 @@ def _read(made: Recording, path: Path, bag: _Bag, name: str, topic: str, kind: K
     place = f"{path}: {topic}"
     table = np.array(rows, dtype=float)
     columns = {field: table[:, part] for field, part in kind.fields.items()}
-    if "attitude" in columns:
-        columns["attitude"] = unit_quaternions(columns["attitude"], place)
-    for field, values in columns.items():
-        plausible(
-            field,
-            values[np.isfinite(values).all(axis=1)],
-            f"{place}: {field}",
-            "mend the driver: ROS has SI units",
-        )
     made.add(
         name,
         place,
@@ -282,6 +281,5 @@ def _read(made: Recording, path: Path, bag: _Bag, name: str, topic: str, kind: K
         columns,
         kind.signal,
         row=lambda k: f"{place}, message {k + 1}",
-        checked=False,
     )
     made.info["topics"][name], made.info["frames"][name] = topic, ", ".join(sorted(frames))

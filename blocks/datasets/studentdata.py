@@ -23,7 +23,16 @@ import numpy as np
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_structs
 from flowgraph.blocks.datasets.parameters import Parameters, parse_parameters
-from flowgraph.blocks.datasets.shape import chosen, known, number, split_argument
+from flowgraph.blocks.datasets.shape import (
+    NOISE_SETTINGS,
+    Recording,
+    chosen,
+    imu_noise,
+    known,
+    number,
+    split_argument,
+    stream_settings,
+)
 from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.geometry.euler import quaternion_from_angles
 from flowgraph.blocks.inertial.imu import ImuNoise
@@ -31,6 +40,7 @@ from flowgraph.blocks.signals import Imu, MotionTruth
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.pnp import measure
 from flowgraph.blocks.vision.tags import tags_series
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["NOISE", "SETTINGS", "load", "packet_tags", "packets", "vicon_rows"]
@@ -38,6 +48,8 @@ __all__ = ["NOISE", "SETTINGS", "load", "packet_tags", "packets", "vicon_rows"]
 SETTINGS: Mapping[str, str] = {
     "images": "auto, raw or rectified: whether corners are of distorted images; auto takes what fits better",
     "most_tags": "room for tags in an image",
+    **NOISE_SETTINGS,
+    **stream_settings("imu", "tags", "truth", only=("time_offset", "every")),
 }
 """The settings of `load` and what they mean."""
 
@@ -70,18 +82,27 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
 
 def flight_of(
-    content: Mapping[str, Any], parameters: Parameters, file: Path, given: Mapping[str, str | float]
+    content: Mapping[str, Any],
+    parameters: Parameters,
+    file: Path,
+    given: Mapping[str, str | float],
+    noise: ImuNoise | None = None,
 ) -> Flight:
-    """The flight of the variables `data`, `time` and `vicon`; `file` is what messages call them."""
+    """The flight of the variables `data`, `time` and `vicon`; `file` is what messages call them.
+
+    The unit's noise is `noise` where it is known.
+    """
     known(given, SETTINGS, "studentdata")
     images = chosen(given, "images", ("auto", "raw", "rectified"), "studentdata")
-    notes = list(parameters.notes)
+    made = Recording(file.stem, kind="studentdata", given=given, place=str(file))
+    notes = made.notes
+    notes += parameters.notes
     found = packets(content["data"], file)
     room = int(number(given, "most_tags", 108, "studentdata", positive=True))
     seconds = np.array([_numbers(p, "t", 1, file, k)[0] for k, p in enumerate(found, start=1)])
     rate_name = "omg" if "omg" in found[0] else "drpy"
     if rate_name == "drpy":
-        notes.append(f"{file.name}: drpy is taken for omg")
+        notes.append(note("assumed", f"{file.name}: drpy is taken for omg"))
     gyro = np.array([_numbers(p, rate_name, 3, file, k) for k, p in enumerate(found, start=1)])
     force = np.array([_numbers(p, "acc", 3, file, k) for k, p in enumerate(found, start=1)])
     frames = [packet_tags(p, f"{file}: data, packet {k}") for k, p in enumerate(found, start=1)]
@@ -97,27 +118,28 @@ def flight_of(
     keep, more = strictly_later(seconds, "data", file)
     notes += more
     imu = Series.from_seconds(seconds[keep], Imu(gyro=gyro[keep], specific_force=force[keep]), name="imu")
-    streams = {"imu": imu}
+    made.take(imu, f"{file}: data")
     kept = [f for f, k in zip(frames, keep, strict=True) if k]
     camera = parameters.camera
     if any(len(ids) for ids, _ in kept):
-        streams["tags"] = tags_series(imu.time, kept, room=room)
+        made.take(tags_series(imu.time, kept, room=room), f"{file}: data")
         camera, said = _camera(images, parameters, kept)
-        notes.append(said)
+        notes.append(note("info" if images != "auto" else "assumed", said))
     else:
-        notes.append(f"{file.name}: no packet has tags")
+        notes.append(note("info", f"{file.name}: no packet has tags"))
     truth, more = _truth(content, file)
     notes += more
-    early = int((imu.time < truth.time[0]).sum())
+    made.take(truth, f"{file}: vicon")
+    early = int((made.streams["imu"].time < truth.time[0]).sum())
     if early:
-        notes.append(f"{file.name}: {early} packets precede the first row of vicon")
-    info: dict[str, Any] = {
-        "camera": camera,
-        "mount": parameters.mount,
-        "tag_map": parameters.tag_map,
-        "imu_noise": NOISE,
-    }
-    return Flight(name=file.stem, streams=streams, truth=truth, info=info, notes=tuple(notes))
+        notes.append(note("info", f"{file.name}: {early} packets precede the first row of vicon"))
+    made.info.update(
+        camera=camera,
+        mount=parameters.mount,
+        tag_map=parameters.tag_map,
+        imu_noise=imu_noise(given, "studentdata", notes, NOISE) if noise is None else noise,
+    )
+    return made.flight()
 
 
 def packets(data: Any, file: Path) -> list[dict[str, Any]]:
@@ -211,7 +233,7 @@ def _truth(content: Mapping[str, Any], file: Path) -> tuple[Series, list[str]]:
     notes = (
         []
         if finite.all()
-        else [f"{file.name}: {int((~finite).sum())} rows of vicon are not finite: left out"]
+        else [note("skipped", f"{file.name}: {int((~finite).sum())} rows of vicon are not finite: left out")]
     )
     seconds, x = seconds[finite], x[finite]
     keep, more = strictly_later(seconds, "vicon", file)

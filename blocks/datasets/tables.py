@@ -7,37 +7,17 @@ through cell by cell, to find what dialect it is in, or the row to blame.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from flowgraph.blocks.datasets.cells import decimal_mark, numbers, stamps
 from flowgraph.blocks.datasets.dialect import Sheet, lines_of, read_sheet, text_of
+from flowgraph.blocks.datasets.stamps import POLICIES, in_order, nanoseconds, strictly_later
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["POLICIES", "in_order", "nanoseconds", "read_table", "strictly_later"]
-
-POLICIES = ("raise", "drop", "sort")
-"""What to do with rows whose time does not increase: refuse them; leave them out; sort, and of equal times
-keep the first."""
-
-
-def nanoseconds(seconds: str) -> int:
-    """Decimal seconds as an integer of nanoseconds, rounded once and never through a float.
-
-    Raises:
-        ValueError: when the text is not a finite number, or beyond 64 bits.
-    """
-    try:
-        number = Decimal(seconds)
-        if "_" in seconds or not -9_223_372_036 < number < 9_223_372_036:
-            raise ValueError
-        return int((number * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"not a finite number below 9.2e9: {seconds!r}") from error
 
 
 def read_table(
@@ -46,9 +26,7 @@ def read_table(
     columns: int,
     bad_time: str = "raise",
     delimiter: str | None = ",",
-    seconds: bool = False,
     unit: str = "ns",
-    quaternion: int | None = None,
     gaps: bool = False,
     lines: list[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -62,9 +40,7 @@ def read_table(
         columns: how many numbers follow the stamp.
         bad_time: one of `POLICIES`.
         delimiter: between columns, where nothing speaks against it; None for white space.
-        seconds: whether a stamp is decimal seconds: unit="s".
         unit: of the stamps, of `units.TIME`: whole numbers of ns; of others decimal numbers, or dates.
-        quaternion: the first of four columns that must have a norm within 1 % of 1; they are normalised.
         gaps: whether a NaN is data, a number that was not measured; otherwise it is refused.
         lines: to be filled with the line of each row, from 1; then rows stay as they are in the file, and
             their order is left to the caller.
@@ -76,7 +52,6 @@ def read_table(
     Raises:
         DataError: the file has no rows, or a row is malformed or out of order; names the file and the line.
     """
-    unit = "s" if seconds else unit
     text, said = text_of(file)
     held = [(i, line) for i, line in enumerate(lines_of(text), start=1) if line.strip() and line[0] != "#"]
     try:
@@ -97,19 +72,6 @@ def read_table(
     except (ValueError, OverflowError, Warning):
         at, time, x, more = _in_dialect(file, columns, delimiter, unit, gaps)
         said = [*said, *more]
-    if quaternion is not None:
-        part = x[:, quaternion : quaternion + 4]
-        norm = np.linalg.norm(part, axis=-1, keepdims=True)
-        off = np.flatnonzero(np.abs(norm[:, 0] - 1.0) > 0.01)
-        if len(off):
-            raise DataError(
-                "an attitude is not a unit quaternion",
-                path=f"{file}, line {at[off[0]]}",
-                expected="a norm within 1 % of 1",
-                got=f"{norm[off[0], 0]:.6g}",
-                fix="mend or delete the row",
-            )
-        x[:, quaternion : quaternion + 4] = part / norm
     if lines is not None:
         lines.extend(at)
         return time, x, said
@@ -181,52 +143,3 @@ def _whole(cells: list[str], sheet: Sheet) -> np.ndarray:
                 fix="mend or delete the row",
             ) from None
     return np.array([int(c) for c in cells], dtype=np.int64)
-
-
-def in_order(
-    name: str, row: Callable[[int], str], time: np.ndarray, x: np.ndarray, bad_time: str
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Times (n,) and rows (n, ...) with increasing time, as `bad_time` (of `POLICIES`) says, and notes.
-
-    Args:
-        name: what the notes are about.
-        row: what to call row k in a message.
-
-    Raises:
-        DataError: with bad_time="raise", for the first row that is not later than all before it.
-    """
-    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(time)[:-1]])
-    bad = np.flatnonzero(time <= before) if len(time) else time[:0]
-    if not len(bad):
-        return time, x, []
-    if bad_time == "raise":
-        k = int(bad[0])
-        raise DataError(
-            "time does not increase",
-            path=row(k),
-            expected=f"a stamp after {before[k]} ns",
-            got=f"{time[k]} ns",
-            fix="bad_time=drop leaves such rows out, bad_time=sort sorts them in",
-        )
-    if bad_time == "drop":
-        kept = time > before
-        return time[kept], x[kept], [f"{name}: {len(bad)} rows out of order left out"]
-    times, first = np.unique(time, return_index=True)
-    twice = len(time) - len(times)
-    note = f"{name}: sorted, {len(bad)} rows were out of order"
-    return times, x[first], [note + (f", {twice} of equal time left out" if twice else "")]
-
-
-def strictly_later(seconds: np.ndarray, what: str, file: Path) -> tuple[np.ndarray, list[str]]:
-    """Which rows (n,) come after all before them, and notes that name those that do not."""
-    stamps = np.rint(np.asarray(seconds) * 1e9)
-    before = np.concatenate([[-np.inf], np.maximum.accumulate(stamps)[:-1]])
-    keep = stamps > before
-    bad = np.flatnonzero(~keep)
-    if not len(bad):
-        return keep, []
-    first = int(bad[0])
-    step = 1e3 * float(seconds[first] - seconds[first - 1])
-    more = f"; {len(bad)} rows in all are not after those before them" if len(bad) > 1 else ""
-    note = f"{file.name}: {what}, row {first + 1} is {step:+.3f} ms after the one before{more}: left out"
-    return keep, [note]

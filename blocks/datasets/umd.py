@@ -23,7 +23,15 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
-from flowgraph.blocks.datasets.shape import known, number, split_argument
+from flowgraph.blocks.datasets.shape import (
+    NOISE_SETTINGS,
+    Recording,
+    imu_noise,
+    known,
+    number,
+    split_argument,
+    stream_settings,
+)
 from flowgraph.blocks.datasets.tables import strictly_later
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu
@@ -35,7 +43,8 @@ from flowgraph.errors import DataError
 __all__ = ["SETTINGS", "load"]
 
 SETTINGS: Mapping[str, str] = {
-    "imu.time_offset": "s, added to the stamps of the IMU",
+    **stream_settings("imu", "tags", only=("time_offset", "every")),
+    **NOISE_SETTINGS,
     "most_tags": "room for tags in an image",
 }
 """The settings of `load` and what they mean."""
@@ -76,20 +85,17 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     frames = [_detected(cell, row, file, room) for row, cell in enumerate(detections, start=1)]
     keep_image, notes = strictly_later(images, "TLeftImgs", file)
     keep_imu, more = strictly_later(imu[:, 10], "IMU", file)
-    offset = number(given, "imu.time_offset", 0.0, "umd", signed=True)
     u = imu[keep_imu]
-    streams = {
-        "imu": Series.from_seconds(
-            u[:, 10] + offset, Imu(gyro=u[:, 7:10], specific_force=u[:, 4:7]), name="imu"
-        ),
-        "tags": tags_series(
-            Series.from_seconds(images[keep_image], images[keep_image]).time,
-            [f for f, kept in zip(frames, keep_image, strict=True) if kept],
-            room=room,
-        ),
-    }
-    info: dict[str, Any] = {"camera": camera, "mount": mount, "tag_side": side, "imu_noise": NOISE, **PIXELS}
-    return Flight(name=file.stem, streams=streams, info=info, notes=(*notes, *more))
+    made = Recording(file.stem, kind="umd", given=given, place=str(file))
+    made.notes += [*notes, *more]
+    readings = Imu(gyro=u[:, 7:10], specific_force=u[:, 4:7])
+    made.take(Series.from_seconds(u[:, 10], readings, name="imu"), f"{file}: IMU")
+    seen = [f for f, kept in zip(frames, keep_image, strict=True) if kept]
+    stamps = Series.from_seconds(images[keep_image], images[keep_image]).time
+    made.take(tags_series(stamps, seen, room=room), f"{file}: DetAll")
+    unit = imu_noise(given, "umd", made.notes, NOISE)
+    made.info.update(camera=camera, mount=mount, tag_side=side, imu_noise=unit, **PIXELS)
+    return made.flight()
 
 
 NOISE = ImuNoise(gyro=0.02, accelerometer=0.6, gyro_bias=2e-4, accelerometer_bias=2e-3)

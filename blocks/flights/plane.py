@@ -14,6 +14,7 @@ import numpy as np
 from flowgraph import Flight, Series
 from flowgraph.blocks.signals import PlanePosition, PlaneVelocity
 from flowgraph.blocks.world import generator
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 __all__ = ["DEFAULTS", "load_plane"]
@@ -79,7 +80,7 @@ def load_plane(*, seed: int = 0, settings: Mapping[str, str | float] | None = No
         },
         truth=Series(time, PlanePosition(position=_figure(time, seed)), name="truth"),
         info={"velocity_noise": n["velocity.noise"], "position_noise": n["position.noise"]},
-        notes=(f"simulated with seed {seed}: a smooth figure in the plane",),
+        notes=(note("info", f"simulated with seed {seed}: a smooth figure in the plane"),),
     )
 
 

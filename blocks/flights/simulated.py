@@ -23,6 +23,7 @@ from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
 from flowgraph.blocks.world import generator
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 __all__ = ["DEFAULTS", "SETTINGS", "load", "trajectory"]
@@ -122,7 +123,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
             "imu_period_ns": imu_period,
             "vicon_period_ns": vicon_period,
         },
-        notes=(f"simulated with seed {seed}: 1 s at rest, then a smooth figure",),
+        notes=(note("info", f"simulated with seed {seed}: 1 s at rest, then a smooth figure"),),
     )
 
 

@@ -20,6 +20,7 @@ from flowgraph.blocks import sensors as s
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.signals import NavigationState
 from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
+from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
 __all__ = ["MOST_SAMPLES", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
@@ -158,7 +159,7 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
     )
     info["across"] = float(np.sqrt(np.mean(np.square(motion.specific_force[:, :2]).sum(-1))))
-    notes = [f"simulated with seed {seed}: {figures(world)}"]
+    notes = [note("info", f"simulated with seed {seed}: {figures(world)}")]
     notes += [_late(name, streams[name], stamp, world) for name, stamp in stamps.items() if len(stamp)]
     return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, tuple(notes))
 
@@ -168,10 +169,11 @@ def _late(name: str, series: Series, stamp: np.ndarray, world: World) -> str:
     then, now = world.at(stamp / 1e9), world.at(np.minimum(series.time / 1e9, world.duration))
     gone = np.sqrt(np.mean(np.square(now.position - then.position).sum(-1)))
     turned = np.sqrt(np.mean(np.square(geodesic_angle(then.attitude, now.attitude))))
-    return (
+    sentence = (
         f"{name} arrives {np.mean(series.time - stamp) * 1e-6:.1f} ms late on average; a filter that takes "
         f"it as fresh is told where the body was {gone:.3f} m and {turned:.1f} deg ago (root mean squares)"
     )
+    return note("info", sentence)
 
 
 def check_samples(numbers: Numbers, rates: Iterable[str], path: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import typer
@@ -71,17 +71,26 @@ def one_flight(data: list[str] | None) -> str | None:
 
 
 def case_of(
-    name: str, spec: str, settings: list[str] | None, seed: int, truth: str | None = None
+    name: str,
+    spec: str,
+    settings: list[str] | None,
+    seed: int,
+    truth: str | None = None,
+    say: Callable[[tuple[str, ...]], None] = lambda notes: None,
 ) -> tuple[Case, Flight]:
+    """A graph made ready for a flight; `say` is told the notes of each as soon as they are known."""
     graph = find_graph(name)
     given = pairs(settings)
     if graph.prepare is None:
         return graph.case(Flight(spec, {})), Flight(spec, {})  # raises, saying what is missing
     mine, rest = parsed_settings(graph.prepare, given, also=flight_settings(spec, truth), path=name)
     flight = load_flight(spec, seed=seed, settings=rest, truth=truth)
+    say(flight.notes)
     if "seed" in inspect.signature(graph.prepare).parameters:
         mine.setdefault("seed", seed)
-    return graph.case(flight, **mine), flight
+    case = graph.case(flight, **mine)
+    say(case.notes)
+    return case, flight
 
 
 def graph_of(

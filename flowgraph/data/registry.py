@@ -234,6 +234,8 @@ def parsed_settings(
             rest[key] = text
         elif key in own:
             mine[key] = _parse(text, hints.get(key, str), f"{path}.{key}")
+        elif "STREAM." + key.rpartition(".")[2] in also:  # a setting that streams of any name have
+            rest[key] = text
         else:
             raise UnknownNameError("setting", key, [*own, *also], path=path)
     return mine, rest

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph.data.frames import frame_of, signal_of, stamps_of
+from flowgraph.data.notes import said
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import (
     DTYPES,
@@ -341,7 +342,11 @@ class Flight:
         streams: a `Series` for each sensor.
         truth: a `Series` with at least `position` and `attitude`, or None.
         info: calibration and noise, by name.
-        notes: what was dropped, shifted or assumed when it was read, a sentence each.
+        notes: what was dropped, shifted or assumed when it was read, a sentence each, which begins with a
+            word of `flowgraph.data.notes`.
+
+    Raises:
+        DeclarationError: for a note that does not.
     """
 
     name: str
@@ -349,6 +354,9 @@ class Flight:
     truth: Series | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "notes", said(self.notes))
 
     def need(self, graph: str, *names: str, fix: str = "choose another flight") -> dict[str, Series]:
         """The streams of these names, for a graph that cannot run without them.

@@ -238,7 +238,7 @@ def test_the_pictures(tmp_path):
 def test_recorded_poses_are_bettered(number):
     """At most 0.7 of the recorded vision's error, which is that of poses in the tags' own frame."""
     made = recorded(number)
-    assert "imu: derived from the motion capture, not recorded" in made.notes
+    assert "info: imu: derived from the motion capture, not recorded" in made.notes
     raw = load_flight(
         f"rob6213:{DATA / 'nyu_rob6213' / f'proj2_dataset{number}.mat'}", settings={"frame": "raw"}
     )

@@ -120,7 +120,8 @@ def test_what_was_found_out_is_said(tmp_path, dialect, said):
 def test_words_for_what_was_not_measured(tmp_path):
     words = ["NA", "N/A", "#N/A", "null", "None", "-", "1.#QNAN", "-nan(ind)", "<NA>", "NaN", ""]
     rows = [
-        [str(START + k), "0", "0", "0", w, "0", "9.8"] for k, w in enumerate([*words, "1", "2", "3", "4"])
+        [str(START + 1_000_000 * k), "0", "0", "0", w, "0", "9.8"]
+        for k, w in enumerate([*words, "1", "2", "3", "4"])
     ]
     flight = load(tmp_path, text(rows))
     assert len(flight.streams["imu"]) == 4
@@ -284,6 +285,11 @@ def test_attitudes_may_be_matrices(tmp_path, order):
     flight = turned(tmp_path, matrices, given, matrices.reshape(12, 9))
     found = Rotation.from_quat(flight.streams["vicon"]["attitude"][:, [1, 2, 3, 0]])
     assert (wanted.inv() * found).magnitude().max() < 1e-12
+    columns = matrices.reshape(12, 9).copy()
+    columns[7] = 0.0  # the body was lost
+    with pytest.raises(DataError, match="line 8[\\s\\S]*vicon.lost=absent"):
+        turned(tmp_path, matrices, given, columns)
+    assert len(turned(tmp_path, matrices, {**given, "vicon.lost": "absent"}, columns).streams["vicon"]) == 11
     matrices[4, 0] *= -1.0
     with pytest.raises(DataError, match="line 5: a matrix is no rotation"):
         turned(tmp_path, matrices, given, matrices.reshape(12, 9))

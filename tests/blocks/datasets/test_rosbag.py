@@ -217,7 +217,7 @@ def test_wrong_units_in_a_bag_are_named(tmp_path):
     with Pen(tmp_path / "g") as pen:
         for k in range(4):
             pen.imu("/imu", k * MS, [0, 0, 0], [0, 0, 1.0])
-    refused(tmp_path / "g", "/imu: specific_force", "not in the unit", "in g it is 1")
+    refused(tmp_path / "g", "/imu: imu.specific_force", "not in the unit", "in g it is 1")
     with Pen(tmp_path / "q") as pen:
         pen.pose("/pose", 0, [0, 0, 0], [0, 0, 0, 0])
     refused(tmp_path / "q", "/pose", "not a unit quaternion")
