@@ -28,7 +28,7 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
 
 def from_matrices(values: np.ndarray, where: Callable[[int], str], *, by_rows: bool) -> np.ndarray:
     """Quaternions (n, 4), w first, body to world, of rotation matrices (n, 9), by rows or by columns;
-    rows with a NaN are NaN.
+    rows with a NaN are NaN, and rows of zeros, which say that the body was lost, are zeros.
 
     Raises:
         DataError: for a matrix that is no rotation, to 1 %.
@@ -37,6 +37,9 @@ def from_matrices(values: np.ndarray, where: Callable[[int], str], *, by_rows: b
     matrices = matrices if by_rows else matrices.transpose(0, 2, 1)
     whole = np.isfinite(values).all(axis=1)
     found = np.full((len(values), 4), np.nan)
+    lost = (values == 0.0).all(axis=1)
+    found[lost] = 0.0
+    whole &= ~lost
     if not whole.any():
         return found
     square = matrices[whole] @ matrices[whole].transpose(0, 2, 1)

@@ -93,8 +93,8 @@ def tried(sample: Sample, content: bytes) -> str | None:
         wrong = f"over {MOST_SECONDS:g} s of processor time, or {MOST_STUCK:g} s"
     except Exception as error:
         *way, place = traceback.extract_tb(error.__traceback__)
-        first = [f for f in [*way, place] if "/flowgraph/" in f.filename or "/blocks/" in f.filename][-1:]
-        first = (first or [place])[0]
+        ours = [f for f in [*way, place] if "/flowgraph/" in f.filename or "/blocks/" in f.filename]
+        first = (ours or [place])[-1]
         wrong = (
             f"{type(error).__name__}: {str(error)[:100]} at {place.filename}:{place.lineno} by {first.name}"
         )
