@@ -19,7 +19,8 @@ from flowgraph.data.registry import find_graph, load_flight
 from flowgraph.engines.state import load_registers, load_state, save_state
 from flowgraph.study.spec import Study
 from flowgraph.study.store import Store, pack_trajectory, read_table, read_trajectory
-from tests.blocks.datasets import test_datasets, test_euroc, test_rosbag, test_studentdata
+from tests.blocks.datasets import test_datasets, test_euroc, test_studentdata
+from tests.blocks.datasets.bags import Pen
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def _euroc(folder: Path) -> None:
 
 
 def _bag(path: Path, version: int) -> None:
-    with test_rosbag.Pen(path, version) as pen:
+    with Pen(path, version) as pen:
         for k in range(6):
             pen.imu("/imu", 10**18 + k * 10**7, [0.1, 0.2, 0.3], [0.0, 0.0, 9.81])
             pen.pose("/vicon", 10**18 + k * 10**7, [1.0, 2.0, 3.0], [1.0, 0.0, 0.0, 0.0])
