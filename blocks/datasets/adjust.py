@@ -27,6 +27,7 @@ __all__ = [
     "TURNED",
     "Adjustment",
     "adjustment",
+    "check_settings",
     "lost_rows",
     "shifted",
     "stream_settings",
@@ -93,6 +94,18 @@ def adjustment(given: Mapping[str, Any], name: str, path: str) -> Adjustment:
         lever=_three(given, f"{name}.lever", path),
         mount=mount,
     )
+
+
+def check_settings(given: Mapping[str, Any], path: str) -> None:
+    """Refuse settings of streams that are not usable, before any file is opened.
+
+    Raises:
+        DeclarationError, UnknownNameError: as `adjustment`.
+    """
+    for setting in given:
+        stream, _, what = str(setting).rpartition(".")
+        if stream and what in MEANT:
+            adjustment(given, stream, path)
 
 
 def _three(given: Mapping[str, Any], name: str, path: str) -> tuple[float, ...] | None:

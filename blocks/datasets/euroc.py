@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph import Flight
+from flowgraph.blocks.datasets.adjust import check_settings
 from flowgraph.blocks.datasets.sensor_yaml import (
     UNMOUNTED,
     described,
@@ -92,6 +93,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     given = dict(settings or {})
     known(given, SETTINGS, "euroc")
     unit = chosen({"time.unit": "ns", **given}, "time.unit", list(UNITS), "euroc")
+    check_settings(given, "euroc")
     mav, imu0 = _find(Path(argument).expanduser())
     name = mav.parent.name if mav.name == "mav0" else mav.name
     made = Recording(
