@@ -346,9 +346,8 @@ def _axis(key: str, given: Any) -> tuple[Value, ...]:
             raise _wrong(key, "a count from 1", numbers[2])
         if kind == "logspace" and min(numbers[:2]) <= 0:
             raise _wrong(key, "positive ends, which are values and not exponents", ends)
-        made = (np.linspace if kind == "linspace" else np.geomspace)(
-            float(numbers[0]), float(numbers[1]), numbers[2]
-        )
+        first, last = map(float, numbers[:2])
+        made = (np.linspace if kind == "linspace" else np.geomspace)(first, last, numbers[2])
         return tuple(made.tolist())
     if isinstance(given, np.ndarray):
         given = given.tolist()
