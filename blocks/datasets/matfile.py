@@ -137,6 +137,8 @@ def _check_parts(content: bytes) -> None:
     """
     if 0 in content[:4] or len(content) < 128:
         return  # version 4, which has no parts, or no file at all
+    if content[124 + (content[126] == ord("I"))] != 1:
+        return  # another version, which is refused by its number
     order = "<" if content[126:128] == b"IM" else ">"
     limit = _EXPANDED * len(content) + 2**24
     place = 128
