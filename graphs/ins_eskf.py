@@ -5,7 +5,13 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 
 from __future__ import annotations
 
-from flowgraph import Case, Series, Stream, collect, delay, graph, latest
+import math
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Case, Series, Stream, clocks_of, collect, delay, graph, latest, simulate
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
@@ -14,6 +20,9 @@ from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_flight
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
+
+SEARCHED, HEADINGS = 15.0, 12
+"""Over how many seconds a heading is sought of which nothing is known, and how many are tried."""
 
 
 @graph
@@ -83,19 +92,57 @@ def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
     imu, info = inputs["imu"], on.flight.info
     seen = inputs["attitude"]["attitude"][0] if "attitude" in inputs else None
     begin = filter.pose(on, int(imu.time[0]), inputs["position"]["position"][0], seen)
-    spread = StartSpread() if begin.heading is None else StartSpread(heading=begin.heading)
     force = on.first_up("imu", imu["specific_force"])
+    settings = {
+        "noise": filter.imu_noise(on, (1.0, 1.0) if "position_noise" in info else (15.0, 20.0)),
+        **filter.measured(on),
+        "lever": info.get(lever, (0.0, 0.0, 0.0)),
+        "held": filter.held(on, imu),
+        "invariant": begin.heading is not None,
+        **filter.gating(),
+    }
+    turn, spread = begin.attitude, StartSpread()
+    if begin.heading is not None:
+        spread = StartSpread(heading=0.5)
+        turn = _likeliest_heading(on, inputs, begin.position, turn, force, spread, settings)
     return on.case(
         filter.score(on, pose_errors),
         inputs=inputs,
-        start=start_belief(begin.position, begin.attitude, specific_force=force, spread=spread),
-        noise=filter.imu_noise(on, (1.0, 1.0) if "position_noise" in info else (15.0, 20.0)),
-        **filter.measured(on),
-        lever=info.get(lever, (0.0, 0.0, 0.0)),
-        held=filter.held(on, imu),
-        invariant=begin.heading is not None,
-        **filter.gating(),
+        start=start_belief(begin.position, turn, specific_force=force, spread=spread),
+        **settings,
     )
+
+
+def _likeliest_heading(
+    on: OnFlight,
+    inputs: dict[str, Series],
+    position: np.ndarray,
+    attitude: np.ndarray,
+    force: np.ndarray,
+    spread: StartSpread,
+    settings: dict[str, Any],
+) -> np.ndarray:
+    """The attitude (4), turned about the vertical by the heading of a circle of them with which the filter
+    best foretells the first measurements, those of `SEARCHED` seconds.
+
+    One Gaussian cannot hold a whole circle: from the wrong side of it the innovations look like errors of
+    velocity and bias, and the filter grows sure of a wrong heading. Each of `HEADINGS` is near enough.
+    """
+    end = inputs["imu"].time[0] + round(SEARCHED * 1e9)
+    first = {name: series[series.time <= end] for name, series in inputs.items()}
+    clocks = clocks_of(first)
+    best, found = math.inf, attitude
+    for k in range(HEADINGS):
+        about_z = from_rotation_vector(np.array([0.0, 0.0, 2.0 * math.pi * k / HEADINGS]), xp=np)
+        turn = np.asarray(multiply(about_z, attitude, xp=np))
+        start = start_belief(position, turn, specific_force=force, spread=spread)
+        result = simulate(ins_eskf.build(**clocks, start=start, **{**settings, "gate": None}), first)
+        seen = [result[name] for name in result.series if name.endswith("innovation")]
+        cost = sum(float(np.sum(s["nis"] + np.linalg.slogdet(s["covariance"])[1])) for s in seen)
+        if cost < best:
+            best, found = cost, turn
+    on.note("info", f"the heading at the start was sought in the first {SEARCHED:g} s of measurements")
+    return found
 
 
 def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:

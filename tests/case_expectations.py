@@ -287,7 +287,7 @@ EXPECTATIONS: Mapping[str, Expectation] = {
     "heading_without_truth": Expectation(
         "the start heading is said to be assumed or unknown, or its error is covered",
         both(_heading_covered),
-        'print(*came["flight"].notes, *getattr(came["result"], "notes", ()), sep="\\n")',
+        'print(*came["flight"].notes, *came["case"].notes, *getattr(came["result"], "notes", ()), sep="\\n")',
     ),
     "hint_that_loses_data": Expectation(
         "equal stamps are named, and no remedy is to drop them", both(_twice_said)

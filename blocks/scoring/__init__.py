@@ -27,6 +27,7 @@ from flowgraph.blocks.scoring.cases import (
 )
 from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
+from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, StartPose
 from flowgraph.blocks.scoring.streams import (
     first_attitude,
     own_density,
@@ -63,6 +64,9 @@ __all__ = [
     "Smoothed",
     "SmoothedPoseFilter",
     "SMOOTHED",
+    "UNKNOWN_HEADING",
+    "Started",
+    "StartPose",
     "Scorer",
     "WEIGHTLESS",
     "given",

@@ -19,6 +19,7 @@ from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussia
 from flowgraph.blocks.scoring.cases import Factors, OnFlight, PoseAided, PoseFilter, Scored
 from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import Positive, named
+from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian
 
@@ -96,7 +97,11 @@ def on_measured_pose(
         start: makes the graph's start of a belief around the first measured pose.
         settings: of the graph itself.
     """
-    first = start_gaussian(pose["position"][0], pose["attitude"][0], order=filter.order)
+    place, turn, more = pose["position"][0], pose["attitude"][0], {}
+    if isinstance(filter, Started):
+        place, turn, heading = filter.pose(on, int(pose.time[0]), place, turn, usual="file")
+        more = {} if heading is None else {"deviations": (0.05, heading, 0.3, 0.03, 0.15)}
+    first = start_gaussian(place, turn, order=filter.order, **more)
     return on.case(
         euler_score(on, filter, filter.order),
         inputs={**on.inputs, "pose": pose},
