@@ -19,6 +19,7 @@ from flowgraph.blocks.kalman.filters import (
 )
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.roots import (
+    covariance_root,
     lower_root,
     predict_root,
     semidefinite_root,
@@ -29,6 +30,7 @@ from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "covariance_root",
     "LinearModel",
     "Correction",
     "Vector",
