@@ -43,6 +43,9 @@ ORDERS = ("zxy", "zyx")
 NEAR = 0.02
 """The cosine below which an attitude counts as singular: 1.1 degrees."""
 
+_POLE, _CLOSE = 1e-8, 1e-4
+"""The cosines below which two of the angles are one, and below which psi is what the others leave."""
+
 _FLIP = {"zxy": 0, "zyx": 1}
 """The angle whose cosine vanishes."""
 
@@ -86,15 +89,35 @@ def matrix_from_angles(e: Array, *, order: str, xp: Any) -> Array:
 
 
 def angles_from_matrix(R: Array, *, order: str, xp: Any) -> Array:
-    """The angles (..., 3) of a rotation (..., 3, 3); the one that flips over lies in [-pi/2, pi/2]."""
+    """The angles (..., 3) of a rotation (..., 3, 3); the one that flips over lies in [-pi/2, pi/2].
+
+    At +-90 degrees of that one only the sum or the difference of the other two has a meaning: the angle next
+    to the body (phi of zyx, theta of zxy) is 0 there and psi is all of it, as SciPy gives them.
+    """
     size = lambda a, b: xp.sqrt(a * a + b * b)  # not asin: near +-90 degrees that has half the digits
     if order == "zyx":
-        theta = xp.atan2(-R[..., 2, 0], size(R[..., 2, 1], R[..., 2, 2]))
+        cosine = size(R[..., 2, 1], R[..., 2, 2])
+        theta = xp.atan2(-R[..., 2, 0], cosine)
         phi, psi = xp.atan2(R[..., 2, 1], R[..., 2, 2]), xp.atan2(R[..., 1, 0], R[..., 0, 0])
+        phi, c, s = _inner(phi, cosine, xp)
+        rest = xp.atan2(s * R[..., 0, 2] - c * R[..., 0, 1], c * R[..., 1, 1] - s * R[..., 1, 2])
     else:
-        phi = xp.atan2(R[..., 2, 1], size(R[..., 2, 0], R[..., 2, 2]))
+        cosine = size(R[..., 2, 0], R[..., 2, 2])
+        phi = xp.atan2(R[..., 2, 1], cosine)
         theta, psi = xp.atan2(-R[..., 2, 0], R[..., 2, 2]), xp.atan2(-R[..., 0, 1], R[..., 1, 1])
-    return xp.stack([phi, theta, psi], axis=-1)
+        theta, c, s = _inner(theta, cosine, xp)
+        rest = xp.atan2(c * R[..., 1, 0] + s * R[..., 1, 2], c * R[..., 0, 0] + s * R[..., 0, 2])
+    return xp.stack([phi, theta, xp.where(cosine < _CLOSE, rest, psi)], axis=-1)
+
+
+def _inner(angle: Array, cosine: Array, xp: Any) -> tuple[Array, Array, Array]:
+    """The angle next to the body, 0 at the pole, with its cosine and sine.
+
+    Close to the pole its digits are those of two numbers near 0. What is left of the rotation when it is
+    undone gives a psi that goes with it, whatever it is.
+    """
+    angle = xp.where(cosine < _POLE, 0.0, angle)
+    return angle, xp.cos(angle), xp.sin(angle)
 
 
 def angles_from_quaternion(q: Array, *, order: str, xp: Any) -> Array:

@@ -20,6 +20,7 @@ from flowgraph.blocks.kalman.filters import (
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.kalman.roots import (
+    covariance_root,
     lower_root,
     predict_root,
     semidefinite_root,
@@ -34,6 +35,7 @@ __all__ = [
     "Held",
     "bridge",
     "find_back",
+    "covariance_root",
     "LinearModel",
     "Correction",
     "Vector",

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from flowgraph import Array, block, real, when
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.metrics.chi_square import gate_table
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
@@ -93,7 +94,7 @@ def update_linear(
         prior: mean (n) and covariance (t, t).
         measured: z (m); or absent.
         H: (m, n).
-        R: (m, m) covariance of the noise.
+        R: (m, m) covariance of the noise; (m) is its diagonal, and one number the variance of each entry.
         space: of the state, where some of it are angles: x' = x plus K r. (For quaternions:
             `update_extended`.)
         measured_space: of z, where some of it are angles: r = z minus H x.
@@ -105,12 +106,16 @@ def update_linear(
     Returns:
         The posterior, and the innovation where there was one.
 
+    Raises:
+        DeclarationError: where H or R does not fit, or R is no covariance.
+
     Source: Bar-Shalom et al. eqs. 5.2.3-9 to 5.2.3-17. (The thesis prints P' = P + K S K^T: the sign is
     minus.)
     """
     if measured is None:
         return prior, None
-    H = xp.asarray(H, dtype=prior.mean.dtype)
+    m, n = measured.shape[-1], prior.mean.shape[-1]
+    H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
     return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
 
@@ -132,7 +137,7 @@ def update_extended(
     Args:
         observe: `observe(x, xp) -> (h(x), H)`, where H (m, t) is the Jacobian of h with respect to the
             tangent vectors of `space` and `measured_space`, at x.
-        R: (m, m) covariance of the noise, in the tangent space of z.
+        R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z, of any parts.
         prior, measured, gate: as in `update_linear`.
 
@@ -196,7 +201,7 @@ def _update(
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
     residual, present = innovate(measured, predicted, measured_space, xp)
-    noise = xp.asarray(R, dtype=prior.mean.dtype)
+    noise = noise_matrix(R, residual.shape[-1], "R", kind=prior.mean.dtype, xp=xp)
     found = correct(prior.covariance, residual, H, noise, present=present, gate=gate, space=space, xp=xp)
     mean = moved(prior.mean, found.shift, space, xp)
     return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)

@@ -25,15 +25,20 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
 from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.signals import GaussianRoot, KalmanInnovation
 
 __all__ = [
+    "covariance_root",
     "lower_root",
     "predict_root",
     "semidefinite_root",
     "update_extended_root",
     "update_root",
 ]
+
+_FIRM = 1e-12
+"""The share of its diagonal from which a pivot is not made by rounding: Cholesky's signs are then sure."""
 
 
 @block
@@ -75,7 +80,8 @@ def update_root(
     """
     if measured is None:
         return prior, None
-    H = xp.asarray(H, dtype=prior.mean.dtype)
+    m, n = measured.shape[-1], prior.mean.shape[-1]
+    H = observation_matrix(H, m, n, "update_root.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
     return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
 
@@ -104,7 +110,7 @@ def _update(
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
 ) -> tuple[GaussianRoot, Any]:  # fmt: skip
     kind, m = prior.mean.dtype, H.shape[-2]
-    R = xp.asarray(R, dtype=kind)
+    R = noise_matrix(R, m, "R", kind=kind, xp=xp)
     residual, present = innovate(measured, predicted, measured_space, xp)
     H, R = masked(H, R, present, xp)
     L = prior.root
@@ -154,16 +160,31 @@ def lower_root(wide: Array, *, xp: Any) -> Array:
 def semidefinite_root(P: Array, *, xp: Any) -> Array:
     """The lower triangle L (..., n, n) with L L^T = P, for a P that may be singular, or zero.
 
-    Cholesky's factorization by outer products; a pivot below 1e-15 of the largest diagonal counts as zero.
+    Cholesky's factorization by outer products; a pivot below 1e-15 of its own diagonal counts as zero.
     """
+    return _outer_root(P, xp)[0]
+
+
+def covariance_root(P: Array, *, xp: Any) -> Array:
+    """`semidefinite_root`, which is Cholesky's own wherever P is clearly positive definite.
+
+    So a filter whose start is known in some direction goes on, and others have the digits of Cholesky.
+    """
+    root, firm = _outer_root(P, xp)
+    firm = firm[..., None, None]
+    return xp.where(firm, xp.linalg.cholesky(xp.where(firm, P, xp.eye(P.shape[-1], dtype=P.dtype))), root)
+
+
+def _outer_root(P: Array, xp: Any) -> tuple[Array, Array]:
+    """The root, and whether (...) every pivot is well above the rounding of its diagonal."""
     n = P.shape[-1]
-    one = xp.eye(n, dtype=P.dtype)
-    least = xp.max(xp.sum(P * one, axis=-1), axis=-1)[..., None] * 1e-15
-    columns = []
+    variance = xp.sum(P * xp.eye(n, dtype=P.dtype), axis=-1)
+    columns, firm = [], None
     for j in range(n):
-        pivot = P[..., j, j : j + 1]
-        solid = pivot > least
+        pivot, least = P[..., j, j : j + 1], variance[..., j : j + 1]
+        solid = (pivot > least * 1e-15) & (pivot > 0.0)
+        firm = pivot > least * _FIRM if firm is None else firm & (pivot > least * _FIRM)
         column = P[..., :, j] / xp.sqrt(xp.where(solid, pivot, 1.0)) * xp.astype(solid, P.dtype)
         columns.append(column)
         P = P - column[..., :, None] * column[..., None, :]
-    return xp.tril(xp.stack(columns, axis=-1))
+    return xp.tril(xp.stack(columns, axis=-1)), firm[..., 0] & xp.all(variance > 0.0, axis=-1)

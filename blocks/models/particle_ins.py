@@ -20,6 +20,7 @@ import numpy.typing as npt
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.roots import covariance_root
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     increment_variances,
@@ -153,7 +154,7 @@ def _mean(cloud: StateCloud, xp: Any) -> Array:
 
 def start_states(particles: int, start: Gaussian, *, seed: int = 0) -> StateCloud:
     """A cloud drawn from a Gaussian over `STATE`, equally weighted."""
-    factor = np.linalg.cholesky(np.asarray(start.covariance))
+    factor = np.asarray(covariance_root(np.asarray(start.covariance), xp=np))
     drawn = np.random.default_rng(seed).normal(size=(particles, 15)) @ factor.T
     return StateCloud(
         log_weight=np.full(particles, -math.log(particles)),

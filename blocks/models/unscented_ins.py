@@ -22,6 +22,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.roots import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -96,7 +97,7 @@ def update_camera_velocity(
     x, kind = prior.mean, prior.mean.dtype
     n, points = x.shape[-1], far_points(6)
     scale = points.scale(n + 6)
-    S = xp.linalg.cholesky(prior.covariance)
+    S = covariance_root(prior.covariance, xp=xp)
     deviations = xp.asarray(np.diag(np.repeat([velocity_noise, rate_noise], 3)), dtype=kind)
     apart, shakes = points.around(S, scale, xp), points.around(deviations, scale, xp)
     X = STATE.plus(x[None, :], xp.concat([0.0 * apart[:1], apart, 0.0 * apart[:12]], axis=0), xp)
@@ -110,7 +111,9 @@ def update_camera_velocity(
     cluster = points.cluster(seen, None, scale, xp)
     slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * scale)  # H S
     rest = points.covariance(cluster, cluster, scale) - slope @ slope.mT
-    H = xp.linalg.solve(S.mT, slope.mT).mT
+    # a direction that is known exactly has a column of zeros, and nothing to learn: any H there will do
+    known = xp.eye(n, dtype=kind) * xp.astype(S == 0.0, kind)
+    H = xp.linalg.solve((S + known).mT, slope.mT).mT
     residual = motion.velocity - cluster.mean
     found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, xp=xp)
     return moved_by(prior, found, xp)

@@ -26,7 +26,8 @@ import numpy.typing as npt
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
-from flowgraph.blocks.kalman.roots import semidefinite_root
+from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.roots import covariance_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
 from flowgraph.language.block import Limit
@@ -63,22 +64,25 @@ def predict_unscented(
         move: `move(x, control, w, dt, xp) -> x'`, on x (..., k, size) and w (..., k, n_w), a point a row; w
             is None without noise. w is white noise, integrated over the step.
         noise: (n_w, n_w) spectral density of the noise that goes through `move`.
-        Q: (t, t) spectral density of noise that is added, in the tangent space of the state.
+        Q: (t, t) spectral density of noise that is added, in the tangent space of the state; (t) is its
+            diagonal, and one number the density of each entry.
         Q_first: whether it is added before the points are drawn, as Kraft does, so that it goes through the
             model too (Kraft 2003, eqs. 33-35).
         space: of the state; without one it is a vector.
         points: the set of sigma points.
     """
     x, kind = belief.mean, belief.mean.dtype
-    added = None if Q is None else xp.asarray(Q, dtype=kind) * dt
+    t = belief.covariance.shape[-1]
+    added = None if Q is None else noise_matrix(Q, t, "predict_unscented.Q", kind=kind, xp=xp) * dt
     P = belief.covariance + added if added is not None and Q_first else belief.covariance
-    extra = 0 if noise is None else np.asarray(noise).shape[-1]
+    extra = 0 if noise is None else np.atleast_1d(np.asarray(noise)).shape[-1]
     scale = points.scale(P.shape[-1] + extra)
-    apart = points.around(xp.linalg.cholesky(P), scale, xp)
+    apart = points.around(covariance_root(P, xp=xp), scale, xp)
     w = None
     if noise is not None:
         # the root of a constant, scaled: the noise over no time has none
-        root = xp.asarray(semidefinite_root(np.asarray(noise, dtype=float), xp=np), dtype=kind)
+        density = noise_matrix(noise, extra, "predict_unscented.noise", kind=np.float64, xp=np)
+        root = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
         blown = points.around(root * xp.sqrt(xp.asarray(dt, dtype=kind)), scale, xp)
         w = xp.concat([xp.zeros((1 + apart.shape[-2], extra), dtype=kind), blown], axis=-2)
         apart = xp.concat([apart, xp.zeros((*apart.shape[:-2], 2 * extra, P.shape[-1]), dtype=kind)], axis=-2)
@@ -115,7 +119,7 @@ def update_unscented(
         prior: mean (size) and covariance (t, t).
         measured: z; or absent.
         observe: `observe(x, xp) -> h(x)`, on x (..., k, size), a point a row.
-        R: covariance of the noise, in the tangent space of z.
+        R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z; without one it is a vector.
         points: the set of sigma points.
         gate: when given, as in `update_linear`.
@@ -127,10 +131,11 @@ def update_unscented(
         return prior, None
     x, P = prior.mean, prior.covariance
     scale = points.scale(P.shape[-1])
-    apart = points.around(xp.linalg.cholesky(P), scale, xp)
+    apart = points.around(covariance_root(P, xp=xp), scale, xp)
     z = points.cluster(observe(_spread(x, apart, space, xp), xp), measured_space, scale, xp)
     residual, present = innovate(measured, z.mean, measured_space, xp)
-    outer, noise = masked(z.outer.mT, xp.asarray(R, dtype=x.dtype), present, xp)
+    noise = noise_matrix(R, residual.shape[-1], "update_unscented.R", kind=x.dtype, xp=xp)
+    outer, noise = masked(z.outer.mT, noise, present, xp)
     seen = Cluster(z.mean, outer.mT, z.centre * xp.astype(present, x.dtype)[..., None, :])
     S = points.covariance(seen, seen, scale) + noise
     C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), seen, scale)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flowgraph import UnknownNameError
-from flowgraph.blocks.geometry import euler
+from flowgraph.blocks.geometry import euler, geodesic_angle
 from flowgraph.blocks.inertial import ImuNoise
 from flowgraph.blocks.models import euler_ins as ins
 from flowgraph.blocks.models.unscented_ins import carried, far_points
@@ -232,3 +232,28 @@ def test_the_covariance_in_the_tangent_space(order):
     deviation = np.sqrt(np.diag(found.covariance))
     scale = deviation[:, None] * deviation
     np.testing.assert_allclose((np.cov(error.T) - found.covariance) / scale, 0.0, atol=0.02)
+
+
+@pytest.mark.parametrize("order", euler.ORDERS)
+@pytest.mark.parametrize("off", [0.0, 1e-15, 1e-12, 1e-9, 3e-8, 1e-7, 1e-5, 1e-3])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_close_to_the_pole_the_angles_make_the_same_rotation(order, off, sign):
+    e = some_angles(3, 3.0)
+    e[:, 1 if order == "zyx" else 0] = sign * (np.pi / 2 - off)
+    q = euler.quaternion_from_angles(e, order=order, xp=np)
+    back = euler.angles_from_quaternion(q, order=order, xp=np)
+    again = euler.quaternion_from_angles(back, order=order, xp=np)
+    assert geodesic_angle(q, again).max() < 1e-6
+
+
+@pytest.mark.parametrize(("order", "inner"), [("zyx", 0), ("zxy", 1)])
+def test_at_the_pole_the_angles_are_those_of_scipy(order, inner):
+    e = some_angles(4, 3.0)
+    e[:, 1 - inner] = np.where(np.arange(len(e)) % 2, np.pi / 2, -np.pi / 2)
+    q = euler.quaternion_from_angles(e, order=order, xp=np)
+    letters, places = SCIPY[order]
+    with pytest.warns(UserWarning, match="Gimbal lock"):
+        theirs = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_euler(letters)
+    ours = euler.angles_from_quaternion(q, order=order, xp=np)
+    np.testing.assert_allclose(np.degrees(euler.wrapped(ours[:, places] - theirs)), 0.0, atol=1e-6)
+    assert (ours[:, inner] == 0.0).all()
