@@ -53,6 +53,8 @@ def whole(file: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO]:
         OutputError: where it cannot be written; what was there before is then there still.
     """
     with writes(file):
+        if "\0" in str(file):
+            raise OSError(errno.EINVAL, "a zero byte in the name")
         place = Path(os.path.realpath(file))
         if place.exists() and not place.is_file():
             if place.is_dir():

@@ -175,18 +175,38 @@ def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
     """Write a state tree to an .npz file, exactly; the one that is there stays until the new one is whole.
 
     Raises:
-        OutputError: where the file cannot be written.
+        OutputError: where the file cannot be written; DataError: where the tree is no state, which could not
+            be read again. What the file held before is then there still.
     """
+    _check_members(tree, ("registers", "sources", "seed"), "save_state", "this is no state", "graph")
     flat: dict[str, np.ndarray] = {}
     for group, members in tree.items():
         if not isinstance(members, Mapping):
-            flat[group] = np.asarray(members)
+            flat[group] = _numbers(members, group)
             continue
         for path, part in members.items():
             leaves = part.items() if isinstance(part, Mapping) else [("", part)]
-            flat.update({f"{group}\n{path}\n{leaf}": np.asarray(a) for leaf, a in leaves})
+            flat.update({f"{group}\n{path}\n{leaf}": _numbers(a, f"{group}, {path}") for leaf, a in leaves})
     with whole(file) as out:
         np.savez(out, **flat)  # type: ignore[arg-type]
+
+
+def _numbers(value: Any, where: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+        got = array.dtype.name
+        sound = array.dtype.kind in "biuf"
+    except ValueError as error:
+        got, sound = str(error), False
+    if not sound:
+        raise DataError(
+            "a part of this state is malformed",
+            path=where,
+            expected="numbers",
+            got=got,
+            fix="save a whole run.state as it was",
+        )
+    return array
 
 
 def load_state(file: str | Path) -> dict[str, Any]:

@@ -84,11 +84,12 @@ def test_what_is_no_regular_file_is_written_to_as_it_is(tmp_path):
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
-@pytest.mark.parametrize("kind", ["folder", "no folder", "a file as folder"])
+@pytest.mark.parametrize("kind", ["folder", "no folder", "a file as folder", "a zero byte"])
 def test_where_nothing_can_be_written_the_error_is_ours(tmp_path, kind):
     (tmp_path / "file").write_text("x")
     (tmp_path / "d").mkdir()
-    place = {"folder": "d", "no folder": "x/y", "a file as folder": "file/y"}[kind]
+    places = {"folder": "d", "no folder": "x/y", "a file as folder": "file/y", "a zero byte": "x\0y"}
+    place = places[kind]
     with pytest.raises(OutputError) as caught:
         put(tmp_path / place, "text")
     assert caught.value.path == str(tmp_path / place)

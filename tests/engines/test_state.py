@@ -253,6 +253,25 @@ def test_a_checkpoint_outlives_what_is_killed_while_it_is_written_over(tmp_path)
     assert os.listdir(tmp_path) == ["state.npz"]
 
 
+@pytest.mark.parametrize(
+    ("tree", "said"),
+    [
+        (5, "this is no state"),
+        ({}, "this is no state"),
+        ({**STATE, "more": 1}, "this is no state"),
+        ({**STATE, "registers": {"x": object()}}, "a part of this state is malformed"),
+        ({**STATE, "registers": {"x": "text"}}, "a part of this state is malformed"),
+        ({**STATE, "registers": {"x": [[1.0], [1.0, 2.0]]}}, "a part of this state is malformed"),
+    ],
+)
+def test_what_could_not_be_read_again_does_not_take_the_place_of_a_state(tmp_path, tree, said):
+    file = tmp_path / "state.npz"
+    save_state(STATE, file)
+    with pytest.raises(DataError, match=said):
+        save_state(tree, file)
+    same_state(load_state(file), STATE)
+
+
 def test_a_pipe_or_a_folder_is_no_state(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for file in (tmp_path / "pipe", tmp_path, tmp_path / "none"):
