@@ -43,6 +43,9 @@ MEANS = ("markley", "kraft")
 LEAST_ALPHA = 0.1
 """In single precision or fixed point."""
 
+FARTHEST = 0.9 * math.pi
+"""How far an angle or a rotation is taken from the centre, rad: half a turn is the same either way round."""
+
 _SQUARINGS, _STEPS = 6, 8
 
 
@@ -56,6 +59,17 @@ class Cluster(NamedTuple):
     mean: Array
     outer: Array
     centre: Array
+
+
+class Reach(NamedTuple):
+    """How far the outer points lie where the covariance decides it: s and W = 1/(2 s^2), each (..., 1, 1)."""
+
+    scale: Array
+    weight: Array
+
+
+def _weight(scale: float | Reach) -> Any:
+    return scale.weight if isinstance(scale, Reach) else 0.5 / scale**2
 
 
 @dataclass(frozen=True)
@@ -127,16 +141,33 @@ class SigmaPoints:
             ),
         )
 
-    def around(self, root: Array, scale: float, xp: Any) -> Array:
+    def reach(self, root: Array, scale: float, space: StateSpace | None, xp: Any) -> float | Reach:
+        """The scale, or as much less as keeps every point of `space` within 0.9 of half a turn.
+
+        A point beyond half a turn comes back from the other side, and an unknown heading would be taken for a
+        known one. Nearer points of larger weight have the same covariance.
+        """
+        turns = [p.turn(root[..., on, :], xp) for p, _, on in space.places()] if space is not None else []
+        sizes = [xp.max(turn, axis=(-2, -1), keepdims=True) for turn in turns if turn is not None]
+        if not sizes:
+            return scale
+        most = sizes[0]
+        for size in sizes[1:]:
+            most = xp.maximum(most, size)
+        far = most * scale > FARTHEST
+        near = FARTHEST / xp.where(far, most, 1.0)
+        return Reach(xp.where(far, near, scale), xp.where(far, 0.5 / (near * near), 0.5 / scale**2))
+
+    def around(self, root: Array, scale: float | Reach, xp: Any) -> Array:
         """The outer points (..., 2 n, t), as tangent vectors: s times the columns of root (..., t, n), both
         ways."""
-        columns = root.mT * scale
+        columns = root.mT * (scale.scale if isinstance(scale, Reach) else scale)
         return xp.concat([columns, -columns], axis=-2)
 
-    def cluster(self, images: Array, space: StateSpace | None, scale: float, xp: Any) -> Cluster:
+    def cluster(self, images: Array, space: StateSpace | None, scale: float | Reach, xp: Any) -> Cluster:
         """The mean of images (..., 1 + 2 n, size), the first of them central, and how they lie about it."""
         first, others = images[..., :1, :], images[..., 1:, :]
-        weight = 0.5 / scale**2
+        weight = _weight(scale)
         if space is None or not any(part.curved for part in space.parts):
             apart = others - first if space is None else space.minus(others, first, xp)
             shift = xp.sum(apart, axis=-2, keepdims=True) * weight
@@ -154,9 +185,9 @@ class SigmaPoints:
         centre = seen[..., :1, :]
         return Cluster(mean[..., 0, :], seen[..., 1:, :] - centre, centre)
 
-    def covariance(self, a: Cluster, b: Cluster, scale: float) -> Array:
+    def covariance(self, a: Cluster, b: Cluster, scale: float | Reach) -> Array:
         """The covariance (..., t_a, t_b) of two clusters of the same points."""
-        outer = a.outer.mT @ b.outer * (0.5 / scale**2)
+        outer = a.outer.mT @ b.outer * _weight(scale)
         return outer + a.centre.mT @ b.centre * (self.beta - self.alpha**2)
 
 
@@ -164,7 +195,7 @@ GAUSSIAN = SigmaPoints()
 """What is taken where no set is named: alpha = 1, beta = 2, kappa = 0."""
 
 
-def mean_turn(turns: Array, weight: float, method: str, xp: Any) -> Array:
+def mean_turn(turns: Array, weight: float | Array, method: str, xp: Any) -> Array:
     """The turn (..., 1, 3) from a central attitude to the mean of it and others; rotation vectors, rad.
 
     "markley": the unit quaternion that minimises the weighted squared chordal distance to all, which is the
