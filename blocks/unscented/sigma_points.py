@@ -205,9 +205,9 @@ def mean_turn(turns: Array, weight: float | Array, method: str, xp: Any) -> Arra
         M = [1 - W sum |v|^2   W sum w v^T]
             [W sum w v         W sum v v^T]
 
-    M is squared six times, which is 64 steps of the power method from the centre. What remains of the other
-    eigenvectors is a share of (l_2/l_1)^64: below 1e-15 rad for attitudes that spread by less than 1 rad
-    about each axis.
+    M is squared six times, which is 64 steps of the power method from the centre, and where other
+    eigenvectors remain another six times, which makes 4096. Where the centre has a negative weight and the
+    others lie so far out that M is no more about it, the mean is that of the rotation vectors.
 
     "kraft": the attitude at which the weighted rotation vectors to all add up to zero, by 8 steps of gradient
     descent from the centre, m <- m * Exp(sum W_i Log(m^-1 q_i)). What remains is below 1e-11 rad for
@@ -237,6 +237,31 @@ def mean_turn(turns: Array, weight: float | Array, method: str, xp: Any) -> Arra
     M = 2.0 * M  # its trace is 2: the largest eigenvalue is at least 1/2, and no power of it vanishes
     for _ in range(_SQUARINGS):
         M = M @ M
-    column = M[..., :, :1].mT
-    size = xp.sqrt(xp.linalg.vecdot(column, column))[..., None]
-    return to_rotation_vector(column / size, xp=xp)
+    mean = to_rotation_vector(_dominant(M, xp), xp=xp)
+    if isinstance(weight, float) and weight * turns.shape[-2] < 1.0 + 1e-9:
+        return mean  # the centre's weight is not negative
+    rest = both[..., 1:, :]
+    lost = xp.sqrt(xp.sum(rest * rest, axis=(-2, -1), keepdims=True)) > ahead
+    return xp.where(lost, xp.sum(turns, axis=-2, keepdims=True) * weight, mean)
+
+
+def _dominant(M: Array, xp: Any) -> Array:
+    """The unit eigenvector (..., 1, 4) of a high power M (..., 4, 4), taken further where others remain.
+
+    It is M's first column, or where that is small the one with the largest diagonal.
+    """
+    one = xp.eye(4, dtype=M.dtype)
+    trace = lambda A: xp.sum(A * one, axis=(-2, -1), keepdims=True)
+    N = M / trace(M)
+    loose = xp.sum(N * N, axis=(-2, -1), keepdims=True) < 1.0 - 1e-12  # 1 where one eigenvalue is left
+    N = 2.0 * N
+    for _ in range(_SQUARINGS):
+        N = N @ N
+    M = xp.where(loose, N, M)
+    column, most = M[..., :, :1].mT, M[..., :1, :1]
+    enough = most > 0.01 * trace(M)
+    for k in range(1, 4):
+        size = M[..., k : k + 1, k : k + 1]
+        larger = ~enough & (size > most)
+        column, most = xp.where(larger, M[..., :, k : k + 1].mT, column), xp.where(larger, size, most)
+    return column / xp.sqrt(xp.linalg.vecdot(column, column))[..., None]
