@@ -29,6 +29,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, to_rotation_vector
@@ -254,10 +256,11 @@ def _dominant(M: Array, xp: Any) -> Array:
     trace = lambda A: xp.sum(A * one, axis=(-2, -1), keepdims=True)
     N = M / trace(M)
     loose = xp.sum(N * N, axis=(-2, -1), keepdims=True) < 1.0 - 1e-12  # 1 where one eigenvalue is left
-    N = 2.0 * N
-    for _ in range(_SQUARINGS):
-        N = N @ N
-    M = xp.where(loose, N, M)
+    if not isinstance(M, np.ndarray) or loose.any():  # of arrays, only where it will be taken
+        N = 2.0 * N
+        for _ in range(_SQUARINGS):
+            N = N @ N
+        M = xp.where(loose, N, M)
     column, most = M[..., :, :1].mT, M[..., :1, :1]
     enough = most > 0.01 * trace(M)
     for k in range(1, 4):
