@@ -22,7 +22,7 @@ def still(x: Any, u: Any, w: Any, dt: Any, xp: Any) -> Any:
     return x
 
 
-def predict(mean: Any, P: Any, space: StateSpace, move: Any = still, **settings: Any) -> Gaussian:
+def predict(mean: Any, P: Any, space: StateSpace | None, move: Any = still, **settings: Any) -> Gaussian:
     return predict_unscented.step(
         Gaussian(np.asarray(mean, dtype=float), np.asarray(P, dtype=float)),
         None, move=move, space=space, dt=0.0, xp=np, **settings,
