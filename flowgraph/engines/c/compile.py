@@ -74,7 +74,7 @@ def _command() -> list[str]:
             got=f"no {wanted}",
             fix='install gcc or clang, or use engine="xla" or "python"',
         )
-    return [found, *words[1:]]
+    return [os.path.abspath(found), *words[1:]]  # it is started in other folders than this one
 
 
 def cache_folder() -> Path | None:

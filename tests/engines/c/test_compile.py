@@ -90,11 +90,19 @@ def test_the_name_is_of_the_text_the_flags_and_the_compiler(cache, tmp_path, mon
 )
 def test_a_compiler_that_fails_is_our_error_and_leaves_nothing(cache, tmp_path, monkeypatch, text, said):
     monkeypatch.setenv("CC", program(tmp_path, f'test "$1" = --version && exit 0\n{text}'))
+    monkeypatch.chdir(tmp_path)  # where it is asked about itself
     with pytest.raises(CompileError) as caught:
         load(TEXT)
     assert said in str(caught.value)
     assert caught.value.fix
     assert list(cache.iterdir()) == []
+
+
+def test_a_compiler_may_be_named_from_the_folder_one_is_in(cache, tmp_path, monkeypatch):
+    program(tmp_path, 'exec cc "$@"')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CC", "./cc")
+    assert load(TEXT).f() == 3
 
 
 def test_a_compiler_that_cannot_be_started_or_is_not_there(cache, tmp_path, monkeypatch):
