@@ -638,3 +638,13 @@ def test_the_unit_of_a_latitude_that_nobody_says_is_said(tmp_path, unit):
     said = [n for n in load_flight(f"csv:{tmp_path / 'gps.csv'}", settings=given).notes if "is in rad" in n]
     assert len(said) == (0 if unit else 2)
     assert unit or said[0] == "assumed: gps.latitude is in rad; gps.latitude.unit says it"
+
+
+@pytest.mark.parametrize(
+    ("start", "step", "said"), [(0, 1, True), (1, 1, True), (0, 2, False), (7, 1, False)]
+)
+def test_poses_by_their_index_are_said(tmp_path, start, step, said):
+    lines = [f"{start + step * k} {k / 100} 0 0 0 0 0 1" for k in range(20)]
+    (tmp_path / "a.tum").write_text("\n".join(lines) + "\n")
+    notes = load_flight(f"tum:{tmp_path / 'a.tum'}").notes
+    assert any("as an index of rows is" in n for n in notes) == said
