@@ -110,8 +110,8 @@ def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, m
 
     The first `patience` refusals in a row change nothing: they may be outliers. From then on each makes the
     deviations of the first `moving` numbers, those of the motion, four times as large and keeps their
-    correlations, while biases keep what they know. The covariance so grows until a measurement passes, and the motion is then that which
-    was measured. A measurement that passes ends the run.
+    correlations, while biases keep what they know. The covariance so grows until a measurement passes, and
+    the motion is then that which was measured. A measurement that passes ends the run.
 
     Args:
         posterior: any belief with a `covariance`, after the correction.
