@@ -30,7 +30,7 @@ from flowgraph.blocks.models.euler_ins import (
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.tuning import given
@@ -93,6 +93,7 @@ def for_flight(
     velocity_noise: Positive = 0.1,
     rate_noise: Positive | None = None,
     gated: Gated,
+    control: HeldControl,
     scored: Scored,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
@@ -127,6 +128,6 @@ def for_flight(
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         order=order,
-        held=factors.held(on, on.inputs["imu"]),
+        held=control.held(on, on.inputs["imu"]),
         **gated.gating(),
     )

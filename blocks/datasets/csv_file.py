@@ -185,6 +185,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             columns[name] = values
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
+        if len(kept) < len(time):
+            less = f"{stream}: {len(time) - len(kept)} of {len(time)} rows of {file.name} hold nothing of it"
+            made.notes.append(note("skipped", less))
         made.add(
             stream,
             str(file),
@@ -409,6 +412,8 @@ def _converted(
     if field == "matrix":
         return "attitude", from_matrices(values, sheet.where, by_rows=unit == "rows")
     said = _units(sheet, given, key, places, units, notes)
+    if field in ("latitude", "longitude") and not said and key not in given:
+        notes.append(note("assumed", f"{stream}.{field} is in {unit}; {key} says it"))
     if field != "angles":
         values = values * units[said or unit]
         return field, values[:, 0] if width == 1 else values

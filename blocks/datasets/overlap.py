@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flowgraph.blocks.datasets.stamps import lasting, stretch
+from flowgraph.data.joint import doubtful_span
 from flowgraph.data.notes import note
 from flowgraph.data.series import Series
 from flowgraph.errors import DataError
@@ -67,7 +68,10 @@ def check_overlap(
             )
         share = max(inside / len(b), around / len(a))
         length = max(int(a[-1]) - int(a[0]), int(b[-1]) - int(b[0]))
-        if share < _PART:
+        doubtful = doubtful_span(name, b, one, a)
+        if doubtful and share >= _PART:
+            said += doubtful
+        elif share < _PART:
             said.append(
                 note("warning", f"{name}: only {inside} of {len(b)} samples lie within the span of the {one}")
             )

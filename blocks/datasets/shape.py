@@ -301,6 +301,15 @@ class Recording:
                 fix=self.clock or "check the stamps of the recording",
             )
             if said is None:
+                if (
+                    not inertial
+                    and len(time) >= 10
+                    and (np.diff(time) == 10**9).all()
+                    and time[0] in (0, 10**9)
+                ):
+                    first = ", ".join(str(k // 10**9) for k in time[:3].tolist())
+                    sentence = f"{name}: its stamps are {first}, ... s, as an index of rows is"
+                    self.notes.append(note("warning", f"{sentence}: check the column of the time"))
                 return time, rows
             self.notes.append(note("skipped", f"{name}: {said}: left out"))
             time, rows = time[part], rows[part]

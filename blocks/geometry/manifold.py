@@ -59,6 +59,10 @@ class Part(abc.ABC):
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         """The vector (..., tangent) that moves b to a."""
 
+    def turn(self, d: Array, xp: Any) -> Array | None:
+        """How far tangent vectors, the columns of d (..., tangent, n), turn, in rad; None: not at all."""
+        return None
+
 
 class _Euclidean(Part):
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
@@ -75,6 +79,9 @@ class _Angle(Part):
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         return _wrapped(a - b, xp)
 
+    def turn(self, d: Array, xp: Any) -> Array:
+        return xp.abs(d)
+
 
 class _Quaternion(Part):
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
@@ -82,6 +89,9 @@ class _Quaternion(Part):
 
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         return to_rotation_vector(multiply(conjugate(b, xp=xp), a, xp=xp), xp=xp)
+
+    def turn(self, d: Array, xp: Any) -> Array:
+        return xp.sqrt(xp.sum(d * d, axis=-2, keepdims=True))
 
 
 def _wrapped(x: Array, xp: Any) -> Array:

@@ -19,6 +19,7 @@ from flowgraph.blocks.kalman.filters import (
 )
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.roots import (
     covariance_root,
     lower_root,
@@ -31,6 +32,8 @@ from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "noise_matrix",
+    "observation_matrix",
     "PATIENCE",
     "Held",
     "bridge",

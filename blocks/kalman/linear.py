@@ -1,7 +1,9 @@
 """Linear motion in continuous time, and its exact discretisation over any step.
 
 Filters that are fired by events step over whatever time has passed; so a model is kept in continuous time and
-made discrete for each step, as a polynomial in dt whose coefficients are constants of the graph.
+made discrete for each step, as a polynomial in dt whose coefficients are constants of the graph. Where no
+power of A vanishes the polynomial is taken over a part of the step that is short enough for it, and doubled
+until it is the whole: the scaling and squaring of the matrix exponential.
 
 Source: C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23(3), 1978; Y.
 Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, secs. 4.2
@@ -21,15 +23,24 @@ from flowgraph.errors import DeclarationError
 
 __all__ = ["LinearModel"]
 
+_PART, _LONGEST = 0.25, 3600.0
+"""How long a part may be for the sums to be exact, in units of 1/|A|; the longest step, in seconds."""
+
 
 class LinearModel:
     """dx = (A x + B u) dt + dw with E[dw dw^T] = D dt, and u held over a step. Immutable.
 
-    Over dt, with the sums cut off at `order` powers of A (exact where A^(order + 1) = 0, as for positions,
-    velocities and accelerations):
+    Over dt:
 
         F = sum A^k dt^k / k!        G = sum A^k B dt^(k+1) / (k+1)!
         Q = sum A^j D (A^k)^T dt^(j+k+1) / (j! k! (j+k+1))
+
+    These end where a power of A vanishes, as for positions, velocities and accelerations. For any other A
+    they are cut off at `order` powers and taken over h = dt / 2^s with |A| h at most 1/4, and then s times
+
+        F(2h) = F F        G(2h) = F G + G        Q(2h) = F Q F^T + Q
+
+    which is exact to the rounding for steps of up to an hour.
 
     Args:
         A: (n, n), 1/s.
@@ -41,7 +52,9 @@ class LinearModel:
         DeclarationError: where the shapes do not fit together.
     """
 
-    def __init__(self, A: npt.ArrayLike, B: npt.ArrayLike, density: npt.ArrayLike, *, order: int = 6) -> None:
+    def __init__(
+        self, A: npt.ArrayLike, B: npt.ArrayLike, density: npt.ArrayLike, *, order: int = 12
+    ) -> None:
         A, B, D = (np.array(x, dtype=float) for x in (A, B, density))
         n = len(A)
         if A.shape != (n, n) or D.shape != (n, n) or B.ndim != 2 or len(B) != n:
@@ -59,22 +72,45 @@ class LinearModel:
         power = [p / math.factorial(k) for k, p in enumerate(power) if p.any()]
         self._F = dict(enumerate(power))
         self._G = {k + 1: p @ B / (k + 1) for k, p in enumerate(power)}
+        self._doublings = 0
+        endless = len(power) > order  # no power of A vanished
+        if endless:
+            self._norm = float(np.linalg.norm(A, 2))
+            self._doublings = max(math.ceil(math.log2(self._norm * _LONGEST / _PART)), 0)
         self._Q = {k: np.zeros((n, n)) for k in range(1, 2 * len(power))}
         for j, left in enumerate(power):
             for k, right in enumerate(power):
                 self._Q[j + k + 1] += left @ D @ right.T / (j + k + 1)
+        if endless:
+            self._Q = {k: matrix for k, matrix in self._Q.items() if k <= order + 1}
         for matrix in (*self._F.values(), *self._G.values(), *self._Q.values()):
             matrix.flags.writeable = False
 
     def discrete(self, dt: Any, xp: Any, kind: Any) -> tuple[Array, Array, Array]:
         """(F, G, Q) over dt seconds, in the precision `kind`; for dt (k, 1, 1) a stack of each."""
-        F, G, Q = (_polynomial(p, dt, xp, kind) for p in (self._F, self._G, self._Q))
-        return F, G, Q
+        if not self._doublings:
+            F, G, Q = (_polynomial(p, dt, xp, kind) for p in (self._F, self._G, self._Q))
+            return F, G, Q
+        dt = xp.asarray(dt, dtype=kind)
+        goes = [dt * self._norm > _PART * 2.0**s for s in range(self._doublings)]
+        part = dt
+        for go in goes:
+            part = xp.where(go, 0.5 * part, part)
+        one = xp.eye(self.size, dtype=kind)
+        # F - I is doubled, not F: over a short part F is so close to I that its digits would be lost
+        E = _polynomial({k: p for k, p in self._F.items() if k}, part, xp, kind)
+        G, Q = (_polynomial(p, part, xp, kind) for p in (self._G, self._Q))
+        for go in goes:
+            F = E + one
+            G = xp.where(go, F @ G + G, G)
+            Q = xp.where(go, F @ Q @ F.mT + Q, Q)
+            E = xp.where(go, E @ E + 2.0 * E, E)
+        return E + one, G, Q
 
     def transitions(self, time: np.ndarray) -> np.ndarray:
         """F (k - 1, n, n) from each of the times (k,) int64 ns to the next, as the smoothers ask for it."""
         dt = np.diff(time)[:, None, None] * 1e-9
-        return np.asarray(_polynomial(self._F, dt, np, np.float64) + np.zeros_like(dt))
+        return np.asarray(self.discrete(dt, np, np.float64)[0] + np.zeros_like(dt))
 
 
 def _polynomial(terms: dict[int, np.ndarray], dt: Any, xp: Any, kind: Any) -> Array:

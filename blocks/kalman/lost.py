@@ -108,10 +108,10 @@ def _fresh(*_: Any, **__: Any) -> Any:
 def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, moving: int, xp: Any):  # type: ignore[no-untyped-def]
     """Doubt a belief whose gate refuses one measurement after the other.
 
-    The first `patience` refusals in a row change nothing: they may be outliers. From then on each doubles the
-    deviations of the first `moving` numbers, those of the motion, and keeps their correlations, while biases
-    keep what they know. The covariance so grows until a measurement passes, and the motion is then that which
-    was measured. A measurement that passes ends the run.
+    The first `patience` refusals in a row change nothing: they may be outliers. From then on each makes the
+    deviations of the first `moving` numbers, those of the motion, four times as large and keeps their
+    correlations, while biases keep what they know. The covariance so grows until a measurement passes, and
+    the motion is then that which was measured. A measurement that passes ends the run.
 
     Args:
         posterior: any belief with a `covariance`, after the correction.
@@ -129,7 +129,7 @@ def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, m
     lost = xp.astype(count > float(patience), P.dtype)
     moved = np.zeros(P.shape[-1])
     moved[:moving] = 1.0
-    scale = 1.0 + xp.asarray(moved, dtype=P.dtype) * lost
+    scale = 1.0 + 3.0 * xp.asarray(moved, dtype=P.dtype) * lost
     return count, _with(posterior, P * scale[..., :, None] * scale[..., None, :])
 
 

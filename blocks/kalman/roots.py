@@ -170,6 +170,14 @@ def covariance_root(P: Array, *, xp: Any) -> Array:
 
     So a filter whose start is known in some direction goes on, and others have the digits of Cholesky.
     """
+    if isinstance(P, np.ndarray):  # the same root, without computing what will not be taken
+        try:
+            root = np.linalg.cholesky(P)
+        except np.linalg.LinAlgError:
+            root = np.zeros_like(P)
+        pivots, variances = (np.diagonal(x, axis1=-2, axis2=-1) for x in (root, P))
+        if (pivots * pivots > 2.0 * _FIRM * variances).all():
+            return root
     root, firm = _outer_root(P, xp)
     firm = firm[..., None, None]
     return xp.where(firm, xp.linalg.cholesky(xp.where(firm, P, xp.eye(P.shape[-1], dtype=P.dtype))), root)
@@ -179,11 +187,11 @@ def _outer_root(P: Array, xp: Any) -> tuple[Array, Array]:
     """The root, and whether (...) every pivot is well above the rounding of its diagonal."""
     n = P.shape[-1]
     variance = xp.sum(P * xp.eye(n, dtype=P.dtype), axis=-1)
-    columns, firm = [], None
+    columns, firm = [], variance[..., :1] > 0.0
     for j in range(n):
         pivot, least = P[..., j, j : j + 1], variance[..., j : j + 1]
         solid = (pivot > least * 1e-15) & (pivot > 0.0)
-        firm = pivot > least * _FIRM if firm is None else firm & (pivot > least * _FIRM)
+        firm = firm & (pivot > least * _FIRM)
         column = P[..., :, j] / xp.sqrt(xp.where(solid, pivot, 1.0)) * xp.astype(solid, P.dtype)
         columns.append(column)
         P = P - column[..., :, None] * column[..., None, :]

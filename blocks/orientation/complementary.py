@@ -89,11 +89,14 @@ def level_near(attitude: Attitude, force: WorldForce, *, xp: Any) -> Attitude:
     """The attitude nearest to `attitude` in which `force`, which it carried to the world, points up.
 
     The smallest rotation that takes the direction of `force` to +z, after `attitude`: it is about a
-    horizontal axis, so the heading stays that of `attitude`. Fires when its inputs do.
+    horizontal axis, so the heading stays that of `attitude`. A force of zero, as a sensor gives that has not
+    started, points nowhere: `attitude` stays. Fires when its inputs do.
     """
     q = attitude.attitude
     in_body = rotate(conjugate(q, xp=xp), force.force, xp=xp)
-    return Attitude(attitude=level(q, in_body, xp=xp))
+    points = (xp.linalg.vecdot(in_body, in_body) > 0.0)[..., None]
+    up = xp.where(points, in_body, xp.asarray([0.0, 0.0, 1.0]))
+    return Attitude(attitude=xp.where(points, level(q, up, xp=xp), q))
 
 
 @block

@@ -96,6 +96,17 @@ class OnFlight:
             self.note("skipped", f"{stream}: {row} readings before the first that shows where up is")
         return np.asarray(readings[row])
 
+    def usual_step(self, control: Series) -> float | None:
+        """The median step of a control in s; None where none of its steps is a gap. Gaps are a note."""
+        steps = np.diff(control.time) * 1e-9
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        wide = steps[steps > GAP * usual]
+        if not len(wide):
+            return None
+        many = "a gap of" if len(wide) == 1 else f"{len(wide)} gaps, the longest of"
+        self.note("bridged", f"{control.name}: {many} {wide.max():.3g} s (median step {usual:.3g} s)")
+        return usual
+
     def noise(self, name: str, setting: float | None, otherwise: float | None = None) -> float:
         """A standard deviation or density: `noise_of` of the graph."""
         return noise_of(self.name, self.flight, name, setting, otherwise)
@@ -118,6 +129,8 @@ class OnFlight:
             sizes, settings: as for `build`.
         """
         inputs = dict(self.inputs if inputs is None else inputs)
+        if "imu" in inputs:
+            self.usual_step(inputs["imu"])
         built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
         return Case(
             built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
@@ -254,21 +267,12 @@ class HeldControl(Settings):
 
         A gap is a note of the case.
         """
-        steps = np.diff(control.time) * 1e-9
-        if not len(steps):
-            return None
-        usual = float(np.median(steps))
-        wide = steps[steps > GAP * usual]
-        if not len(wide):
-            return None
-        many = "a gap of" if len(wide) == 1 else f"{len(wide)} gaps, the longest of"
-        many = f"{many} {wide.max():.3g} s"
-        on.note("bridged", f"{control.name}: {many} (median step {usual:.3g} s)")
-        return Held(after=GAP * usual) if self.held_noise == "grow" else None
+        usual = on.usual_step(control)
+        return None if usual is None or self.held_noise == "keep" else Held(after=GAP * usual)
 
 
 @dataclass(frozen=True)
-class Factors(HeldControl):
+class Factors(Settings):
     """How far the densities of an IMU are believed.
 
     Args:
@@ -318,7 +322,7 @@ class PoseAided(Factors, PoseNoises, Scored):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, Gated, Started):
+class PoseFilter(PoseAided, HeldControl, Gated, Started):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 

@@ -76,15 +76,17 @@ def predict_unscented(
     added = None if Q is None else noise_matrix(Q, t, "predict_unscented.Q", kind=kind, xp=xp) * dt
     P = belief.covariance + added if added is not None and Q_first else belief.covariance
     extra = 0 if noise is None else np.atleast_1d(np.asarray(noise)).shape[-1]
-    scale = points.scale(P.shape[-1] + extra)
-    apart = points.around(covariance_root(P, xp=xp), scale, xp)
+    root = covariance_root(P, xp=xp)
+    scale = points.reach(root, points.scale(t + extra), space, xp)
+    apart = points.around(root, scale, xp)
     w = None
     if noise is not None:
         # the root of a constant, scaled: the noise over no time has none
         density = noise_matrix(noise, extra, "predict_unscented.noise", kind=np.float64, xp=np)
-        root = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
-        blown = points.around(root * xp.sqrt(xp.asarray(dt, dtype=kind)), scale, xp)
-        w = xp.concat([xp.zeros((1 + apart.shape[-2], extra), dtype=kind), blown], axis=-2)
+        shaken = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
+        blown = points.around(shaken * xp.sqrt(xp.asarray(dt, dtype=kind)), scale, xp)
+        w = xp.zeros((*blown.shape[:-2], 1 + apart.shape[-2], extra), dtype=kind)
+        w = xp.concat([w, blown], axis=-2)
         apart = xp.concat([apart, xp.zeros((*apart.shape[:-2], 2 * extra, P.shape[-1]), dtype=kind)], axis=-2)
     images = move(_spread(x, apart, space, xp), control, w, dt, xp)
     cluster = points.cluster(images, space, scale, xp)
@@ -130,8 +132,9 @@ def update_unscented(
     if measured is None:
         return prior, None
     x, P = prior.mean, prior.covariance
-    scale = points.scale(P.shape[-1])
-    apart = points.around(covariance_root(P, xp=xp), scale, xp)
+    root = covariance_root(P, xp=xp)
+    scale = points.reach(root, points.scale(P.shape[-1]), space, xp)
+    apart = points.around(root, scale, xp)
     z = points.cluster(observe(_spread(x, apart, space, xp), xp), measured_space, scale, xp)
     residual, present = innovate(measured, z.mean, measured_space, xp)
     noise = noise_matrix(R, residual.shape[-1], "update_unscented.R", kind=x.dtype, xp=xp)

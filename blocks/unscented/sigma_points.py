@@ -29,6 +29,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, to_rotation_vector
@@ -43,6 +45,9 @@ MEANS = ("markley", "kraft")
 LEAST_ALPHA = 0.1
 """In single precision or fixed point."""
 
+FARTHEST = 0.9 * math.pi
+"""How far an angle or a rotation is taken from the centre, rad: half a turn is the same either way round."""
+
 _SQUARINGS, _STEPS = 6, 8
 
 
@@ -56,6 +61,17 @@ class Cluster(NamedTuple):
     mean: Array
     outer: Array
     centre: Array
+
+
+class Reach(NamedTuple):
+    """How far the outer points lie where the covariance decides it: s and W = 1/(2 s^2), each (..., 1, 1)."""
+
+    scale: Array
+    weight: Array
+
+
+def _weight(scale: float | Reach) -> Any:
+    return scale.weight if isinstance(scale, Reach) else 0.5 / scale**2
 
 
 @dataclass(frozen=True)
@@ -127,16 +143,33 @@ class SigmaPoints:
             ),
         )
 
-    def around(self, root: Array, scale: float, xp: Any) -> Array:
+    def reach(self, root: Array, scale: float, space: StateSpace | None, xp: Any) -> float | Reach:
+        """The scale, or as much less as keeps every point of `space` within 0.9 of half a turn.
+
+        A point beyond half a turn comes back from the other side, and an unknown heading would be taken for a
+        known one. Nearer points of larger weight have the same covariance.
+        """
+        turns = [p.turn(root[..., on, :], xp) for p, _, on in space.places()] if space is not None else []
+        sizes = [xp.max(turn, axis=(-2, -1), keepdims=True) for turn in turns if turn is not None]
+        if not sizes:
+            return scale
+        most = sizes[0]
+        for size in sizes[1:]:
+            most = xp.maximum(most, size)
+        far = most * scale > FARTHEST
+        near = FARTHEST / xp.where(far, most, 1.0)
+        return Reach(xp.where(far, near, scale), xp.where(far, 0.5 / (near * near), 0.5 / scale**2))
+
+    def around(self, root: Array, scale: float | Reach, xp: Any) -> Array:
         """The outer points (..., 2 n, t), as tangent vectors: s times the columns of root (..., t, n), both
         ways."""
-        columns = root.mT * scale
+        columns = root.mT * (scale.scale if isinstance(scale, Reach) else scale)
         return xp.concat([columns, -columns], axis=-2)
 
-    def cluster(self, images: Array, space: StateSpace | None, scale: float, xp: Any) -> Cluster:
+    def cluster(self, images: Array, space: StateSpace | None, scale: float | Reach, xp: Any) -> Cluster:
         """The mean of images (..., 1 + 2 n, size), the first of them central, and how they lie about it."""
         first, others = images[..., :1, :], images[..., 1:, :]
-        weight = 0.5 / scale**2
+        weight = _weight(scale)
         if space is None or not any(part.curved for part in space.parts):
             apart = others - first if space is None else space.minus(others, first, xp)
             shift = xp.sum(apart, axis=-2, keepdims=True) * weight
@@ -154,9 +187,9 @@ class SigmaPoints:
         centre = seen[..., :1, :]
         return Cluster(mean[..., 0, :], seen[..., 1:, :] - centre, centre)
 
-    def covariance(self, a: Cluster, b: Cluster, scale: float) -> Array:
+    def covariance(self, a: Cluster, b: Cluster, scale: float | Reach) -> Array:
         """The covariance (..., t_a, t_b) of two clusters of the same points."""
-        outer = a.outer.mT @ b.outer * (0.5 / scale**2)
+        outer = a.outer.mT @ b.outer * _weight(scale)
         return outer + a.centre.mT @ b.centre * (self.beta - self.alpha**2)
 
 
@@ -164,7 +197,7 @@ GAUSSIAN = SigmaPoints()
 """What is taken where no set is named: alpha = 1, beta = 2, kappa = 0."""
 
 
-def mean_turn(turns: Array, weight: float, method: str, xp: Any) -> Array:
+def mean_turn(turns: Array, weight: float | Array, method: str, xp: Any) -> Array:
     """The turn (..., 1, 3) from a central attitude to the mean of it and others; rotation vectors, rad.
 
     "markley": the unit quaternion that minimises the weighted squared chordal distance to all, which is the
@@ -174,9 +207,9 @@ def mean_turn(turns: Array, weight: float, method: str, xp: Any) -> Array:
         M = [1 - W sum |v|^2   W sum w v^T]
             [W sum w v         W sum v v^T]
 
-    M is squared six times, which is 64 steps of the power method from the centre. What remains of the other
-    eigenvectors is a share of (l_2/l_1)^64: below 1e-15 rad for attitudes that spread by less than 1 rad
-    about each axis.
+    M is squared six times, which is 64 steps of the power method from the centre, and where other
+    eigenvectors remain another six times, which makes 4096. Where the centre has a negative weight and the
+    others lie so far out that M is no more about it, the mean is that of the rotation vectors.
 
     "kraft": the attitude at which the weighted rotation vectors to all add up to zero, by 8 steps of gradient
     descent from the centre, m <- m * Exp(sum W_i Log(m^-1 q_i)). What remains is below 1e-11 rad for
@@ -206,6 +239,32 @@ def mean_turn(turns: Array, weight: float, method: str, xp: Any) -> Array:
     M = 2.0 * M  # its trace is 2: the largest eigenvalue is at least 1/2, and no power of it vanishes
     for _ in range(_SQUARINGS):
         M = M @ M
-    column = M[..., :, :1].mT
-    size = xp.sqrt(xp.linalg.vecdot(column, column))[..., None]
-    return to_rotation_vector(column / size, xp=xp)
+    mean = to_rotation_vector(_dominant(M, xp), xp=xp)
+    if isinstance(weight, float) and weight * turns.shape[-2] < 1.0 + 1e-9:
+        return mean  # the centre's weight is not negative
+    rest = both[..., 1:, :]
+    lost = xp.sqrt(xp.sum(rest * rest, axis=(-2, -1), keepdims=True)) > ahead
+    return xp.where(lost, xp.sum(turns, axis=-2, keepdims=True) * weight, mean)
+
+
+def _dominant(M: Array, xp: Any) -> Array:
+    """The unit eigenvector (..., 1, 4) of a high power M (..., 4, 4), taken further where others remain.
+
+    It is M's first column, or where that is small the one with the largest diagonal.
+    """
+    one = xp.eye(4, dtype=M.dtype)
+    trace = lambda A: xp.sum(A * one, axis=(-2, -1), keepdims=True)
+    N = M / trace(M)
+    loose = xp.sum(N * N, axis=(-2, -1), keepdims=True) < 1.0 - 1e-12  # 1 where one eigenvalue is left
+    if not isinstance(M, np.ndarray) or loose.any():  # of arrays, only where it will be taken
+        N = 2.0 * N
+        for _ in range(_SQUARINGS):
+            N = N @ N
+        M = xp.where(loose, N, M)
+    column, most = M[..., :, :1].mT, M[..., :1, :1]
+    enough = most > 0.01 * trace(M)
+    for k in range(1, 4):
+        size = M[..., k : k + 1, k : k + 1]
+        larger = ~enough & (size > most)
+        column, most = xp.where(larger, M[..., :, k : k + 1].mT, column), xp.where(larger, size, most)
+    return column / xp.sqrt(xp.linalg.vecdot(column, column))[..., None]

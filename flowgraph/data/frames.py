@@ -39,9 +39,15 @@ def stamps_of(frame: Any, time: str | None, unit: str | None, name: str) -> np.n
     if unit is not None and unit not in UNITS:
         raise UnknownNameError("unit of time", unit, UNITS, path=name)
     index = frame.index if time is None else pandas.Index(_column(frame, time, name))
+    if index.nlevels > 1:
+        raise _no_clock(
+            name, "one stamp a row", f"an index of {index.nlevels} levels", "name its column: time="
+        )
     counted = index.name is None and index.dtype.kind in "iu" and len(index) > 1
+    spaced = unit is not None and getattr(index, "step", 1) != 1  # 0, 10, 20 of ms are evenly spaced stamps
     if time is None and (
-        isinstance(index, pandas.RangeIndex) or (counted and np.array_equal(index, np.arange(len(index))))
+        (isinstance(index, pandas.RangeIndex) and not spaced)
+        or (counted and np.array_equal(index, np.arange(len(index))))
     ):
         raise DataError(
             "this index counts rows: it is no clock",

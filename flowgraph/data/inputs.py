@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from flowgraph.data.series import Flight, Series, unmasked
 from flowgraph.data.tape import need_near
-from flowgraph.errors import ClockError, DataError, TypeMismatchError, UnknownNameError
+from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import StructType, Type, as_value, check_fits, flatten
@@ -99,7 +99,16 @@ def _broken_rows(series: Series) -> np.ndarray:
 
 
 def need_inputs(graph: Graph, inputs: object) -> None:
-    """Refuse what is neither a flight nor data by source name."""
+    """Refuse what is no graph, and inputs that are neither a flight nor data by source name."""
+    if not isinstance(graph, Graph):
+        getattr(graph, "sources", None)  # a @graph function says for itself that it was not built
+        raise DeclarationError(
+            "this is no graph",
+            path="simulate",
+            expected="a built graph",
+            got=f"{type(graph).__name__} {graph!r}"[:80],
+            fix="declare a function with @graph, and build it: f.build(...)",
+        )
     if not isinstance(inputs, Flight | Mapping):
         raise DataError(
             "these are no inputs",

@@ -19,7 +19,13 @@ from flowgraph.data.notes import note
 from flowgraph.data.series import Flight, Series
 from flowgraph.errors import DataError, UnknownNameError
 
-__all__ = ["joined", "numbered", "parts_of", "shared", "with_truth"]
+__all__ = ["doubtful_span", "joined", "numbered", "of_a_truth", "parts_of", "shared", "with_truth"]
+
+_ALIKE = 0.1  # of log10 of two spans; a recording and its truth start and end with as much between them
+_PART, _FEW = 0.5, 3  # the share and the number of samples that are enough
+
+_MOVING = ("time_offset", "every", "lost", "lever", "mount")
+"""What may be set of every stream of a recording."""
 
 Claims = Callable[[str, Mapping[str, Any]], Iterable[str]]
 """Given the argument of a part and settings for all, the names of those that are for this part."""
@@ -89,6 +95,23 @@ def shared(
     return found
 
 
+def of_a_truth(settings: Mapping[str, Any], names: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """The settings of a flight whose last part is its truth: what moves, thins or places the truth is for
+    that part, and a trajectory that may be either is read as a truth then.
+
+    Args:
+        settings: given for the whole flight.
+        names: of the settings that the kind of each part has.
+    """
+    last = len(names)
+    moving = {k for k in settings if k.removeprefix("truth.") in _MOVING and _has(names[-1], k)}
+    moving -= set(_MOVING)
+    given = {(f"{last}.{k}" if k in moving else k): v for k, v in settings.items()}
+    if moving and "role" in names[-1] and not {"role", f"{last}.role"} & set(given):
+        given[f"{last}.role"] = "truth"
+    return given
+
+
 def _has(names: Sequence[str], key: str) -> bool:
     """Whether a kind has a setting; `STREAM.NAME` stands for that of a stream of any name."""
     return key in names or ("." in key and "STREAM." + key.rpartition(".")[2] in names)
@@ -138,8 +161,8 @@ def joined(specs: Sequence[str], flights: Sequence[Flight]) -> Flight:
                 )
             else:
                 info[key] = value
-    _together(specs, owner, {**streams, **({"truth": truth} if truth is not None else {})})
-    notes = tuple(dict.fromkeys(n for f in flights for n in f.notes))
+    said = _together(specs, owner, {**streams, **({"truth": truth} if truth is not None else {})})
+    notes = tuple(dict.fromkeys((*(n for f in flights for n in f.notes), *said)))
     return Flight(
         "+".join(dict.fromkeys(f.name for f in flights)), streams, truth=truth, info=info, notes=notes
     )
@@ -165,7 +188,7 @@ def with_truth(flight: Flight, spec: str, other: Flight) -> Flight:
         truth = Series(poses[0].time, poses[0].values, type=poses[0].type, name="truth", gaps=True)
     said = [note("info", f"the truth is that of {spec}")] if flight.truth is not None else []
     whole = {**flight.streams, "truth": truth}
-    _together([flight.name, spec], {**dict.fromkeys(flight.streams, 0), "truth": 1}, whole)
+    said += _together([flight.name, spec], {**dict.fromkeys(flight.streams, 0), "truth": 1}, whole)
     notes = tuple(dict.fromkeys((*flight.notes, *other.notes, *said)))
     return replace(flight, truth=truth, notes=notes)
 
@@ -177,16 +200,18 @@ def _alike(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _together(specs: Sequence[str], owner: Mapping[str, int], series: Mapping[str, Series]) -> None:
-    """Refuse a stream that does not overlap with the first of another part."""
+def _together(specs: Sequence[str], owner: Mapping[str, int], series: Mapping[str, Series]) -> list[str]:
+    """Refuse a stream that does not overlap with the first of another part; notes on those that hardly do."""
     held = {n: s for n, s in series.items() if len(s)}
+    said: list[str] = []
     if not held:
-        return
+        return said
     first, against = next(iter(held.items()))
     for name, one in held.items():
-        if owner[name] == owner[first] or (
-            one.time[0] <= against.time[-1] and one.time[-1] >= against.time[0]
-        ):
+        if owner[name] == owner[first]:
+            continue
+        if one.time[0] <= against.time[-1] and one.time[-1] >= against.time[0]:
+            said += doubtful_span(name, one.time, first, against.time)
             continue
         apart = int(against.time[0]) - int(one.time[0])
         part = owner[name] + 1
@@ -199,6 +224,35 @@ def _together(specs: Sequence[str], owner: Mapping[str, int], series: Mapping[st
             fix=f"check the unit of the stamps, for one part by {part}.time.unit=..., or shift it where"
             f" the clocks differ: {part}.{name}.time_offset",
         )
+    return said
+
+
+def doubtful_span(name: str, time: np.ndarray, first: str, against: np.ndarray) -> list[str]:
+    """A note where stamps that overlap with those of another stream look like another unit's, or hardly meet.
+
+    A clock that counts from 0 overlaps in any unit. What tells is its span, which is then 1e3, 1e6 or 1e9
+    times the other, or that of many samples next to none lies within it.
+
+    Args:
+        name: of the stream.
+        time: (n,) int64 ns, its stamps.
+        first: the stream that it is held against.
+        against: (m,) int64 ns, the stamps of that.
+    """
+    if min(len(time), len(against)) < 10:
+        return []
+    mine, other = float(time[-1]) - float(time[0]), float(against[-1]) - float(against[0])
+    inside = int(np.searchsorted(time, against[-1], side="right") - np.searchsorted(time, against[0]))
+    around = int(np.searchsorted(against, time[-1], side="right") - np.searchsorted(against, time[0]))
+    spans = f"{name} spans {mine / 1e9:.3g} s, {first} {other / 1e9:.3g} s"
+    for power in (3, 6, 9):
+        if abs(abs(np.log10(mine / other)) - power) < _ALIKE:
+            return [note("warning", f"{spans}: its unit of time looks wrong by 1e{power}")]
+    few = max(inside / len(time), around / len(against)) < _PART or (inside < _FEW and inside < len(time))
+    if few:
+        within = f"{inside} of {len(time)} samples of it lie within"
+        return [note("warning", f"{spans}: only {within}; check the unit of the stamps")]
+    return []
 
 
 def _words(ns: int) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.joint import joined, numbered, parts_of, shared, with_truth
+from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
@@ -198,7 +198,9 @@ def load_flight(
     each = [dict(settings or {})]
     if len(specs) > 1:
         claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
-        each = shared(specs, [flight_settings(s) for s in specs], claims, settings or {})
+        names = [flight_settings(s) for s in specs]
+        given = of_a_truth(settings or {}, names) if truth is not None else settings or {}
+        each = shared(specs, names, claims, given)
     found = [_read(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
     if truth is None:
         return found[0] if len(found) == 1 else joined(specs, found)

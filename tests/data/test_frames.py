@@ -58,6 +58,10 @@ WRONG = {
     "rows that are counted": (lambda: pandas.DataFrame({"v": [1.0, 2.0]}), {}, "counts rows: it is no clock"),
     "an index as a file gives it": (
         lambda: pandas.DataFrame({"v": [1.0, 2.0]}, index=pandas.Index([0, 1])), {}, "is no clock"),
+    "every second row": (
+        lambda: pandas.DataFrame({"v": np.arange(6.0)})[::2], {}, "counts rows: it is no clock"),
+    "levels": (
+        lambda: pandas.DataFrame({"v": [1.0], "a": [1], "b": [2]}).set_index(["a", "b"]), {}, "of 2 levels"),
     "floats without a unit": (
         lambda: pandas.DataFrame({"v": [1.0], "t": [0.5]}), {"time": "t"}, "unit=...) says their unit"),
     "texts": (lambda: pandas.DataFrame({"v": [1.0], "t": ["noon"]}), {"time": "t"}, "pandas.to_datetime"),
@@ -70,6 +74,13 @@ WRONG = {
     "two of a name": (
         lambda: pandas.DataFrame([[1.0, 2.0, 3]], columns=["v", "v", "t"]), {"time": "t"}, "is ambiguous"),
 }  # fmt: skip
+
+
+def test_an_index_of_evenly_spaced_stamps_is_a_clock_where_its_unit_is_said():
+    frame = pandas.DataFrame({"v": np.arange(3.0)}, index=pandas.RangeIndex(0, 30, 10))
+    assert Series.from_pandas(frame, columns="v", unit="ms").time.tolist() == [0, 10_000_000, 20_000_000]
+    with pytest.raises(DataError, match="counts rows"):
+        Series.from_pandas(frame.reset_index(drop=True), columns="v", unit="ms")
 
 
 @pytest.mark.parametrize("what", WRONG)

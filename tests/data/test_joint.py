@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Series, load_flight
-from flowgraph.data.joint import parts_of
+from flowgraph.data.joint import doubtful_span, parts_of
 from flowgraph.data.registry import flight_settings
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.study import Study
@@ -149,6 +149,51 @@ def test_a_truth_of_its_own(tmp_path):
             settings={"2.time.unit": "ns", **{f"2.{k}": v for k, v in IMU.items()}},
             truth=f"csv:{tmp_path / 'imu.csv'}",
         )
+
+
+@pytest.mark.parametrize(
+    ("unit", "words"),
+    [
+        ("s", "its unit of time looks wrong by 1e3"),
+        ("us", "its unit of time looks wrong by 1e3"),
+        ("min", "only 1 of 50 samples of it lie within; check the unit"),
+        ("ms", None),
+    ],
+)
+@pytest.mark.parametrize("truth", [False, True])
+def test_a_part_that_counts_from_zero_in_another_unit_is_said(tmp_path, unit, words, truth):
+    imu = ["t,wx,wy,wz,ax,ay,az", *(f"{5 * k},0,0,0,0,0,9.81" for k in range(500))]
+    (tmp_path / "imu.csv").write_text("\n".join(imu) + "\n")
+    (tmp_path / "mocap.csv").write_text(
+        "\n".join(f"{50 * k} {k / 1000} 0 0 0 0 0 1" for k in range(50)) + "\n"
+    )
+    parts = f"csv:{tmp_path / 'imu.csv'}", f"tum:{tmp_path / 'mocap.csv'}"
+    given = {"1.time.unit": "ms", "2.time.unit": unit, **IMU}
+    spec, other = (parts[0], parts[1]) if truth else ("+".join(parts), None)
+    said = [n for n in load_flight(spec, settings=given, truth=other).notes if n.startswith("warning: ")]
+    assert len(said) == (words is not None)
+    assert words is None or (words in said[0] and ("truth" if truth else "vicon") in said[0])
+
+
+def test_one_recording_in_two_units_is_said_too():
+    time = np.arange(50) * 10**8
+    assert not doubtful_span("truth", np.arange(900) * 10**7, "imu", time)  # a truth that is longer
+    assert not doubtful_span("gps", time[:9], "imu", time // 1000)  # too few to tell
+    assert "wrong by 1e6" in doubtful_span("gps", time, "imu", time // 10**6)[0]
+    assert "only 20 of 50 samples" in doubtful_span("gps", time, "imu", time - 3 * 10**9)[0]
+
+
+def test_settings_of_the_truth_are_for_the_truth_that_is_given(tmp_path):
+    write(tmp_path)
+    given = {"1.time.unit": "ns", **IMU, "truth.time_offset": "0.01", "truth.every": "0.02"}
+    flight = load_flight(f"csv:{tmp_path / 'imu.csv'}", settings=given, truth=f"tum:{tmp_path / 'truth.tum'}")
+    assert flight.truth is not None
+    assert flight.truth.time[0] == START + 10_000_000
+    assert len(flight.truth) == 11
+    assert not any("this flight has no truth" in n for n in flight.notes)
+    far = {**given, "truth.time_offset": "50"}
+    with pytest.raises(DataError, match="no sample of truth"):
+        load_flight(f"csv:{tmp_path / 'imu.csv'}", settings=far, truth=f"tum:{tmp_path / 'truth.tum'}")
 
 
 def test_a_study_may_name_parts(tmp_path):

@@ -282,17 +282,19 @@ def spiked(base: Flight, row: int, field: str, by: float) -> Flight:
 
 
 @pytest.mark.parametrize("made", [
-    pytest.param(lambda: spiked(flight(12.0), 500, "specific_force", 2000.0), id="a spike of the force"),
-    pytest.param(lambda: spiked(flight(12.0), 500, "gyro", 200.0), id="a spike of the rate"),
-    pytest.param(lambda: outliers(flight(12.0), slice(8, 20), 50.0), id="a run of outliers"),
+    pytest.param(lambda: spiked(flight(16.0), 500, "specific_force", 2000.0), id="a spike of the force"),
+    pytest.param(lambda: spiked(flight(16.0), 500, "gyro", 200.0), id="a spike of the rate"),
+    pytest.param(lambda: outliers(flight(16.0), slice(8, 20), 50.0), id="a run of outliers"),
 ])  # fmt: skip
 @pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose"])
 def test_a_gate_opens_again(name, made):
-    """From nine seconds on the error is again that of a flight without a fault."""
-    case = find_graph(name).case(made(), gate=0.999, settle=9.0)
-    whole = find_graph(name).case(flight(12.0), gate=0.999, settle=9.0)
+    """Seven seconds after the fault, at four poses a second, the error is that of a flight without one; where
+    there are biases, which take longer to be found again, it is below 0.3 m after 50 m of fault."""
+    case = find_graph(name).case(made(), gate=0.999, settle=12.0)
+    whole = find_graph(name).case(flight(16.0), gate=0.999, settle=12.0)
     score, usual = (c.score(simulate(c.graph, c.inputs)) for c in (case, whole))
-    assert score["position_rmse_m"] < 2.0 * usual["position_rmse_m"]
+    most = 2.0 * usual["position_rmse_m"] if name == "ekf" else 0.3
+    assert score["position_rmse_m"] < most
     assert refused(score) >= 5
 
 

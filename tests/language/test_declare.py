@@ -544,3 +544,11 @@ def test_a_graph_that_was_not_built_says_how_to_build_it(use):
     assert "g.build(...)" in str(error.value.fix)
     with pytest.raises(AttributeError, match="no attribute 'spelt_wrongly'"):
         _ = g.spelt_wrongly
+
+
+@pytest.mark.parametrize("thing", [lambda x: x, 3, None, Scalar, "ins_eskf"])
+def test_what_is_no_graph_is_refused_by_name(thing):
+    with pytest.raises(DeclarationError, match="this is no graph") as error:
+        simulate(thing, {"x": scalars([0])})
+    assert type(thing).__name__ in str(error.value.got)
+    assert "build it" in str(error.value.fix)

@@ -55,8 +55,8 @@ class Terminal:
             self.shown += part
 
     def end(self):
-        status = self.process.wait(timeout=60)
-        self._reader.join(timeout=60)
+        status = self.process.wait(timeout=240)
+        self._reader.join(timeout=240)
         os.close(self._ours)
         return status, self.shown.decode(errors="replace")
 

@@ -615,3 +615,36 @@ def test_simulated_flights_say_that_they_are(spec):
     settings = {"duration": "1"} if spec in ("course", "sim:hover") else {}
     notes = load_flight(spec, settings=settings).notes
     assert notes[0].startswith("info: simulated with seed 0")
+
+
+@pytest.mark.parametrize(("stream", "columns", "every"), [("imu", slice(6), 5), ("vicon", slice(6, 13), 3)])
+def test_rows_of_a_table_that_hold_nothing_of_a_stream_are_counted(tmp_path, stream, columns, every):
+    time, x = rows()
+    x[1::every, columns] = np.nan
+    lost = len(time[1::every])
+    flight = load_flight(csv(tmp_path, time, x), settings=MAPPED)
+    assert len(flight.streams[stream]) == 60 - lost
+    assert f"skipped: {stream}: {lost} of 60 rows of log.csv hold nothing of it" in flight.notes
+    assert not [n for n in flight.notes if "hold nothing" in n and f": {stream}:" not in n]
+
+
+@pytest.mark.parametrize("unit", [None, "rad", "deg"])
+def test_the_unit_of_a_latitude_that_nobody_says_is_said(tmp_path, unit):
+    lines = ["t,lat,lon,h", *(f"{k / 10},{0.8 + 1e-9 * k:.12f},0.1,400" for k in range(30))]
+    (tmp_path / "gps.csv").write_text("\n".join(lines) + "\n")
+    given = {"gps.latitude": "lat", "gps.longitude": "lon", "gps.height": "h"}
+    if unit:
+        given |= {"gps.latitude.unit": unit, "gps.longitude.unit": unit}
+    said = [n for n in load_flight(f"csv:{tmp_path / 'gps.csv'}", settings=given).notes if "is in rad" in n]
+    assert len(said) == (0 if unit else 2)
+    assert unit or said[0] == "assumed: gps.latitude is in rad; gps.latitude.unit says it"
+
+
+@pytest.mark.parametrize(
+    ("start", "step", "said"), [(0, 1, True), (1, 1, True), (0, 2, False), (7, 1, False)]
+)
+def test_poses_by_their_index_are_said(tmp_path, start, step, said):
+    lines = [f"{start + step * k} {k / 100} 0 0 0 0 0 1" for k in range(20)]
+    (tmp_path / "a.tum").write_text("\n".join(lines) + "\n")
+    notes = load_flight(f"tum:{tmp_path / 'a.tum'}").notes
+    assert any("as an index of rows is" in n for n in notes) == said

@@ -25,7 +25,7 @@ from tests.support import all_engines
 H = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, -0.3]])
 P = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 1.5]])
 MEAN = np.array([0.4, -0.2, 0.1])
-SEEN = {
+SEEN: dict[str, tuple[Any, dict[str, Any]]] = {
     "linear": (update_linear, {"H": H}),
     "root": (update_root, {"H": H}),
     "extended": (update_extended, {"observe": lambda x, xp: (H @ x, H)}),

@@ -25,6 +25,7 @@ from flowgraph.engines.c import generate
 from flowgraph.engines.c.expand import _RULES
 from flowgraph.pipeline.optimise import optimise, without
 from flowgraph.pipeline.program import specialise
+from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import ELEMENTWISE, OPS
 
 SHAPES = [(3, 4), (20,), (3, 20), (20, 3), (9, 9), (2, 18, 19)]
@@ -136,13 +137,9 @@ def test_instructions_agree_with_the_reference(shape):
         y: Array = real(*shape)
         n: Array = integer(*shape, dtype="int64")
 
-    names: list[str] = []
-
     @block
     def work(given: Given, *, xp):
-        found = outputs(given.x, given.y, given.n, xp)
-        names[:] = found
-        return tuple(found.values())
+        return tuple(outputs(given.x, given.y, given.n, xp).values())
 
     @graph
     def g(given: Stream[Given]):
@@ -151,6 +148,7 @@ def test_instructions_agree_with_the_reference(shape):
     random = np.random.default_rng(3)
     size = (4, *shape)
     data = Given(random.normal(size=size) * 2.0, random.normal(size=size), random.integers(0, 7, size=size))
+    names = list(outputs(data.x[0], data.y[0], data.n[0], NUMPY))
     built = g.build()
     wanted = simulate(built, {"given": Series(np.arange(4), data)}, engine="reference")
     got = simulate(built, {"given": Series(np.arange(4), data)}, engine="c")
