@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
@@ -57,7 +56,7 @@ MOVED = {
 """The new name of each module that was moved, by its old one."""
 
 
-class _Moved(MetaPathFinder, Loader):
+class _Moved:
     """Finds a module under its old name, and hands out the one under the new name."""
 
     def __init__(self) -> None:
@@ -66,7 +65,7 @@ class _Moved(MetaPathFinder, Loader):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        return ModuleSpec(name, self) if self._place(name) else None
+        return ModuleSpec(name, self) if self._place(name) else None  # type: ignore[arg-type]  # importlib.abc costs the start 5 ms
 
     def _place(self, name: str) -> str | None:
         if name in MOVED:
