@@ -12,6 +12,7 @@ __all__ = [
     "Gaussian",
     "GaussianRoot",
     "KalmanInnovation",
+    "Innovation",
     "Belief",
     "PointBelief",
     "PoseBelief",
@@ -53,6 +54,10 @@ class KalmanInnovation(Signal):
     nis: Array = real()
     parts: Array = real()
     accepted: Array = boolean()
+
+
+Innovation = KalmanInnovation
+"""What it was called while measurements of three numbers had a type of their own."""
 
 
 class Belief(Signal):
