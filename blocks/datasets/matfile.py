@@ -6,6 +6,7 @@ Files of version 4 to 7.2, through SciPy. Text and numbers only: nothing in a fi
 from __future__ import annotations
 
 import io
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -21,8 +22,12 @@ __all__ = ["columns_of", "read_mat", "read_structs"]
 
 _EXPANDED = 32  # times its size, that a compressed file holds at most
 _FLAGS, _MATRIX, _COMPRESSED = 6, 14, 15
-_KINDS = {*range(1, 8), 9, 12, 13, _MATRIX, 16, 17, 18}  # of parts, as the format numbers them
-_CLASSES, _DEEPEST = 17, 64
+_INT8, _INT32 = 1, 5
+_NUMBERS = {*range(1, 8), 9, 12, 13}  # kinds of parts, as the format numbers them
+_KINDS = {*_NUMBERS, _MATRIX, 16, 17, 18}
+_CELL, _STRUCT, _CHAR, _SPARSE = 1, 2, 4, 5
+_NUMERIC = range(6, 16)  # classes of arrays
+_DEEPEST = 64
 
 
 def read_mat(file: Path, fields: Mapping[str, tuple[int | None, ...]]) -> dict[str, np.ndarray]:
@@ -161,7 +166,8 @@ def _check_parts(content: bytes) -> None:
 
 def _walk(parts: memoryview, order: str, depth: int) -> None:
     """Go through the parts of a variable, and those of the cells and fields in it."""
-    place, first = 0, True
+    place = 0
+    found: list[tuple[int, memoryview]] = []
     while place + 8 <= len(parts):
         kind, size = struct.unpack_from(f"{order}II", parts, place)
         small = kind >> 16
@@ -174,15 +180,45 @@ def _walk(parts: memoryview, order: str, depth: int) -> None:
             raise ValueError(f"a part of kind {kind} and {size} bytes")
         if depth == 0 and kind != _MATRIX:
             raise ValueError(f"a variable of kind {kind}")
-        if depth and first:
-            (flags,) = struct.unpack_from(f"{order}I", parts, start) if size == 8 else (0,)
-            if kind != _FLAGS or not 1 <= flags & 0xFF <= _CLASSES:
-                raise ValueError(f"an array of class {flags & 0xFF}")
-        if kind == _MATRIX:
+        found.append((kind, parts[start : start + size]))
+        if kind == _MATRIX and size:  # a field that was never set has nothing in it
             if depth > _DEEPEST:
                 raise ValueError("cells within cells without end")
-            _walk(parts[start : start + size], order, depth + 1)
-        place, first = end, False
+            _walk(found[-1][1], order, depth + 1)
+        place = end
+    if depth:
+        _check_array(found, order)
+
+
+def _check_array(parts: list[tuple[int, memoryview]], order: str) -> None:
+    """See that an array has the parts of its class, for SciPy reads on where one is missing.
+
+    Raises:
+        ValueError: where it has not.
+    """
+    kinds = [kind for kind, _ in parts]
+    if kinds[:3] != [_FLAGS, _INT32, _INT8] or len(parts[0][1]) != 8:
+        raise ValueError(f"an array with parts of kinds {kinds[:3]}")
+    (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
+    kept, numbers = flags & 0xFF, 1 + (flags >> 11 & 1)  # a complex array has two parts
+    shape = parts[1][1]
+    cells = math.prod(struct.unpack_from(f"{order}{len(shape) // 4}i", shape))
+    values, wanted, allowed = kinds[3:], cells, {_MATRIX}
+    if kept in _NUMERIC:
+        wanted, allowed = numbers, _NUMBERS
+    elif kept == _SPARSE:
+        wanted, allowed = 2 + numbers, _NUMBERS
+    elif kept == _CHAR:
+        wanted, allowed = 1, _KINDS - {_MATRIX}
+    elif kept == _STRUCT:
+        length = struct.unpack_from(f"{order}i", parts[3][1])[0] if values[:2] == [_INT32, _INT8] else 0
+        if length < 1:
+            raise ValueError("a struct without names of its fields")
+        values, wanted = values[2:], cells * (len(parts[4][1]) // length)
+    elif kept != _CELL:
+        raise ValueError(f"an array of class {kept}")
+    if len(values) != wanted or not set(values) <= allowed:
+        raise ValueError(f"an array of class {kept} with {len(values)} parts of kinds {sorted(set(values))}")
 
 
 def _array(file: Path, name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:

@@ -134,7 +134,7 @@ def test_the_example_is_a_study_of_three_filters_on_six_recordings():
 def test_the_example_runs_with_one_command_and_its_report_opens(tmp_path):
     recordings("ese650")
     file, out = tmp_path / "study.toml", tmp_path / "out"
-    file.write_text(EXAMPLE.read_text().replace("../shared/datasets", str(DATA)))
+    file.write_text(EXAMPLE.read_text().replace("../../shared/datasets", str(DATA)))
     done = flowgraph("batch", file, "--out", out, "--workers", 2, "--quiet")
     assert done.returncode == 0, done.stderr
     rows = read_table(out)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import savemat
+from scipy.sparse import csc_array
 
 from flowgraph import DataError, load_flight
 from flowgraph.blocks.datasets import euroc
@@ -109,6 +110,36 @@ def test_pipes_in_place_of_files_are_refused_at_once(tmp_path):
         TagMap.load(tmp_path / "tags.json")
     with pytest.raises(DataError, match="no regular file"):
         parse_parameters(tmp_path / "parameters.txt")
+
+
+def flags_changed(file: Path, change: int) -> None:
+    """The flags of the first array, which stand behind the head, the variable's tag and their own."""
+    content = bytearray(file.read_bytes())
+    (flags,) = struct.unpack_from("<I", content, 144)
+    struct.pack_into("<I", content, 144, flags ^ change)
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("held", "change"),
+    [
+        pytest.param(np.arange(30.0), 1 << 11, id="a complex array without its second part"),
+        pytest.param(np.arange(30.0), 6 ^ 1, id="numbers as cells"),
+        pytest.param(np.arange(30.0), 6 ^ 2, id="numbers as a struct"),
+        pytest.param(np.arange(30.0), 6 ^ 5, id="numbers as a sparse array"),
+        pytest.param(np.arange(30.0), 6 ^ 17, id="numbers as an object"),
+        pytest.param({"a": 1.0}, 2 ^ 6, id="a struct as numbers"),
+        pytest.param(csc_array(np.eye(3)), 1 << 11, id="a complex sparse array without its last part"),
+    ],
+)
+def test_an_array_without_the_parts_of_its_class_is_refused_before_it_is_read(tmp_path, held, change):
+    """SciPy would read on behind the array, where a wrong kind of part ends the process."""
+    file = tmp_path / "a.mat"
+    savemat(file, {"x": held, "y": np.arange(3.0)})
+    read_structs(file, "x", "y")
+    flags_changed(file, change)
+    with pytest.raises(DataError, match="this is no whole .mat file"):
+        read_structs(file, "x", "y")
 
 
 def test_thousands_of_digits_take_no_time(tmp_path):
