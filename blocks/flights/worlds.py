@@ -4,7 +4,8 @@ sensors.
 `sensors` names the streams, comma-separated (or all); each sensor has settings of its own, `NAME.rate` and so
 on, that are refused where the flight has no such sensor. Left out, they are those of the thesis: variances
 per sample of 0.1 for gyroscope and accelerometer at 200 Hz, as continuous densities here, and of 0.01 for the
-motion capture at 4 Hz; no biases, no latency. The inertial unit of `sim:roundtrip` is another: see `TRIP`.
+motion capture at 4 Hz; no biases, no latency. The inertial unit of `sim:roundtrip` is another: see `TRIP`; the gyroscope of
+`sim:thesis` measures turns: see `TURNING`.
 """
 
 from __future__ import annotations
@@ -32,14 +33,15 @@ _CLOCK = {"phase": 0.0, "latency": 0.0, "jitter": 0.0}
 _DRIFT = {"bias": 0.0, "walk": 0.0}
 _TURN_DRIFT = {"attitude_bias": 0.0, "attitude_walk": 0.0}
 _LOOKS = {"oversample": 1.0}
+_TURN = {"turn": 0.0}
 _EARTH = {"geodetic": 0.0, "latitude": 0.0, "longitude": 0.0, "height": 0.0}
 _THESIS = math.sqrt(0.1 / 200.0)  # the density of a variance of 0.1 per sample at 200 Hz
 _DEVIATION = math.sqrt(0.1)
 _LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
 
 SENSORS: Mapping[str, Mapping[str, float]] = {
-    "imu": {"rate": 200.0, **_CLOCK, **_LOOKS},
-    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
+    "imu": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN},
+    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN, "noise": _THESIS, **_DRIFT},
     "accelerometer": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "coordinate_acceleration": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "position": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, **_LEVER},
@@ -57,17 +59,18 @@ SENSORS: Mapping[str, Mapping[str, float]] = {
         **{"rate": 20.0, **_CLOCK, "noise": 0.01, **_DRIFT, "attitude_noise": 0.01, **_TURN_DRIFT}
     },
     "thrust": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
-    "body_rate": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
+    "body_rate": {"rate": 200.0, **_CLOCK, **_TURN, "noise": _DEVIATION, **_DRIFT},
 }
 """What each sensor can be set to, and what it is when left out, in SI units and radians. `noise` is a
 continuous density for gyro, accelerometer and coordinate_acceleration (the imu has theirs), and for all
 others a standard deviation per sample; `bias` is the standard deviation of a constant, `walk` the density of
-its random walk; `oversample` is how many looks a reading is the mean of. A GPS with geodetic=1 gives
+its random walk; `oversample` is how many looks a reading is the mean of, and with `turn` 1 a rate is that of
+the turn since the last reading. A GPS with geodetic=1 gives
 latitude, longitude and height, of a world whose origin is at `latitude`, `longitude` (rad) and `height`
 (m)."""
 
 WORLDS: Mapping[str, Mapping[str, float]] = {
-    "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 30.0, "most_rate": 35.0},
+    "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 20.0, "most_rate": 20.0},
     "roundtrip": {"duration": 20.0, "angle": 1.0, "trip": 5.0, "rest": 1.0},
     "hover": {"duration": 20.0, "drift": 0.0},
 }
@@ -79,6 +82,10 @@ whose gyroscope is biased. Its specific force alone shows roll and pitch to 0.00
 integrated with the bias, is off by some tenths of a rad within 20 s: the figures with which such data were
 first published."""
 
+TURNING: Mapping[str, float] = {"imu.turn": 1.0, "gyro.turn": 1.0, "body_rate.turn": 1.0}
+"""What those of `thesis` read when left out: its gyroscope measures the rotation over the last step. The rate
+jumps there at each key point, and two readings of an instant do not tell when."""
+
 SETTINGS: Mapping[str, str | float] = {
     "sensors": "imu,vicon",
     **{name: value for world in WORLDS.values() for name, value in world.items()},
@@ -88,8 +95,9 @@ SETTINGS: Mapping[str, str | float] = {
 
 _POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "rate", "strength", "most_tilt")
 _SIGNED = ("angle", "declination", "dip", "latitude", "longitude", "height", *_LEVER)
-_SWITCHES = ("geodetic",)
+_SWITCHES = ("geodetic", "turn")
 _PARTS_OF_IMU = ("gyro", "accelerometer")
+_OWN = {"roundtrip": TRIP, "thesis": TURNING}
 
 Numbers = Mapping[str, float]
 
@@ -106,7 +114,7 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         A `Flight`: a stream for each sensor, by time of arrival. truth: `NavigationState` at the times of the
         fastest sensor, with the biases of the gyroscope and accelerometer. info:
         `world` (the `World`); `still` (s at rest at the start); `noise` (the settings of each sensor);
-        `NAME_period_ns`; `NAME_oversample` of an inertial sensor; `stamps` (when each reading of a late
+        `NAME_period_ns`; `NAME_oversample` of an inertial sensor, and `NAME_turn`; `stamps` (when each reading of a late
         sensor was true, int64 ns, row by row);
         `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `vicon_lever`, `gps_lever`,
         `gps2_lever`, `position_lever` (m, body), `magnetic_field` (T, world) and, where it is geodetic,
@@ -220,6 +228,8 @@ def _sensor(name: str, numbers: Numbers) -> s.Sensor:
     common: dict[str, Any] = {"name": name, "rate": n["rate"], **{k: n[k] for k in _CLOCK}}
     if "oversample" in n:
         common["oversample"] = int(n["oversample"])
+    if "turn" in n:
+        common["turn"] = bool(n["turn"])
     if name == "imu":
         gyro, push = (_noise(_of(part, numbers), density=True) for part in _PARTS_OF_IMU)
         return s.InertialUnit(**common, gyro=gyro, accelerometer=push)
@@ -253,9 +263,9 @@ _MAKERS: Mapping[str, Callable[..., s.Sensor]] = {
 def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     """What a filter may know of a sensor, under the names that recorded flights use too."""
     if isinstance(sensor, s.InertialUnit):
-        return {"imu_noise": sensor.densities, "imu_oversample": sensor.oversample}
+        return {"imu_noise": sensor.densities, **_averaging(sensor)}
     if isinstance(sensor, s.InertialSensor):
-        return {f"{sensor.name}_oversample": sensor.oversample}
+        return _averaging(sensor)
     if isinstance(sensor, s.Vicon):
         noise = {"position_noise": sensor.noise.deviation, "attitude_noise": sensor.attitude_noise.deviation}
         return {**noise, "vicon_lever": (0.0, 0.0, 0.0)}
@@ -264,6 +274,11 @@ def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     if isinstance(sensor, s.PositionSensor):
         return {f"{sensor.name}_lever": sensor.lever}
     return {}
+
+
+def _averaging(sensor: s.InertialSensor) -> dict[str, Any]:
+    turn = {f"{sensor.name}_turn": sensor.turn} if isinstance(sensor, s.RateSensor) else {}
+    return {f"{sensor.name}_oversample": sensor.oversample, **turn}
 
 
 def _bias(
@@ -302,7 +317,7 @@ def _chosen(text: str, path: str) -> list[str]:
 def _numbers(kind: str, chosen: list[str], given: Mapping[str, str | float], path: str) -> dict[str, float]:
     used = [*chosen, *(_PARTS_OF_IMU if "imu" in chosen else ())]
     known = {f"{name}.{part}": value for name, parts in SENSORS.items() for part, value in parts.items()}
-    known.update({**WORLDS[kind], **(TRIP if kind == "roundtrip" else {})})
+    known.update({**WORLDS[kind], **_OWN.get(kind, {})})
     for name, text in given.items():
         if name not in known:
             raise UnknownNameError("setting", name, ["sensors", *known], path=path)
