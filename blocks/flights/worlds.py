@@ -4,8 +4,8 @@ sensors.
 `sensors` names the streams, comma-separated (or all); each sensor has settings of its own, `NAME.rate` and so
 on, that are refused where the flight has no such sensor. Left out, they are those of the thesis: variances
 per sample of 0.1 for gyroscope and accelerometer at 200 Hz, as continuous densities here, and of 0.01 for the
-motion capture at 4 Hz; no biases, no latency. The inertial unit of `sim:roundtrip` is another: see `TRIP`; the gyroscope of
-`sim:thesis` measures turns: see `TURNING`.
+motion capture at 4 Hz; no biases, no latency. The inertial unit of `sim:roundtrip` is another: see `TRIP`.
+Rates of `sim:thesis` are of the step since the last reading: see `OF_STEPS`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, the
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["MOST_SAMPLES", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
+__all__ = ["MOST_SAMPLES", "OF_STEPS", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
 
 MOST_SAMPLES = 10_000_000
 """The most samples of one simulated sensor: 14 hours at 200 Hz."""
@@ -40,7 +40,7 @@ _DEVIATION = math.sqrt(0.1)
 _LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
 
 SENSORS: Mapping[str, Mapping[str, float]] = {
-    "imu": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN},
+    "imu": {"rate": 200.0, **_CLOCK, **_LOOKS},
     "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN, "noise": _THESIS, **_DRIFT},
     "accelerometer": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "coordinate_acceleration": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
@@ -82,9 +82,10 @@ whose gyroscope is biased. Its specific force alone shows roll and pitch to 0.00
 integrated with the bias, is off by some tenths of a rad within 20 s: the figures with which such data were
 first published."""
 
-TURNING: Mapping[str, float] = {"imu.turn": 1.0, "gyro.turn": 1.0, "body_rate.turn": 1.0}
-"""What those of `thesis` read when left out: its gyroscope measures the rotation over the last step. The rate
-jumps there at each key point, and two readings of an instant do not tell when."""
+OF_STEPS: Mapping[str, float] = {"gyro.turn": 1.0, "body_rate.turn": 1.0, "imu.oversample": 10.0}
+"""What `thesis` reads when left out: its gyroscope measures the rotation over the last step. The rate jumps
+there at each key point, and two readings of an instant do not tell when. Its accelerometers read an instant;
+the `imu`, which is not of the thesis, gives the means of both over the step."""
 
 SETTINGS: Mapping[str, str | float] = {
     "sensors": "imu,vicon",
@@ -97,7 +98,7 @@ _POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "ra
 _SIGNED = ("angle", "declination", "dip", "latitude", "longitude", "height", *_LEVER)
 _SWITCHES = ("geodetic", "turn")
 _PARTS_OF_IMU = ("gyro", "accelerometer")
-_OWN = {"roundtrip": TRIP, "thesis": TURNING}
+_OWN = {"roundtrip": TRIP, "thesis": OF_STEPS}
 
 Numbers = Mapping[str, float]
 
@@ -114,8 +115,8 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         A `Flight`: a stream for each sensor, by time of arrival. truth: `NavigationState` at the times of the
         fastest sensor, with the biases of the gyroscope and accelerometer. info:
         `world` (the `World`); `still` (s at rest at the start); `noise` (the settings of each sensor);
-        `NAME_period_ns`; `NAME_oversample` of an inertial sensor, and `NAME_turn`; `stamps` (when each reading of a late
-        sensor was true, int64 ns, row by row);
+        `NAME_period_ns`; `NAME_oversample` of an inertial sensor; `NAME_turn` of one that reads
+        rates; `stamps` (when each reading of a late sensor was true, int64 ns, row by row);
         `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `vicon_lever`, `gps_lever`,
         `gps2_lever`, `position_lever` (m, body), `magnetic_field` (T, world) and, where it is geodetic,
         `gps_origin` and `gps2_origin` (latitude and longitude in rad, height in m) where there are such
@@ -263,9 +264,11 @@ _MAKERS: Mapping[str, Callable[..., s.Sensor]] = {
 def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     """What a filter may know of a sensor, under the names that recorded flights use too."""
     if isinstance(sensor, s.InertialUnit):
-        return {"imu_noise": sensor.densities, **_averaging(sensor)}
+        return {"imu_noise": sensor.densities, "imu_oversample": sensor.oversample}
+    if isinstance(sensor, s.RateSensor):
+        return {f"{sensor.name}_oversample": sensor.oversample, f"{sensor.name}_turn": sensor.turn}
     if isinstance(sensor, s.InertialSensor):
-        return _averaging(sensor)
+        return {f"{sensor.name}_oversample": sensor.oversample}
     if isinstance(sensor, s.Vicon):
         noise = {"position_noise": sensor.noise.deviation, "attitude_noise": sensor.attitude_noise.deviation}
         return {**noise, "vicon_lever": (0.0, 0.0, 0.0)}
@@ -274,11 +277,6 @@ def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     if isinstance(sensor, s.PositionSensor):
         return {f"{sensor.name}_lever": sensor.lever}
     return {}
-
-
-def _averaging(sensor: s.InertialSensor) -> dict[str, Any]:
-    turn = {f"{sensor.name}_turn": sensor.turn} if isinstance(sensor, s.RateSensor) else {}
-    return {f"{sensor.name}_oversample": sensor.oversample, **turn}
 
 
 def _bias(

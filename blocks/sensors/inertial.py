@@ -8,8 +8,8 @@ Noise is a continuous density by default; `Noise.variance` takes the thesis's va
 
 A reading is what there was at its stamp or, with `oversample`, the mean over the interval that ends there, as
 a unit gives it that samples fast inside and hands on averages. A gyroscope may also read the `turn`: the
-rotation since its last reading, over the period, as the thesis's does. They differ where a rate jumps: between
-two instants nobody knows when it did, but the mean, and the turn to the last digit, hold all of the rotation.
+rotation since its last reading, over the period, as the thesis's does. They differ where a rate jumps:
+between two instants nobody knows when it did, but the mean and the turn hold all of the rotation.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class InertialSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class RateSensor(InertialSensor):
-    """The base of those that read how fast the body turns.
+    """The base of those that read how fast the body turns, and nothing else.
 
     Args:
         turn: whether the rate is that of the whole turn since one period before, log(R(t - T)^T R(t)) / T,
@@ -163,7 +163,7 @@ class CoordinateAccelerometer(InertialSensor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class InertialUnit(RateSensor):
+class InertialUnit(InertialSensor):
     """Reads rate and specific force at the same times (`Imu`).
 
     Args:
@@ -183,7 +183,7 @@ class InertialUnit(RateSensor):
             noise.error(part, seed, seconds, 3, rate=self.rate)
             for noise, part in zip((self.gyro, self.accelerometer), self.parts, strict=True)
         )
-        rate, force = self._turning(motion), self._mean(motion.specific_force)
+        rate, force = self._mean(motion.rate), self._mean(motion.specific_force)
         return Imu(gyro=rate + turn, specific_force=force + push)
 
     @property

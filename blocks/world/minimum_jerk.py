@@ -132,7 +132,9 @@ def join(
     seconds, rows = [], []
     for point in key_points:
         none = (np.nan,) * 3
-        goal = np.array([none if g is None else g for g in (point.position, point.velocity, point.acceleration)])
+        goal = np.array(
+            [none if g is None else g for g in (point.position, point.velocity, point.acceleration)]
+        )
         row, state = primitive(state, goal, point._given, point.seconds)
         seconds.append(point.seconds)
         rows.append(row)

@@ -14,6 +14,7 @@ Source: R. Fiszel's thesis (2017), "Data generation"; the limits, those of its p
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 
@@ -61,6 +62,11 @@ def thesis_flight(seed: int = 0, *, limits: Limits = LIMITS, attempts: int = 20_
     Raises:
         DataError: when none of `attempts` draws is feasible.
     """
+    return _first_feasible(seed, limits, attempts)
+
+
+@functools.lru_cache(maxsize=1024)
+def _first_feasible(seed: int, limits: Limits, attempts: int) -> Quadrotor:
     random = generator(seed, "thesis")
     for tried in range(0, attempts, _AT_ONCE):
         draws = random.standard_normal((min(_AT_ONCE, attempts - tried), _NUMBERS))
