@@ -1,7 +1,7 @@
 """The bound of every filter of a pose that is driven by an inertial unit and corrected by a motion capture.
 
-The state's error is that of `PoseBelief`: position, velocity (world) and a right rotation vector (body). Over a
-step of a true trajectory, from velocity v and attitude R to v' and R', it moves by
+The state's error is that of `PoseBelief`: position, velocity (world) and a right rotation vector (body). Over
+a step of a true trajectory, from velocity v and attitude R to v' and R', it moves by
 
         [I  dt I  S dt/2]
     F = [0   I    S     ]      S = -skew(v' - v - gravity dt) R

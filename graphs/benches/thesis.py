@@ -7,8 +7,8 @@ unit in a world without gravity. Its gyroscope measures the rotation since its l
 
 The thesis prints as RMSE what its code computes without a root: the mean of |p - p_true|^2, and the mean of
 the square of |R - R_true|_F^2. These, the "thesis metric", stand beside its figures; the errors in metres and
-degrees are root mean squares. The bound is the posterior Cramér-Rao bound along the truth, of the same flights
-and noise and of the same ticks, for a start that is known exactly: no filter on these readings is better.
+degrees are root mean squares. The bound is the posterior Cramér-Rao bound along the truth, of the same
+flights, noise and ticks, for a start that is known exactly: no filter on these readings is better.
 
 Source: R. Fiszel, thesis (2017), the tables of its results; for the bound see `blocks/metrics/bound.py`.
 """
@@ -50,7 +50,7 @@ RATE = 200.0
 NEAR = StartSpread(1e-3, 1e-3, 1e-3, 1e-3, 0.0, 0.0)
 """The start is the truth; a covariance of zero has no square root."""
 
-AT_ONCE = 25
+AT_ONCE = 50
 """Flights whose covariances are held in memory together."""
 
 VARIANCES = {"H": 0.1, "L": 1.0}
@@ -213,7 +213,7 @@ def thesis(
         duration: of a flight, s, at most 20.
         seed: of the first flight; the others follow.
         settings, filters: those to run, with commas between.
-        engine: as for `simulate_many`; "auto" is xla where JAX is installed, else python.
+        engine: as for `simulate_many`; "auto" is c where there is a compiler, else xla or python.
 
     Returns:
         A row a setting and filter: the errors, the 95 % interval of the position RMSE (bootstrap over
@@ -222,7 +222,7 @@ def thesis(
     """
     need_count("thesis", "flights", flights, least=1)
     need_count("thesis", "particles", particles, least=1)
-    engine = engine_of(engine)
+    engine = engine_of(engine, many=True)
     names, codes = _listed("filter", filters, FILTERS), _listed("setting", settings, SETTINGS)
     rows = []
     for code in codes:
