@@ -90,10 +90,11 @@ def unbiased_factors(graph: str, flight: Flight) -> tuple[float, float]:
     return factor, factor
 
 
-def reading_of(flight: Flight) -> str:
-    """Whether the flight's imu reads an "instant", or the "mean" since its last reading."""
+def reading_of(flight: Flight, sensor: str = "imu") -> str:
+    """Whether the flight's sensor reads an "instant", or the "mean" since its last reading."""
     info = flight.info
-    return "mean" if info.get("imu_oversample", 1) > 1 or info.get("imu_turn", False) else "instant"
+    averages = info.get(f"{sensor}_oversample", 1) > 1 or info.get(f"{sensor}_turn", False)
+    return "mean" if averages else "instant"
 
 
 def with_imu(flight: Flight) -> Flight:

@@ -121,7 +121,7 @@ def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
     p, v, q = _at_first(flight)
     start = PoseEstimate(position=p, velocity=v, attitude=q)
     build = lambda: augmented_complementary.build(
-        **clocks_of(flight.streams), start=start, gravity=WEIGHTLESS
+        **clocks_of(flight.streams), start=start, gravity=WEIGHTLESS, reading=reading_of(flight)
     )
     return Trial(build, flight.streams, {"previous": start})
 
