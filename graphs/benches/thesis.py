@@ -127,11 +127,11 @@ def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
 
 
 def _ekf(flight: Flight, noise: Noise, _: int) -> Trial:
-    return _told(ekf, flight, noise, _near(start_pose, flight), reading=reading_of(flight))
+    return _told(ekf, flight, noise, _near(start_pose, flight))
 
 
 def _ukf(flight: Flight, noise: Noise, _: int) -> Trial:
-    return _told(ukf, flight, noise, _near(start_state, flight), reading=reading_of(flight))
+    return _told(ukf, flight, noise, _near(start_state, flight))
 
 
 def _eskf(flight: Flight, noise: Noise, _: int) -> Trial:
@@ -169,9 +169,8 @@ def _told(
     *,
     register: str = "belief",
     inputs: Mapping[str, Series] | None = None,
-    **settings: Any,
 ) -> Trial:
-    """A filter of a pose on the flight's streams, or on `inputs`, with settings of its own."""
+    """A filter of a pose on the flight's streams, or on `inputs`; told how the unit reads, if it asks."""
     inputs = flight.streams if inputs is None else inputs
     build = lambda: graph.build(
         **clocks_of(inputs),
@@ -180,7 +179,7 @@ def _told(
         position_noise=noise.pose,
         attitude_noise=noise.pose,
         gravity=WEIGHTLESS,
-        **settings,
+        **({"reading": reading_of(flight)} if "reading" in graph.parameters[1] else {}),
     )
     return Trial(build, inputs, {register: start})
 
