@@ -18,6 +18,7 @@ import numpy as np
 from flowgraph.errors import DeclarationError, LoweringError
 from flowgraph.recorder.dual import Dual
 from flowgraph.recorder.dual_rules import RULES, plain
+from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic_namespace import namespace as symbolic
@@ -33,9 +34,9 @@ def jacobian(
     """The value of f at x, and its derivative.
 
     Args:
-        f: `f(x, xp) -> y`, on x (..., n), a point a row, and y (..., m), of each row its own. It must take its
-            functions from the `xp` that it is handed; what else it needs, it closes over, and that counts as
-            constant. It may itself call `jacobian`.
+        f: `f(x, xp) -> y`, on x (..., n), a point a row, and y (..., m), of each row its own. It must take
+            its functions from the `xp` that it is handed; what else it needs, it closes over, and that counts
+            as constant. It may itself call `jacobian`.
         x: real numbers (..., n).
         xp: the namespace of x, as a block is handed it.
         along: (n, k), constant or not: the derivative along these k directions, in place of along each of
@@ -126,10 +127,10 @@ class Duals:
     """
 
     def __init__(self, below: Any) -> None:
-        self.below = below
+        self.below = NUMPY if below is np else below
         self.depth: int = below.depth + 1 if isinstance(below, Duals) else 1
         self.sparse: bool = below.sparse if isinstance(below, Duals) else below is symbolic
-        """Whether zeros are looked for: where work is recorded that is done many times, not where it is done."""
+        """Whether zeros are looked for: where work is recorded, to be done many times."""
         self.linalg = _Linalg(self)
 
     def made(self, value: Any, tangent: Tangent) -> Any:
@@ -199,6 +200,10 @@ class Duals:
                 in_every_engine=True,
             )
         return self.below.asarray(x, dtype=dtype)
+
+    def roll(self, x: Any, /, shift: int, *, axis: int | None = None) -> Any:
+        """x with its elements moved on, those beyond the end to the start."""
+        return self._operation("roll")(x, shift=shift, axis=axis)
 
     def expand_dims(self, x: Any, /, *, axis: int = 0) -> Any:
         """x with an axis of size 1 more."""

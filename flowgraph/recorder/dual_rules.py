@@ -10,7 +10,8 @@ it is a very large number, so that a change of 0 stays 0.
 
 Source: A. Griewank and A. Walther, "Evaluating Derivatives", 2nd ed., SIAM 2008, secs. 2.2, 3.1, 14 (kinks);
 for matrices M. Giles, "Collected matrix derivative results for forward and reverse mode algorithmic
-differentiation", 2008, and I. Murray, "Differentiation of the Cholesky decomposition", arXiv:1602.07527, 2016.
+differentiation", 2008, and I. Murray, "Differentiation of the Cholesky decomposition", arXiv:1602.07527,
+2016.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ def _weighted(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], slope
     for t, slope in zip(tangents, slopes, strict=True):
         if t:
             g = None if slope is None else slope()
+            if type(g) in (int, float) and not g:
+                continue  # 0.0 * x, as written to give a constant the shape of x
             wide = mapped(t, lambda d: lifted(xp, d, rank))
             out = added(xp, out, wide if g is None else mapped(wide, lambda d, g=g: d * g))
     return out

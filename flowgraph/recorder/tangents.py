@@ -26,7 +26,7 @@ def mapped(tangent: Tangent, function: Callable[[Any], Any]) -> Tangent:
 
 
 def aligned(xp: Any, *tangents: Tangent) -> list[tuple[Directions, list[Any]]]:
-    """The parts of several tangents side by side, over keys that all share; None where one has no such part."""
+    """The parts of several tangents side by side, over keys that all share; None where one has none."""
     keys = list(dict.fromkeys(key for t in tangents for key in t))
     whole = len({i for key in keys for i in key}) == sum(map(len, keys))
     if not whole:
