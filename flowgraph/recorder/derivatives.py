@@ -17,12 +17,12 @@ import numpy as np
 
 from flowgraph.errors import DeclarationError, LoweringError
 from flowgraph.recorder.dual import Dual
-from flowgraph.recorder.dual_rules import RULES, plain
+from flowgraph.recorder.dual_rules import RULES
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic_namespace import namespace as symbolic
-from flowgraph.recorder.tangents import Tangent, pruned, spread
+from flowgraph.recorder.tangents import Tangent, plain, pruned, spread
 from flowgraph.types import Array
 
 __all__ = ["jacobian"]

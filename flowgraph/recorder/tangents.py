@@ -18,6 +18,22 @@ import numpy as np
 
 Directions = tuple[int, ...]
 Tangent = dict[Directions, Any]
+Made = tuple[Any, Tangent]
+Rule = Callable[..., Made]
+"""`rule(xp, values, tangents, **attrs)`: the value and the tangent of a result, from those of the arguments.
+`xp` is the namespace of the values."""
+
+_LINALG = ("cholesky", "solve", "cross", "vecdot", "outer")
+
+
+def plain(xp: Any, name: str) -> Any:
+    """The function of that name in a namespace of values."""
+    return getattr(xp.linalg if name in _LINALG else xp, name)
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """The shape of an array or number."""
+    return tuple(getattr(x, "shape", ()))
 
 
 def mapped(tangent: Tangent, function: Callable[[Any], Any]) -> Tangent:
