@@ -29,7 +29,7 @@ __all__ = ["jacobian"]
 
 
 def jacobian(
-    f: Callable[..., Array], x: Array, xp: Any, *, along: Array | None = None
+    f: Callable[..., Array], x: Array, xp: Any, *, along: Array | Sequence[Array] | None = None
 ) -> tuple[Array, Array]:
     """The value of f at x, and its derivative.
 
@@ -40,7 +40,8 @@ def jacobian(
         x: real numbers (..., n).
         xp: the namespace of x, as a block is handed it.
         along: (n, k), constant or not: the derivative along these k directions, in place of along each of
-            the n numbers. Without leading axes, or with those of x.
+            the n numbers. Without leading axes, or with those of x. Several such matrices are taken as beside
+            each other; what directions of one do not change is then not computed for them.
 
     Returns:
         y (..., m), and dy/dx (..., m, n), or (..., m, k): entry (i, j) is how y_i changes with x_j. Where y
@@ -53,12 +54,17 @@ def jacobian(
     x = xp.asarray(x)
     n = _needs_real(x)
     if along is None:
-        start = xp.reshape(xp.eye(n, dtype=x.dtype), (n, *(1,) * (len(x.shape) - 1), n))
+        parts = [xp.reshape(xp.eye(n, dtype=x.dtype), (n, *(1,) * (len(x.shape) - 1), n))]
     else:
-        start = _directions(xp.asarray(along), x, xp)
-    k = start.shape[0]
+        given = along if isinstance(along, list | tuple) else [along]
+        parts = [_directions(xp.asarray(d), x, xp) for d in given]
+    start: Tangent = {}
+    k = 0
+    for d in parts:
+        start[tuple(range(k, k + d.shape[0]))] = d
+        k += d.shape[0]
     inner = Duals(xp)
-    y = f(inner.made(x, {tuple(range(k)): start}), inner)
+    y = f(inner.made(x, start), inner)
     if not isinstance(y, Dual) or y.xp is not inner:
         y = xp.asarray(y)
         return y, xp.zeros((*y.shape, k), dtype=x.dtype)
