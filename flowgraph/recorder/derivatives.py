@@ -22,7 +22,7 @@ from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic_namespace import namespace as symbolic
-from flowgraph.recorder.tangents import Tangent, plain, pruned, spread
+from flowgraph.recorder.tangents import Tangent, mapped, plain, pruned, spread
 from flowgraph.types import Array
 
 __all__ = ["jacobian"]
@@ -67,7 +67,8 @@ def jacobian(
     y = f(inner.made(x, start), inner)
     if not isinstance(y, Dual) or y.xp is not inner:
         y = xp.asarray(y)
-        return y, xp.zeros((*y.shape, k), dtype=x.dtype)
+        kind = y.dtype if np.dtype(y.dtype).kind == "f" else x.dtype
+        return y, xp.zeros((*y.shape, k), dtype=kind)
     return y.value, _assembled(y, k, xp)
 
 
@@ -140,9 +141,11 @@ class Duals:
         self.linalg = _Linalg(self)
 
     def made(self, value: Any, tangent: Tangent) -> Any:
-        """A dual array; the value itself where it does not change."""
+        """A dual array, in one precision; the value itself where it does not change."""
         if self.sparse:
             tangent = pruned(tangent)
+        if any(d.dtype != value.dtype for d in tangent.values()):
+            tangent = mapped(tangent, lambda d: self.below.astype(d, value.dtype))
         return Dual(self, value, tangent) if tangent else value
 
     def _is_mine(self, x: Any) -> bool:

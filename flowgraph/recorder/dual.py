@@ -148,9 +148,9 @@ def _needs_xp(got: str) -> NoReturn:
 
 def _operator(op: str, swap: bool = False) -> Callable[..., Any]:
     def method(self: Dual, other: Any) -> Any:
-        if isinstance(other, Dual) and other.xp.depth > self.xp.depth:
-            return NotImplemented  # to the inner derivative this one is a constant
-        apply = getattr(self.xp, op)
+        # to an inner derivative the arrays of the outer one are constants
+        inner = isinstance(other, Dual) and other.xp.depth > self.xp.depth
+        apply = getattr(other.xp if inner else self.xp, op)
         return apply(other, self) if swap else apply(self, other)
 
     return method

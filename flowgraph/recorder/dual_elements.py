@@ -154,7 +154,7 @@ _SLOPES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "expm1": lambda xp, x, y: y + 1.0,
     "log": lambda xp, x, y: 1.0 / x,
     "log1p": lambda xp, x, y: 1.0 / (1.0 + x),
-    "log2": lambda xp, x, y: (1.0 / np.log(2.0)) / x,
+    "log2": lambda xp, x, y: float(1.0 / np.log(2.0)) / x,
     "sin": lambda xp, x, y: xp.cos(x),
     "cos": lambda xp, x, y: -xp.sin(x),
     "tan": lambda xp, x, y: 1.0 + y * y,

@@ -11,7 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowgraph import jacobian
+from flowgraph import (
+    Array,
+    DeclarationError,
+    LoweringError,
+    Signal,
+    Stream,
+    block,
+    collect,
+    graph,
+    jacobian,
+    real,
+)
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, normalize, to_rotation_vector
 from flowgraph.recorder.dual_rules import RULES
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS, Spec, bound_attrs
@@ -269,9 +281,12 @@ def away_from_kinks(x: np.ndarray) -> np.ndarray:
 
 def check(f: Callable[[Any, Any], Any], x: np.ndarray) -> None:
     value, derivative = jacobian(f, x, np)
+    assert derivative.dtype == np.float64
     expected = f(x, NUMPY)
     np.testing.assert_array_equal(value, expected)
     assert derivative.shape == (*np.shape(expected), x.shape[-1])
+    single, single_slope = jacobian(f, x.astype(np.float32), np)
+    assert single_slope.dtype == np.asarray(single).dtype
     slopes = differences(lambda v: f(v, NUMPY), x)
     np.testing.assert_allclose(derivative, slopes, rtol=1e-6, atol=1e-6 * (1.0 + np.abs(slopes).max()))
     played = record(f, x.shape)(x)
@@ -325,3 +340,257 @@ def test_only_directions_that_change_something_are_recorded():
     assert directions == {"p": {0, 1}, "turned": {4, 5}, "moved": {0, 1, 2, 3}}
     assert type(seen["none"]).__name__ == "Symbolic"
     np.testing.assert_allclose(play(x)[1], differences(lambda v: f(v, NUMPY), x), atol=1e-9)
+
+
+# where a function has a kink, or its slope no bound
+
+
+def sinc(x: Any, xp: Any) -> Any:
+    t = xp.sqrt(xp.linalg.vecdot(x, x))[..., None]
+    return xp.sin(t) / xp.maximum(t, 1e-15)
+
+
+AT_ORIGIN: dict[str, tuple[Callable[[Any, Any], Any], Any]] = {
+    "abs": (lambda x, xp: xp.abs(x), np.zeros((3, 3))),
+    "a norm": (lambda x, xp: xp.sqrt(xp.linalg.vecdot(x, x))[..., None], np.zeros((1, 3))),
+    "a norm by hypot": (
+        lambda x, xp: xp.hypot(xp.hypot(x[..., :1], x[..., 1:2]), x[..., 2:]),
+        np.zeros((1, 3)),
+    ),
+    "sin(t) / max(t, eps)": (sinc, np.zeros((1, 3))),
+    "a direction": (lambda x, xp: x / xp.sqrt(xp.maximum(xp.sum(x * x), 1e-30)), 1e15 * np.eye(3)),
+    "atan2": (lambda x, xp: xp.atan2(x, x[..., ::-1]), np.zeros((3, 3))),
+    "a ratio behind where": (
+        lambda x, xp: xp.where(x == 0.0, 1.0 - x / 2.0, (1.0 - xp.exp(-x)) / xp.where(x == 0.0, 1.0, x)),
+        -0.5 * np.eye(3),
+    ),
+    "a ratio that is not chosen": (lambda x, xp: xp.where(x == 0.0, x, xp.sin(x) / x), np.eye(3)),
+    "a bound that is met": (lambda x, xp: xp.clip(x, min=0.0, max=1.0), np.zeros((3, 3))),
+    "acos of what is kept within 1": (lambda x, xp: xp.acos(xp.clip(1.0 + x, max=1.0)), np.zeros((3, 3))),
+    "sqrt of what is kept above 0": (lambda x, xp: xp.sqrt(xp.maximum(x, 0.0)), np.zeros((3, 3))),
+    "the larger of two": (lambda x, xp: xp.maximum(x, -x), np.eye(3)),
+    "a power": (lambda x, xp: x**2 + x**3 + x**0, np.zeros((3, 3))),
+    "a root": (lambda x, xp: (x**2) ** 0.5, np.zeros((3, 3))),
+    "a product": (lambda x, xp: xp.prod(1.0 + x - 1.0, axis=-1)[..., None], np.zeros((1, 3))),
+    "Exp": (lambda x, xp: from_rotation_vector(x, xp=xp), np.eye(4, 3, -1) / 2.0),
+    "Log(Exp)": (
+        lambda x, xp: to_rotation_vector(normalize(from_rotation_vector(x, xp=xp), xp=xp), xp=xp),
+        np.eye(3),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", AT_ORIGIN)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_at_a_guarded_point_the_derivative_is_that_of_the_guard(name, dtype):
+    f, expected = AT_ORIGIN[name]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        _, found = jacobian(f, np.zeros(3, dtype), np)
+        played = record(f, (3,))(np.zeros(3))[1]
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_allclose(played, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    ("f", "at"),
+    [
+        (lambda x, xp: xp.sqrt(x), 0.0),
+        (lambda x, xp: x**0.5, 0.0),
+        (lambda x, xp: xp.pow(x, 0.5 + 0.0 * x), 0.0),
+        (lambda x, xp: x ** (2.0 + x), 0.0),
+        (lambda x, xp: xp.acos(x), 1.0),
+        (lambda x, xp: xp.asin(x), -1.0),
+    ],
+)
+def test_a_slope_without_bound_is_a_large_number(f, at, dtype):
+    _, slope = jacobian(f, np.full(1, at, dtype), np)
+    assert np.isfinite(slope).all()
+    assert slope == 0.0 or abs(slope) > 1e10
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
+def test_a_guard_that_does_not_hold_changes_nothing(a, b):
+    x = np.array([a, b])
+    _, found = jacobian(lambda v, xp: xp.clip(v, min=-1.0, max=1.0), x, np)
+    np.testing.assert_array_equal(found, np.diag((np.abs(x) < 1.0) * 1.0))
+
+
+# directions, constants and derivatives of derivatives
+
+
+def curved(x: Any, xp: Any) -> Any:
+    return xp.stack([xp.sin(x[..., 0]) * x[..., 1], x[..., 2] ** 3 + x[..., 0] * x[..., 3]], axis=-1)
+
+
+@pytest.mark.parametrize("lead", [(), (5,)])
+def test_the_derivative_along_directions(lead):
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(*lead, 6))
+    _, whole = jacobian(curved, x, np)
+    same, own = rng.normal(size=(6, 4)), rng.normal(size=(*lead, 6, 2))
+    np.testing.assert_allclose(jacobian(curved, x, np, along=same)[1], whole @ same, atol=1e-14)
+    np.testing.assert_allclose(jacobian(curved, x, np, along=own)[1], whole @ own, atol=1e-14)
+    beside = np.concatenate([np.broadcast_to(same, (*lead, 6, 4)), own], axis=-1)
+    np.testing.assert_allclose(jacobian(curved, x, np, along=[same, own])[1], whole @ beside, atol=1e-14)
+    value, recorded = record(curved, x.shape, along=[same, own])(x)
+    np.testing.assert_allclose(recorded, whole @ beside, atol=1e-14)
+    np.testing.assert_array_equal(value, curved(x, NUMPY))
+
+
+def test_directions_that_overlap_in_part_are_cut():
+    """A sum of parts whose tangents have other directions, some of them shared."""
+    weights = np.eye(6)
+    weights[:, 3] = 0.0
+
+    def f(x: Any, xp: Any) -> Any:
+        a, b, c = xp.sin(x[..., :4]), xp.cos(x[..., 2:]), xp.exp(x[..., [0, 2][0] : 3])
+        return xp.concat([a * b, c + a[..., :3], x[..., 4:]], axis=-1)
+
+    x = away_from_kinks(np.linspace(-1.0, 1.0, 6))
+    check(f, x)
+    slopes = differences(lambda v: f(v, NUMPY), x)
+    np.testing.assert_allclose(record(f, (6,), along=weights)(x)[1], slopes @ weights, atol=1e-9)
+
+
+def test_a_second_derivative_is_the_derivative_of_the_first():
+    f = lambda x, xp: xp.exp(x[..., 0]) * x[..., 1] ** 2 + xp.sin(x[..., 0] * x[..., 2])
+    slope = lambda x, xp: jacobian(f, x, xp)[1]
+    x = np.array([[0.3, -0.7, 1.1], [0.1, 0.4, -0.2]])
+    first, second = jacobian(slope, x, np)
+    np.testing.assert_allclose(first, differences(lambda v: f(v, NUMPY), x), atol=1e-8)
+    np.testing.assert_allclose(second, differences(lambda v: slope(v, np), x), atol=1e-8)
+    np.testing.assert_allclose(second, second.mT, atol=1e-14)
+    np.testing.assert_allclose(record(slope, x.shape)(x)[1], second, atol=1e-14)
+
+
+def test_what_the_inner_function_closes_over_is_constant_to_it_alone():
+    """d/dx (x d/dy (x y)) = d/dx x^2, and not x + x y or 0: the two derivatives are told apart."""
+
+    def outer(x: Any, xp: Any) -> Any:
+        inner = lambda y, xp: x * y
+        return x * jacobian(inner, xp.ones_like(x), xp)[1][..., 0]
+
+    np.testing.assert_array_equal(jacobian(outer, np.array([3.0]), np)[1], [[6.0]])
+
+
+def test_a_function_that_does_not_depend_has_a_derivative_of_zero():
+    value, slope = jacobian(lambda x, xp: xp.ones((2, 3)), np.zeros((4, 5)), np)
+    assert value.shape == (2, 3)
+    np.testing.assert_array_equal(slope, np.zeros((2, 3, 5)))
+
+
+def test_a_symbolic_value_on_the_left_leaves_the_operator_to_the_other_class():
+    class Right:
+        __array_ufunc__ = None
+        __radd__ = __rmatmul__ = __gt__ = lambda self, other: "mine"
+
+    x = Trace().input(Spec((2, 2), "real"))
+    assert (x + Right(), x @ Right(), x < Right()) == ("mine", "mine", "mine")
+    with pytest.raises(TypeError, match="unsupported operand"):
+        x - Right()
+
+
+# what is refused, by line
+
+
+def loses(name: str) -> Callable[[Any, Any], Any]:
+    def f(x: Any, xp: Any) -> Any:
+        if name == "float":
+            return float(x[0])
+        if name == "int":
+            return int(x[0])
+        if name == "index":
+            return [1.0, 2.0][x[0]]
+        if name == "branch":
+            return x if x[0] else -x
+        if name == "NumPy":
+            return np.linalg.norm(x)
+        if name == "write":
+            x[0] = 1.0
+        if name == "add in place":
+            x += 1.0
+        if name == "list":
+            return xp.asarray([x[0], x[1]])
+        if name == "mask":
+            return x[x > 0.0]
+        if name == "attribute":
+            return x.astype(np.float32)
+        if name == "method":
+            return x.nothing
+        if name == "indices":
+            return x[0, 0]
+        if name == "scalar":
+            return list(x[0])
+        if name == "T":
+            return x.T
+        if name == "bits":
+            return xp.float32_bits(x)
+        if name == "operation":
+            return xp.einsum("i->", x)
+        return xp.linalg.eigh(x)
+
+    return f
+
+
+REFUSED = {
+    "float": "loses the derivative",
+    "int": "loses the derivative",
+    "index": "loses the derivative",
+    "branch": "loses the derivative",
+    "NumPy": "loses the derivative",
+    "write": "in-place write",
+    "add in place": "in-place write",
+    "list": "from a list",
+    "mask": "depends on data",
+    "attribute": "no attribute 'astype'",
+    "method": "no attribute 'nothing'",
+    "indices": "too many indices",
+    "scalar": "iteration over a scalar",
+    "T": ".T of other than two axes",
+    "bits": "float32_bits has no derivative",
+    "operation": "xp.einsum is not among",
+    "linalg": "xp.linalg.eigh is not among",
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_would_lose_the_derivative_is_refused_by_line(name):
+    with pytest.raises(LoweringError, match=REFUSED[name]) as caught:
+        jacobian(loses(name), np.array([0.5, 0.25]), np)
+    assert caught.value.path.startswith(f"{__name__}:")
+    assert caught.value.in_every_engine
+    assert caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("x", "along", "match"),
+    [
+        (np.array([1, 2]), None, "got: +int64 of shape"),
+        (np.float64(1.0), None, "got: +float64 of shape"),
+        (np.zeros(2), np.zeros((3, 2)), r"expected: +shape \(2, k\)"),
+        (np.zeros((4, 2)), np.zeros((3, 2, 2)), r"or those of x, \(4,\)"),
+    ],
+)
+def test_what_cannot_be_differentiated_by_is_refused(x, along, match):
+    with pytest.raises(DeclarationError, match=match) as caught:
+        jacobian(lambda x, xp: x, x, np, along=along)
+    assert caught.value.path.startswith(f"{__name__}:")
+
+
+class Pair(Signal):
+    a: Array = real(2)
+
+
+def test_a_block_that_loses_the_derivative_is_refused_where_it_is_wired():
+    @block
+    def step(x: Pair, *, xp: Any) -> Array:
+        return jacobian(lambda v, xp: np.sin(v), x.a, xp)[1]
+
+    @graph
+    def g(x: Stream[Pair]):
+        collect(step(x), "out")
+
+    with pytest.raises(LoweringError, match="'Dual' does not support ufuncs"):
+        g.build()
