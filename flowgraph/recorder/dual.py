@@ -64,21 +64,22 @@ class Dual:
                     in_every_engine=True,
                 )
             return self.xp.take(self, entries[0], axis=0)
-        return self.xp.getitem(self, self._full(entries))
+        return self.xp.getitem(self, index=self._full(entries))
 
     def _full(self, entries: list[Any]) -> tuple[Any, ...]:
         """The index with one entry for each axis, and those that are None."""
+        rank = len(self.value.shape)
         used = sum(e is not None and e is not Ellipsis for e in entries)
-        if used > self.ndim:
+        if used > rank:
             refuse(
                 f"too many indices for shape {self.shape}",
-                f"at most {self.ndim}",
+                f"at most {rank}",
                 str(used),
                 "drop some",
                 in_every_engine=True,
             )
         at = next((i for i, e in enumerate(entries) if e is Ellipsis), len(entries))
-        entries[at : at + 1] = [slice(None)] * (self.ndim - used)
+        entries[at : at + 1] = [slice(None)] * (rank - used)
         return tuple(e if e is None or isinstance(e, slice) else operator.index(e) for e in entries)
 
     def __setitem__(self, index: Any, value: Any) -> None:

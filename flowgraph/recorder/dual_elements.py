@@ -34,15 +34,17 @@ def _weighted(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], slope
 
     A slope is called when its argument has a tangent; None in place of it is 1.
     """
-    rank = max(len(shape_of(v)) for v in values)
+    a, b = values
+    rank = max(len(shape_of(a)), len(shape_of(b)))
     out: Tangent = {}
     for t, slope in zip(tangents, slopes, strict=True):
         if t:
-            g = None if slope is None else slope()
+            g = 1.0 if slope is None else slope()
             if type(g) in (int, float) and not g:
                 continue  # 0.0 * x, as written to give a constant the shape of x
-            wide = mapped(t, lambda d: lifted(xp, d, rank))
-            out = added(xp, out, wide if g is None else mapped(wide, lambda d, g=g: d * g))
+            wide = {key: lifted(xp, d, rank) for key, d in t.items()}
+            scaled = wide if slope is None else {key: d * g for key, d in wide.items()}
+            out = added(xp, out, scaled) if out else scaled
     return out
 
 
