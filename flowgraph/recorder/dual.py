@@ -54,7 +54,7 @@ class Dual:
 
     def __getitem__(self, index: Any) -> Any:
         entries = list(index) if isinstance(index, tuple) else [index]
-        if len(entries) == 1 and getattr(entries[0], "shape", ()):
+        if len(entries) == 1 and getattr(entries[0], "shape", None):
             if np.dtype(entries[0].dtype) == np.bool_:
                 refuse(
                     "the shape of x[mask] depends on data",

@@ -79,10 +79,10 @@ def _pow(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent]) -> Made:
     def by_base() -> Any:
         if not shape_of(p) and isinstance(p, int | float | np.generic | np.ndarray):
             known = float(p)
-            if known == 2.0:
-                return 2.0 * x
-            inside = x if known >= 1.0 or known <= 0.0 else xp.maximum(x, LEAST)
-            return 0.0 * y if known == 0.0 else p * xp.pow(inside, p - 1)
+            if known in (0.0, 1.0, 2.0):
+                return (0.0, 1.0, 2.0 * x)[int(known)]
+            inside = xp.maximum(x, LEAST) if 0.0 < known < 1.0 else x
+            return known * xp.pow(inside, known - 1.0)
         # p x^(p - 1), which at x = 0 has no bound where p < 1
         return p * xp.pow(xp.where((x == 0.0) & (p < 1.0), LEAST, x), p - 1.0)
 

@@ -69,7 +69,13 @@ def moving(control: Imu, dt: Any, gravity: tuple[float, float, float] = GRAVITY)
 
 @block
 def predict_derived(
-    belief: Gaussian, control: Imu, *, noise: ImuNoise, gravity: tuple[float, ...], dt: float, xp: Any
+    belief: Gaussian,
+    control: Imu,
+    *,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float],
+    dt: float,
+    xp: Any,
 ) -> Gaussian:
     after, J = in_tangent_space(moving(control, dt, gravity), STATE, STATE, belief.mean, xp, 6)
     F, G = J[..., :9], J[..., 9:]
