@@ -17,7 +17,7 @@ import os
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
@@ -56,8 +56,8 @@ def picture(draw: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 @contextmanager
-def plain_matplotlib() -> Iterator[None]:
-    """Matplotlib's own defaults inside, what was set before outside.
+def plain_matplotlib(settings: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Matplotlib's own defaults and these settings inside, what was set before outside.
 
     Raises:
         MissingDependencyError: where matplotlib is not installed.
@@ -70,6 +70,7 @@ def plain_matplotlib() -> Iterator[None]:
                 matplotlib.rcParams["backend"] = os.environ["MPLBACKEND"]
     with _alone, matplotlib.rc_context():
         matplotlib.rcdefaults()
+        matplotlib.rcParams.update(settings or {})
         yield
 
 
