@@ -46,6 +46,7 @@ from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
     from flowgraph.data.progress import ProgressBar
+    from flowgraph.recorder.derivatives import jacobian
 
 
 _lead()
@@ -74,6 +75,10 @@ def __getattr__(name: str) -> object:
         from flowgraph.data.progress import ProgressBar
 
         return ProgressBar
+    if name == "jacobian":  # a program without derivatives need not read their rules
+        from flowgraph.recorder.derivatives import jacobian
+
+        return jacobian
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -128,6 +133,7 @@ __all__ = [
     "high_pass",
     "integer",
     "integrate",
+    "jacobian",
     "latest",
     "load_flight",
     "load_state",

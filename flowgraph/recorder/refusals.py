@@ -18,7 +18,19 @@ def caller() -> str:
 
 MACHINERY = tuple(
     f"{__package__}.{name}"
-    for name in ("namespaces", "ops", "ranges", "refusals", "symbolic", "symbolic_namespace", "trace")
+    for name in (
+        "namespaces",
+        "ops",
+        "ranges",
+        "refusals",
+        "symbolic",
+        "symbolic_namespace",
+        "trace",
+        "tangents",
+        "dual",
+        "dual_rules",
+        "derivatives",
+    )
 )
 """Modules whose frames are not the user's code."""
 
