@@ -210,6 +210,10 @@ class StateSpace:
             raise UnknownNameError("part", name, self.names, path="StateSpace")
         return self.places()[self.names.index(name)][2]
 
+    def resting(self) -> Gaussian:
+        """The state at rest, with a covariance of one."""
+        return Gaussian(mean=self.rest, covariance=np.eye(self.tangent))
+
     def gaussian(self, **parts: tuple[Any, Any]) -> Gaussian:
         """A belief to start from: for each part by name its mean and standard deviation.
 

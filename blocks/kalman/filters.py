@@ -63,11 +63,8 @@ def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt:
 
     Source: Bar-Shalom et al. eqs. 5.2.3-2, 5.2.3-5. (R. Fiszel's thesis, 2017, prints S- for S there.)
     """
-    F, G, Q = model.discrete(dt, xp, belief.mean.dtype)
-    return Gaussian(
-        mean=(F @ belief.mean[..., None] + G @ control[..., None])[..., 0],
-        covariance=_symmetric(F @ belief.covariance @ F.mT + Q),
-    )
+    mean, F, Q = model.linearised(belief.mean, control, dt, xp)
+    return Gaussian(mean=mean, covariance=_symmetric(F @ belief.covariance @ F.mT + Q))
 
 
 @block

@@ -68,6 +68,7 @@ from flowgraph.blocks.signals.sensors import (
     SpecificForce,
     Thrust,
 )
+from flowgraph.blocks.signals.vectors import vector_of
 from flowgraph.blocks.signals.vision import (
     CameraMotion,
     PoseMeasurement,
@@ -129,4 +130,5 @@ __all__ = [
     "CountsSum",
     "Window",
     "NormalEquations",
+    "vector_of",
 ]

@@ -19,10 +19,8 @@ from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.geometry.views import array_of, joined, stacked_parts
 from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.errors import DeclarationError
-from flowgraph.recorder.differentiate import jacobian
-from flowgraph.types import ArrayType, flatten, leaves_of, type_of
 
-__all__ = ["Covariance", "Handed", "differentiated", "numbers", "vector_of"]
+__all__ = ["Covariance", "Handed", "numbers"]
 
 
 class Handed:
@@ -93,24 +91,8 @@ class Covariance:
         return noise_matrix(given, n, self.path, kind=kind, xp=xp)
 
 
-def vector_of(message: Any, xp: Any) -> Array:
-    """The numbers (m) of a message: a vector, a number, or the real leaves of a signal in their order."""
-    type_ = type_of(message)
-    if isinstance(type_, ArrayType):
-        return message if type_.shape else xp.reshape(message, (1,))
-    kinds = [leaf.dtype == "real" for _, leaf in leaves_of(type_)]
-    leaves = [leaf for leaf, real in zip(flatten(message, type_), kinds, strict=True) if real]
-    flat = [xp.reshape(leaf, (-1 if not leaf.shape else int(np.prod(leaf.shape)),)) for leaf in leaves]
-    return flat[0] if len(flat) == 1 else xp.concat(flat, axis=-1)
-
-
 def numbers(found: Any, like: Array, space: StateSpace | None, xp: Any) -> Array:
     """What a function of states returned, an array, a view or the parts in order, as one array."""
     if not isinstance(found, tuple | list):
         return array_of(found)
     return stacked_parts(found, like, xp) if space is None else joined(space, found, like, xp, tangent=False)
-
-
-def differentiated(function: Callable[[Array, Any], Array], at: Array, xp: Any) -> Array:
-    """The derivative (..., m, n) of `function(d, xp)` (..., m) by the vector `at` (n)."""
-    return jacobian(function, at, xp)[1]

@@ -22,8 +22,10 @@ import numpy as np
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.statespace.functions import Covariance, Handed, differentiated, numbers, vector_of
+from flowgraph.blocks.signals import vector_of
+from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.errors import DeclarationError
+from flowgraph.recorder.derivatives import jacobian
 
 __all__ = ["LinearMeasurement", "Measurement", "MeasurementModel"]
 
@@ -43,12 +45,12 @@ class Measurement(abc.ABC):
         """What would be measured (..., m) of states (..., size) with noises v (..., n_v), if they go in."""
 
     @abc.abstractmethod
-    def noise(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
-        """The covariance of the noise: (m, m) where it is added, (n_v, n_v) where it goes in."""
+    def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
+        """Of the noise: (m, m) where it is added, (n_v, n_v) where it goes in."""
 
     @property
     @abc.abstractmethod
-    def noise_inside(self) -> bool:
+    def inside(self) -> bool:
         """Whether noise goes into what is seen, and is not added to it."""
 
     @abc.abstractmethod
@@ -101,11 +103,101 @@ class MeasurementModel(Measurement):
 
     space: StateSpace
     observe: Callable[..., Any]
-    noise: Any  # type: ignore[assignment]
+    noise: Any
     measured_space: StateSpace | None = None
     read: Callable[[Any], Array] | None = None
     _observe: Handed = field(init=False, repr=False)
     _noise: Covariance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        pass
+        observe = Handed(self.observe, "MeasurementModel.observe", ("v", "xp"), "message")
+        object.__setattr__(self, "_observe", observe)
+        object.__setattr__(self, "_noise", Covariance(self.noise, "MeasurementModel.noise"))
+
+    @property
+    def inside(self) -> bool:
+        return "v" in self._observe.names
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def seen(self, x: Array, v: Array | None, message: Any, xp: Any) -> Array:
+        found = self._observe(self.space.view(x, xp), message, v=v, xp=xp)
+        return numbers(found, x, self.measured_space, xp)
+
+    def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
+        return self._noise.matrix(message, kind, xp, None if self.inside else m)
+
+    def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
+        kind, t = x.dtype, d.shape[-1]
+        inside = self.covariance(message, 0, kind, xp) if self.inside else None
+        still = None if inside is None else xp.zeros((inside.shape[-1],), dtype=kind)
+        z = self.seen(self.space.plus(x, d, xp), still, message, xp)
+
+        def apart(c: Array, xp: Any) -> Array:
+            v = None if inside is None else c[..., t:]
+            return self.apart(self.seen(self.space.plus(x, c[..., :t], xp), v, message, xp), z, xp)
+
+        _, both = jacobian(apart, d if still is None else xp.concat([d, still], axis=-1), xp)
+        H, V = both[..., :t], both[..., t:]
+        R = self.covariance(message, z.shape[-1], kind, xp) if inside is None else V @ inside @ V.mT
+        return z, H, R
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMeasurement(Measurement):
+    """z = H x + v, over a space of vectors and angles.
+
+    Args:
+        space: of the state, of n numbers.
+        H: (m, n), or a function of the message that gives it.
+        noise: covariance of v, (m, m); (m) is its diagonal, one number the variance of each entry; or a
+            function of the message.
+        measured_space, read: as in `MeasurementModel`.
+
+    Raises:
+        DeclarationError: where H does not fit the space, or the noise is no covariance.
+    """
+
+    space: StateSpace
+    H: Any
+    noise: Any
+    measured_space: StateSpace | None = None
+    read: Callable[[Any], Array] | None = None
+    _noise: Covariance = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = self.space.size
+        shape = (0, n) if callable(self.H) else np.shape(self.H)
+        if len(shape) != 2 or shape[1] != n or self.space.tangent != n:
+            raise DeclarationError(
+                "the matrix of a measurement does not fit",
+                path="LinearMeasurement.H",
+                expected=f"shape (m, {n}), over a space without attitudes",
+                got=f"shape {shape}, {self.space}",
+                fix="give it a column for each number of the state",
+            )
+        object.__setattr__(self, "_noise", Covariance(self.noise, "LinearMeasurement.noise"))
+
+    @property
+    def inside(self) -> bool:
+        return False
+
+    @property
+    def linear(self) -> bool:
+        return True
+
+    def _matrix(self, message: Any, kind: Any, xp: Any) -> Array:
+        given = self.H(message) if callable(self.H) else np.asarray(self.H, dtype=float)
+        return xp.asarray(given, dtype=kind)
+
+    def seen(self, x: Array, v: Array | None, message: Any, xp: Any) -> Array:
+        return (self._matrix(message, x.dtype, xp) @ x[..., None])[..., 0]
+
+    def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
+        return self._noise.matrix(message, kind, xp, m)
+
+    def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
+        z = self.seen(self.space.plus(x, d, xp), None, message, xp)
+        return z, self._matrix(message, x.dtype, xp), self.covariance(message, z.shape[-1], x.dtype, xp)

@@ -19,48 +19,49 @@ sec. 6.3 (noise that is constant over a step).
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
-from flowgraph.blocks.kalman.roots import semidefinite_root
-from flowgraph.blocks.statespace.functions import Covariance, Handed, differentiated, numbers, vector_of
+from flowgraph.blocks.kalman.triangles import semidefinite_root
+from flowgraph.blocks.signals import vector_of
+from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.errors import DeclarationError
+from flowgraph.recorder.derivatives import jacobian
 
 __all__ = ["DiscreteModel", "Motion", "MotionModel"]
 
 
-class Motion(abc.ABC):
-    """How a state of a `space` moves: what every method asks of it."""
+class Motion(Protocol):
+    """How a state of a `space` moves: what every method asks of it.
 
-    space: StateSpace
-
-    @abc.abstractmethod
-    def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
-        """The states (..., size), one a row, after dt seconds with the noises w (..., n_w); None: without."""
-
-    @abc.abstractmethod
-    def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array | None:
-        """A triangular root (n_w, n_w) of the covariance of w over dt seconds; None where there is no noise."""
-
-    @abc.abstractmethod
-    def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
-        """(x', F, Q) at the state x (size), with F and Q (t, t); Q is None where there is no noise."""
+    `kalman.LinearModel`, motion that is linear in continuous time, is one too.
+    """
 
     @property
-    @abc.abstractmethod
+    def space(self) -> StateSpace:
+        """Of the state."""
+
+    @property
     def linear(self) -> bool:
         """Whether x' is a matrix times x, and noise of a covariance that does not depend on x."""
 
+    def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
+        """The states (..., size), one a row, after dt seconds with the noises w (..., n_w); None: without."""
+
+    def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array | None:
+        """A triangular root (n_w, n_w) of the covariance of w over dt seconds; None where there is no noise."""
+
+    def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
+        """(x', F, Q) at the state x (size), with F and Q (t, t); Q is None where there is no noise."""
+
 
 @dataclass(frozen=True, eq=False)
-class MotionModel(Motion):
+class MotionModel:
     """A motion given by a function, over any space.
 
     Args:
@@ -122,13 +123,13 @@ class MotionModel(Motion):
             start = self.space.plus(x, d[..., :t], xp)
             return self.space.minus(self.carry(start, control, d[..., t:] if none else None, dt, xp), after, xp)
 
-        both = differentiated(moved, xp.zeros((t + none,), dtype=kind), xp)
+        _, both = jacobian(moved, xp.zeros((t + none,), dtype=kind), xp)
         F, G = both[..., :t], both[..., t:]
         return after, F, None if D is None else G @ (D * _per_second(dt, kind, xp)) @ G.mT
 
 
 @dataclass(frozen=True, eq=False)
-class DiscreteModel(Motion):
+class DiscreteModel:
     """A linear motion by steps, whatever time they take: x' = F x + G u + w, w ~ N(0, Q).
 
     A prediction over no time, as at the first firing, is no step. Each matrix may be a function of the
@@ -148,7 +149,7 @@ class DiscreteModel(Motion):
     F: Any
     Q: Any
     G: Any = None
-    space: StateSpace = None  # type: ignore[assignment]
+    space: StateSpace = field(default=None, repr=False)  # type: ignore[assignment]
     _Q: Covariance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
