@@ -1,8 +1,8 @@
 """Filters: the belief about a state that moves as one model says and is seen as others say.
 
 A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
-by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths of those
-that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
+by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
+of those that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,13 @@ from flowgraph.blocks.filtering.methods import (
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import Gaussian
-from flowgraph.blocks.statespace import DiscreteModel, LinearMeasurement, MeasurementModel, MotionModel
+from flowgraph.blocks.statespace import (
+    DiscreteModel,
+    LinearMeasurement,
+    MeasurementModel,
+    MotionModel,
+    runge_kutta,
+)
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
@@ -41,6 +47,7 @@ __all__ = [
     "SE",
     "SE_2",
     "MotionModel",
+    "runge_kutta",
     "LinearModel",
     "DiscreteModel",
     "MeasurementModel",

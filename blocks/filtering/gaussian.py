@@ -65,7 +65,7 @@ class GaussianMethod(abc.ABC):
         """Kinds of number that it cannot be computed in."""
         return ()
 
-    def need(self, model: Motion | Measurement) -> None:
+    def need(self, model: Motion | Measurement) -> None:  # noqa: B027 (most methods take any)
         """Refuse a model that it cannot be used with."""
 
 

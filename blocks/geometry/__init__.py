@@ -36,7 +36,7 @@ from flowgraph.blocks.geometry.geodetic import (
     from_enu,
     to_enu,
 )
-from flowgraph.blocks.geometry.groups import SE, SE_2, SO
+from flowgraph.blocks.geometry.groups import SE, SE_2, SO, swept, turned_by
 from flowgraph.blocks.geometry.manifold import Part, Quaternion, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     between_vectors,
@@ -95,6 +95,8 @@ __all__ = [
     "SO",
     "SE",
     "SE_2",
+    "swept",
+    "turned_by",
     "View",
     "array_of",
     "joined",

@@ -37,7 +37,7 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["SE", "SE_2", "SO"]
+__all__ = ["SE", "SE_2", "SO", "swept", "turned_by"]
 
 _SMALL = 1e-2
 """rad^2: below, the ratios of the exponential are sums, whose first term left out is under their rounding."""
@@ -77,12 +77,12 @@ class _Plane(Part):
 
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         heading, theta = x[..., 2:], d[..., 2:]
-        moved = x[..., :2] + _turned(heading, _swept(theta, d[..., :2], xp), xp)
+        moved = x[..., :2] + turned_by(heading, swept(theta, d[..., :2], xp), xp)
         return xp.concat([moved, _ANGLE.plus(heading, theta, xp)], axis=-1)
 
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         theta = _ANGLE.minus(a[..., 2:], b[..., 2:], xp)
-        apart = _turned(-b[..., 2:], a[..., :2] - b[..., :2], xp)
+        apart = turned_by(-b[..., 2:], a[..., :2] - b[..., :2], xp)
         return xp.concat([_unswept(theta, apart, xp), theta], axis=-1)
 
     def turn(self, d: Array, xp: Any) -> Array:
@@ -95,14 +95,15 @@ class _Plane(Part):
         return table
 
 
-def _turned(angle: Array, v: Array, xp: Any) -> Array:
+def turned_by(angle: Array, v: Array, xp: Any) -> Array:
+    """A vector of the plane (..., 2), turned by an angle (..., 1)."""
     c, s = xp.cos(angle), xp.sin(angle)
     x, y = v[..., :1], v[..., 1:]
     return xp.concat([c * x - s * y, s * x + c * y], axis=-1)
 
 
-def _swept(theta: Array, v: Array, xp: Any) -> Array:
-    """How far a body comes that goes v in its own frame while it turns by theta."""
+def swept(theta: Array, v: Array, xp: Any) -> Array:
+    """How far (..., 2) a body comes that goes v (..., 2) in its own frame and turns by theta (..., 1)."""
     square = theta * theta
     small = square < _SMALL
     safe = xp.where(small, 1.0, theta)
@@ -115,7 +116,7 @@ def _swept(theta: Array, v: Array, xp: Any) -> Array:
 
 
 def _unswept(theta: Array, v: Array, xp: Any) -> Array:
-    """The inverse of `_swept`: half theta over its tangent on the diagonal."""
+    """The inverse of `swept`: half theta over its tangent on the diagonal."""
     square = theta * theta
     small = square < _SMALL
     half = 0.5 * xp.where(small, 1.0, theta)

@@ -71,7 +71,14 @@ class LinearModel:
         B = np.zeros((n, 1)) if B is None else np.array(B, dtype=float)
         D = np.diag(D) if D.shape == (n,) else D
         self.space = StateSpace(euclidean(n)) if space is None else space
-        if self.space.size != n or self.space.tangent != n or A.shape != (n, n) or D.shape != (n, n) or B.ndim != 2 or len(B) != n:
+        if (
+            self.space.size != n
+            or self.space.tangent != n
+            or A.shape != (n, n)
+            or D.shape != (n, n)
+            or B.ndim != 2
+            or len(B) != n
+        ):
             raise DeclarationError(
                 "the matrices of a linear model do not fit together",
                 path="LinearModel",

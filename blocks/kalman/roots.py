@@ -27,6 +27,7 @@ from flowgraph.blocks.signals import GaussianRoot, KalmanInnovation
 
 __all__ = ["predict_root", "update_extended_root", "update_root"]
 
+
 @block
 def predict_root(
     belief: GaussianRoot, control: Vector, *, model: LinearModel, dt: float, xp: Any

@@ -66,6 +66,7 @@ from flowgraph.blocks.signals.sensors import (
     PointReading,
     Range,
     SpecificForce,
+    Steering,
     Thrust,
 )
 from flowgraph.blocks.signals.vectors import vector_of
@@ -100,6 +101,7 @@ __all__ = [
     "Thrust",
     "BodyRate",
     "PointReading",
+    "Steering",
     "Tags",
     "PoseMeasurement",
     "CameraMotion",

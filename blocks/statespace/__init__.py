@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.blocks.statespace.measurement import LinearMeasurement, Measurement, MeasurementModel
-from flowgraph.blocks.statespace.motion import DiscreteModel, Motion, MotionModel
+from flowgraph.blocks.statespace.motion import DiscreteModel, Motion, MotionModel, runge_kutta
 
 __all__ = [
     "Motion",
     "MotionModel",
     "DiscreteModel",
+    "runge_kutta",
     "Measurement",
     "MeasurementModel",
     "LinearMeasurement",

@@ -54,7 +54,7 @@ def _refuse_parameters(path: str, offered: tuple[str, ...], other: str, got: str
         path=path,
         expected=f"the state, then any of {', '.join(offered)}, and at most one more for the {other}",
         got=got,
-        fix=f"write def {path.rpartition('.')[2]}(x, {', '.join(offered)}), or with a parameter for the {other}",
+        fix=f"write def {path.rpartition('.')[2]}(x, {', '.join(offered)}), and one more for the {other}",
     )
 
 
@@ -84,7 +84,9 @@ class Covariance:
     def matrix(self, message: Any, kind: Any, xp: Any, n: int | None = None) -> Array:
         """(n, n), in the precision `kind`."""
         given = self.given(message) if callable(self.given) else self.given
-        shape = tuple(np.shape(given)) if isinstance(given, int | float | list | tuple) else tuple(given.shape)
+        shape = (
+            tuple(np.shape(given)) if isinstance(given, int | float | list | tuple) else tuple(given.shape)
+        )
         n = (shape[-1] if shape else 1) if n is None else n
         if not isinstance(given, int | float | list | tuple | np.ndarray) and shape in ((), (n,)):
             return given[..., None] * xp.eye(n, dtype=kind)  # computed by the graph

@@ -130,19 +130,19 @@ class MeasurementModel(Measurement):
         return self._noise.matrix(message, kind, xp, None if self.inside else m)
 
     def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
-        kind, t = x.dtype, d.shape[-1]
+        kind, t, row, d = x.dtype, d.shape[-1], x[None, :], d[None, :]
         inside = self.covariance(message, 0, kind, xp) if self.inside else None
-        still = None if inside is None else xp.zeros((inside.shape[-1],), dtype=kind)
-        z = self.seen(self.space.plus(x, d, xp), still, message, xp)
+        still = None if inside is None else xp.zeros((1, inside.shape[-1]), dtype=kind)
+        z = self.seen(self.space.plus(row, d, xp), still, message, xp)
 
         def apart(c: Array, xp: Any) -> Array:
             v = None if inside is None else c[..., t:]
-            return self.apart(self.seen(self.space.plus(x, c[..., :t], xp), v, message, xp), z, xp)
+            return self.apart(self.seen(self.space.plus(row, c[..., :t], xp), v, message, xp), z, xp)
 
         _, both = jacobian(apart, d if still is None else xp.concat([d, still], axis=-1), xp)
-        H, V = both[..., :t], both[..., t:]
-        R = self.covariance(message, z.shape[-1], kind, xp) if inside is None else V @ inside @ V.mT
-        return z, H, R
+        H, V = both[0, :, :t], both[0, :, t:]
+        R = self.covariance(message, H.shape[-2], kind, xp) if inside is None else V @ inside @ V.mT
+        return z[0, :], H, R
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,13 +27,14 @@ import numpy as np
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.geometry.views import array_of, joined
 from flowgraph.blocks.kalman.triangles import semidefinite_root
 from flowgraph.blocks.signals import vector_of
 from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.errors import DeclarationError
 from flowgraph.recorder.derivatives import jacobian
 
-__all__ = ["DiscreteModel", "Motion", "MotionModel"]
+__all__ = ["DiscreteModel", "Motion", "MotionModel", "runge_kutta"]
 
 
 class Motion(Protocol):
@@ -54,7 +55,7 @@ class Motion(Protocol):
         """The states (..., size), one a row, after dt seconds with the noises w (..., n_w); None: without."""
 
     def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array | None:
-        """A triangular root (n_w, n_w) of the covariance of w over dt seconds; None where there is no noise."""
+        """A triangular root (n_w, n_w) of the covariance of w over dt seconds; None without noise."""
 
     def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
         """(x', F, Q) at the state x (size), with F and Q (t, t); Q is None where there is no noise."""
@@ -114,18 +115,18 @@ class MotionModel:
         return xp.asarray(root, dtype=kind) * xp.sqrt(_per_second(dt, kind, xp))
 
     def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
-        t, kind = self.space.tangent, x.dtype
+        t, kind, row = self.space.tangent, x.dtype, x[None, :]
         D = None if self._density is None else self._density.matrix(control, kind, xp)
-        none = 0 if D is None else D.shape[-1]
-        after = self.carry(x, control, None if D is None else xp.zeros((none,), dtype=kind), dt, xp)
+        n = 0 if D is None else D.shape[-1]
+        after = self.carry(row, control, None if D is None else xp.zeros((1, n), dtype=kind), dt, xp)
 
         def moved(d: Array, xp: Any) -> Array:
-            start = self.space.plus(x, d[..., :t], xp)
-            return self.space.minus(self.carry(start, control, d[..., t:] if none else None, dt, xp), after, xp)
+            start = self.space.plus(row, d[..., :t], xp)
+            return self.space.minus(self.carry(start, control, d[..., t:] if n else None, dt, xp), after, xp)
 
-        _, both = jacobian(moved, xp.zeros((t + none,), dtype=kind), xp)
-        F, G = both[..., :t], both[..., t:]
-        return after, F, None if D is None else G @ (D * _per_second(dt, kind, xp)) @ G.mT
+        _, both = jacobian(moved, xp.zeros((1, t + n), dtype=kind), xp)
+        F, G = both[0, :, :t], both[0, :, t:]
+        return after[0, :], F, None if D is None else G @ (D * _per_second(dt, kind, xp)) @ G.mT
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,11 @@ class DiscreteModel:
         ]  # rows of each are those of the state
         Q = Covariance(self.Q, "DiscreteModel.Q")
         fits = space is not None and space.size == space.tangent and Q.size in (None, space.size)
-        if not fits or any(len(s) != 2 or s[0] != space.size for s in shapes) or size not in (None, space.size):
+        if (
+            not fits
+            or any(len(s) != 2 or s[0] != space.size for s in shapes)
+            or size not in (None, space.size)
+        ):
             raise DeclarationError(
                 "the matrices of a linear model do not fit together",
                 path="DiscreteModel",
@@ -199,6 +204,47 @@ class DiscreteModel:
         after = (F @ x[..., None])[..., 0]
         after = after if pushed is None else after + pushed
         return (after if self.space.flat else self.space.plus(x, after - x, xp)), F, Q
+
+
+def runge_kutta(space: StateSpace, rates: Callable[..., Any], *, steps: int = 1) -> Callable[..., Any]:
+    """A `move` made of a differential equation, by the classical Runge-Kutta rule of fourth order.
+
+        MotionModel(PENDULUM, runge_kutta(PENDULUM, swing), density=...)
+
+    On angles and vectors the error of a step is of the fifth order in dt; on attitudes and groups the slopes
+    are taken to belong to the start of the step, which leaves an error of the third order.
+
+    Args:
+        space: of the state.
+        rates: `rates(x, u, w, xp)`, the velocity of each part as `space.plus(x, velocity=...)` takes it; u
+            and w may be left out.
+        steps: equal parts that a step is taken in.
+
+    Raises:
+        DeclarationError: where `rates` has other parameters.
+    """
+    slope = Handed(rates, "runge_kutta.rates", ("w", "xp"), "control")
+
+    def move(x: Any, u: Any, w: Any, dt: Any, xp: Any) -> Any:
+        start, h = space.view(x, xp), dt / steps
+        for _ in range(steps):
+            here = array_of(start)
+            at = lambda y: joined(space, slope(y, u, w=w, xp=xp), here, xp, tangent=True)  # noqa: B023
+            go = lambda d: space.view(space.plus(here, d, xp), xp)  # noqa: B023
+            k1 = at(start)
+            k2 = at(go(0.5 * h * k1))
+            k3 = at(go(0.5 * h * k2))
+            k4 = at(go(h * k3))
+            start = go(h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4))
+        return start
+
+    if "w" in slope.names and slope.other:
+        return move
+    if slope.other:
+        return lambda x, u, dt, xp: move(x, u, None, dt, xp)
+    if "w" in slope.names:
+        return lambda x, w, dt, xp: move(x, None, w, dt, xp)
+    return lambda x, dt, xp: move(x, None, None, dt, xp)
 
 
 def _given(matrix: Any, control: Any) -> Any:
