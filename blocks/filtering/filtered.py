@@ -165,7 +165,7 @@ def _fitting(start: Gaussian, motion: Motion) -> Gaussian:
 def begin(
     kept: Any, prior: Gaussian, message: Any | None, started: Any, *,
     method: Method, motion: Motion, believe: Callable[..., Gaussian], rest: Any, draw: Any, xp: Any,
-):  # fmt: skip
+) -> tuple[Any, Gaussian, bool]:  # fmt: skip
     """What a filter keeps, once it has started: before, `rest`; with the first message, what that says.
 
     Args:
