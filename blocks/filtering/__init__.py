@@ -26,6 +26,17 @@ from flowgraph.blocks.filtering.methods import (
     predict,
     unscented,
 )
+from flowgraph.blocks.filtering.particles import (
+    PROPOSALS,
+    Particles,
+    auxiliary_cloud,
+    carry_cloud,
+    cloud_size,
+    guide_cloud,
+    particles,
+    resample_cloud,
+    weigh_cloud,
+)
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import Gaussian
@@ -61,6 +72,15 @@ __all__ = [
     "unscented",
     "cubature",
     "SigmaPoints",
+    "particles",
+    "PROPOSALS",
+    "Particles",
+    "carry_cloud",
+    "guide_cloud",
+    "auxiliary_cloud",
+    "weigh_cloud",
+    "resample_cloud",
+    "cloud_size",
     "Method",
     "Advanced",
     "Seen",
