@@ -7,6 +7,7 @@ of those that believe in a Gaussian. Everything that a user's own filter needs i
 
 from __future__ import annotations
 
+from flowgraph.blocks.filtering.banks import Interacting, imm
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
     Extended,
@@ -72,6 +73,8 @@ __all__ = [
     "unscented",
     "cubature",
     "SigmaPoints",
+    "imm",
+    "Interacting",
     "particles",
     "PROPOSALS",
     "Particles",

@@ -101,7 +101,7 @@ def filtered(
         if control is not None:
             at_first = zeros(control.type) if control_at_first is None else control_at_first
             held = latest(control, init=at_first, at=ticks, name="control")
-        initial = method.begin(rest, motion, NumpyDraw("start", seed_words(0), 0), np)
+        initial = method.begin(rest, motion, NumpyDraw("start", seed_words(method.seed), 0), np)
         kept = delay(initial, name="belief")
         found = method.advance(kept, held, motion, seen, at=ticks, gate=gate, patience=patience)
         if isinstance(start, FirstMeasurement):

@@ -58,8 +58,9 @@ class GaussianMethod(abc.ABC):
     @abc.abstractmethod
     def corrected(
         self, kept: Any, message: Any, measurement: Measurement, gate: float | None, xp: Any
-    ) -> tuple[Any, When]:
-        """What is kept with a message, and the innovation, present where any entry was measured."""
+    ) -> tuple[Any, When, Array]:
+        """What is kept with a message, the innovation, present where any entry was measured, and the
+        log-likelihood of the message."""
 
     def limits(self) -> tuple[Limit, ...]:
         """Kinds of number that it cannot be computed in."""
@@ -83,7 +84,7 @@ class Extended(GaussianMethod):
 
     def corrected(
         self, kept: Gaussian, message: Any, measurement: Measurement, gate: float | None, xp: Any
-    ) -> tuple[Gaussian, When]:
+    ) -> tuple[Gaussian, When, Array]:
         x, P, space = kept.mean, kept.covariance, measurement.space
         measured = measurement.vector(message, xp)
         d = xp.zeros((P.shape[-1],), dtype=x.dtype)
@@ -104,7 +105,7 @@ class Extended(GaussianMethod):
             d = xp.where(innovation.accepted, d, 0.0)
             covariance = xp.where(innovation.accepted, covariance, P)
         posterior = Gaussian(mean=moved(x, d, space, xp), covariance=covariance)
-        return posterior, where_any(present, innovation, xp)
+        return posterior, where_any(present, innovation, xp), innovation_log_likelihood(innovation, xp=xp)
 
 
 @dataclass(frozen=True)
@@ -141,10 +142,10 @@ class Unscented(GaussianMethod):
 
     def corrected(
         self, kept: Gaussian, message: Any, measurement: Measurement, gate: float | None, xp: Any
-    ) -> tuple[Gaussian, When]:
+    ) -> tuple[Gaussian, When, Array]:
         kind, measured = kept.mean.dtype, measurement.vector(message, xp)
         inside = measurement.covariance(message, 0, kind, xp) if measurement.inside else None
-        return through_observation(
+        posterior, found = through_observation(
             kept,
             measured,
             lambda x, v: measurement.seen(x, v, message, xp),
@@ -156,6 +157,7 @@ class Unscented(GaussianMethod):
             gate=gate,
             xp=xp,
         )
+        return posterior, found, innovation_log_likelihood(found.value, xp=xp)
 
 
 def innovation_log_likelihood(innovation: KalmanInnovation, *, xp: Any) -> Array:

@@ -18,7 +18,6 @@ from flowgraph.blocks.filtering.gaussian import (
     GaussianMethod,
     Linear,
     Unscented,
-    innovation_log_likelihood,
 )
 from flowgraph.blocks.kalman.lost import find_back
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
@@ -55,6 +54,9 @@ class Advanced(NamedTuple):
 
 class Method(abc.ABC):
     """How a filter of a model is wired."""
+
+    seed = 0
+    """Of the draws of the start."""
 
     @abc.abstractmethod
     def begin(self, start: Gaussian, motion: Motion, draw: Any, xp: Any) -> Any:
@@ -115,8 +117,7 @@ def correct(
     """
     if message is None:
         return prior, None, None
-    posterior, found = method.corrected(prior, message, measurement, gate, xp)
-    likely = innovation_log_likelihood(found.value, xp=xp)
+    posterior, found, likely = method.corrected(prior, message, measurement, gate, xp)
     return posterior, found, when(found.present, likely)
 
 
@@ -162,7 +163,7 @@ class GaussianFilter(Method):
                     kept, innovations[one.name], patience=patience, moving=motion.space.tangent,
                     name=f"find_back{suffix}",
                 )  # fmt: skip
-        return Advanced(kept, prior, self._belief(kept, motion, "belief"), innovations, likelihoods, {})
+        return Advanced(kept, prior, self._belief(kept, motion, "posterior"), innovations, likelihoods, {})
 
     def _belief(self, kept: Any, motion: Motion, name: str) -> Stream[Gaussian]:
         if type(self.maths).believed is GaussianMethod.believed:

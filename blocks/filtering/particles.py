@@ -303,6 +303,7 @@ class Particles(Method):
     resample_below: float
     scheme: str
     draws: str
+    seed: int
 
     def begin(self, start: Gaussian, motion: Motion, draw: Any, xp: Any) -> StateCloud:
         n, kind = self.count, start.mean.dtype
@@ -371,6 +372,7 @@ def particles(
     proposal: str = "bootstrap",
     resample_below: float = 0.5,
     scheme: str = "systematic",
+    seed: int = 0,
     draws: str = "particles",
 ) -> Method:
     """A particle filter, of any model and any number of particles.
@@ -381,6 +383,7 @@ def particles(
             measurement that `filtered` is given.
         resample_below: drawn anew when the effective sample size is below this fraction of them.
         scheme: "systematic", "stratified", "residual" or "multinomial".
+        seed: of the draws of the start; that of a run is given to `simulate`.
         draws: what its random streams are called; two filters in one graph need two names.
 
     Raises:
@@ -397,4 +400,4 @@ def particles(
     for value, known, what in ((proposal, PROPOSALS, "proposal"), (scheme, tuple(SCHEMES), "scheme")):
         if value not in known:
             raise UnknownNameError(what, value, known, path=f"particles.{what}")
-    return Particles(count, proposal, resample_below, scheme, draws)
+    return Particles(count, proposal, resample_below, scheme, draws, seed)

@@ -220,10 +220,14 @@ def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
 
 def accepts(nis: Array, gate: float | None, present: Array, xp: Any) -> Array:
     """Whether an innovation (...) of the entries `present` (..., m) passes the gate; all do without one."""
+    return passes(nis, gate, xp.sum(xp.astype(present, nis.dtype), axis=-1), present.shape[-1], xp)
+
+
+def passes(nis: Array, gate: float | None, parts: Array, m: int, xp: Any) -> Array:
+    """Whether an innovation (...) of so many parts (...) of m passes the gate; all do without one."""
     if gate is None:
         return nis == nis
-    limits = gate_table(gate, present.shape[-1])
-    parts = xp.sum(xp.astype(present, nis.dtype), axis=-1)[..., None]
+    limits, parts = gate_table(gate, m), parts[..., None]
     places = xp.asarray(np.arange(len(limits)), dtype=nis.dtype)
     return nis <= xp.sum(xp.where(parts == places, xp.asarray(limits, dtype=nis.dtype), 0.0), axis=-1)
 
