@@ -69,8 +69,9 @@ def filtered(
 ) -> Stream[Gaussian]:
     """The belief about the state of a model, by any method: a sub-graph.
 
-    Collected under `name/`: the `prior` of each tick, and where there was a measurement its `innovation`,
-    with NIS, and its `log_likelihood`; with the name of the stream in front where there are several.
+    Collected: the `prior` of each tick, and where there was a measurement its `innovation`, with NIS, and its
+    `log_likelihood`, with the name of the stream in front where there are several measurements; all with
+    `name_` in front where a name is given.
 
     Args:
         motion: how the state moves.
@@ -83,7 +84,7 @@ def filtered(
         gate: as in `update_linear`: below 1 the probability with which an honest measurement passes, from 1
             on the largest NIS. Refused measurements change nothing.
         patience: how many refusals in a row are taken for outliers; then the gate opens again (`find_back`).
-        name: of the sub-graph.
+        name: of the sub-graph; two in one graph need two.
 
     Returns:
         `Gaussian` at every tick of a measurement or the control; with `first(...)` from that tick on.
@@ -107,14 +108,15 @@ def filtered(
         if isinstance(start, FirstMeasurement):
             found = _from_first(found, start, seen, initial, motion, method)
         kept.feed(found.kept)
-        collect(found.prior, "prior")
-        for label, stream in found.innovations.items():
-            front = f"{label}_" if len(seen) > 1 else ""
-            collect(stream, f"{front}innovation")
-            collect(found.log_likelihoods[label], f"{front}log_likelihood")
-        for label, stream in found.more.items():
-            collect(stream, label)
-        return found.belief
+    own = "" if name == "filter" else f"{name}_"
+    collect(found.prior, f"{own}prior")
+    for label, stream in found.innovations.items():
+        front = own + (f"{label}_" if len(seen) > 1 else "")
+        collect(stream, f"{front}innovation")
+        collect(found.log_likelihoods[label], f"{front}log_likelihood")
+    for label, stream in found.more.items():
+        collect(stream, own + label)
+    return found.belief
 
 
 def _named(motion: Motion, measurements: Mapping[Measurement, Stream[Any]]) -> list[Seen]:

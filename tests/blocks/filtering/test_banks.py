@@ -95,7 +95,7 @@ def test_it_is_equal_in_all_engines_and_lowered(method):
     inputs = {"spot": Series(np.arange(len(z)) * SECOND, Spot(position=z))}
     built = both.build(method=imm(MOVES, STAYS, transition=STAY, method=method), gate=0.999)
     result = all_engines(built, inputs)
-    assert len(result["filter/log_likelihood"]) == len(z)
+    assert len(result["log_likelihood"]) == len(z)
     assert {"filter/predict", "filter/correct", "filter/posterior"} <= {s.path for s in lower(built).stages}
 
 
@@ -112,13 +112,13 @@ def test_a_bank_without_transitions_is_its_filters_weighed_by_their_likelihood()
 
         result = simulate(single.build(), inputs)
         alone.append(result["output"]["mean"][-1])
-        weight.append(result["filter/log_likelihood"]["value"].sum())
+        weight.append(result["log_likelihood"]["value"].sum())
     share = np.exp(np.array(weight) - max(weight))
     share /= share.sum()
     result = simulate(both.build(method=imm(MOVES, STAYS, transition=np.eye(2), method=linear())), inputs)
     expected = share @ np.array(alone)
     np.testing.assert_allclose(result["output"]["mean"][-1], expected, rtol=1e-12, atol=1e-9)
-    whole = result["filter/log_likelihood"]["value"].sum()
+    whole = result["log_likelihood"]["value"].sum()
     assert whole == pytest.approx(np.logaddexp(*weight) - np.log(2.0), abs=1e-9)
 
 

@@ -119,8 +119,8 @@ def test_a_method_is_equal_in_all_engines_lowered_and_drawn(name):
     _, inputs = driven(3.0)
     built = tracker.build(method=METHODS[name])
     result = all_engines(built, inputs)
-    assert len(result["filter/innovation"]) == len(inputs["fix"])
-    assert len(result["filter/log_likelihood"]) == len(inputs["fix"])
+    assert len(result["innovation"]) == len(inputs["fix"])
+    assert len(result["log_likelihood"]) == len(inputs["fix"])
     paths = {stage.path for stage in lower(built).stages}
     assert {"filter/predict", "filter/correct"} <= paths
     assert "predict" in built.text()
@@ -138,7 +138,7 @@ def test_a_method_is_consistent_and_better_than_what_it_is_told(name):
         solved = np.linalg.solve(belief["covariance"], apart[..., None])[..., 0]
         nees.append(np.sum(apart * solved, axis=-1).mean())
         error.append(np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=-1))))
-        nis.append(result["filter/innovation"]["nis"].mean())
+        nis.append(result["innovation"]["nis"].mean())
     assert np.mean(error) < 1.6, "a fix alone is 2.8 m off"
     assert 3.0 < np.mean(nees) < 5.2, "4 in a consistent filter"
     assert 1.6 < np.mean(nis) < 2.4, "2 in a consistent filter"
@@ -158,7 +158,7 @@ def test_noise_that_goes_in_is_noise_that_is_added_where_it_only_adds():
             found = simulate(tracker.build(seen=seen, method=method), inputs)
             for leaf in ("mean", "covariance"):
                 np.testing.assert_allclose(found["output"][leaf], expected["output"][leaf], atol=1e-10)
-            likely = [r["filter/log_likelihood"]["value"] for r in (found, expected)]
+            likely = [r["log_likelihood"]["value"] for r in (found, expected)]
             np.testing.assert_allclose(*likely, atol=1e-10)
 
 
@@ -239,7 +239,7 @@ def test_the_likelihood_is_that_of_all_measurements_at_once():
     inputs = {"z": Series(np.arange(3) * 100 * MS, Value(value=z))}
     for method in (linear(), unscented()):
         result = simulate(steps.build(method=method), inputs)
-        assert abs(result["filter/log_likelihood"]["value"].sum() - expected) < 1e-12
+        assert abs(result["log_likelihood"]["value"].sum() - expected) < 1e-12
 
 
 class Value(Signal):
@@ -293,7 +293,7 @@ def test_a_gate_refuses_and_finds_its_way_back(method):
     jump = {k: (50.0, 50.0) for k in range(20, 40)}
     built = point.build(method=method, gate=0.999)
     result = (all_engines if method == extended() else simulate)(built, spots(at=jump))
-    accepted = result["filter/innovation"]["accepted"]
+    accepted = result["innovation"]["accepted"]
     assert accepted[:20].all()
     assert not accepted[20:25].any()
     assert accepted[-5:].all()
@@ -306,12 +306,12 @@ def test_entries_that_are_missing_say_nothing(method):
     inputs = spots(at=at)
     series = inputs["spot"]
     result = simulate(point.build(method=method), inputs)
-    assert len(result["filter/innovation"]) == len(series) - 1
-    assert result["filter/innovation"]["parts"][5] == 1.0
+    assert len(result["innovation"]) == len(series) - 1
+    assert result["innovation"]["parts"][5] == 1.0
     for leaf in ("mean", "covariance"):
         assert np.isfinite(result["output"][leaf]).all()
-    np.testing.assert_array_equal(result["output"]["mean"][9], result["filter/prior"]["mean"][9])
-    before, after = (result[name]["covariance"][5, 0, 0] for name in ("filter/prior", "output"))
+    np.testing.assert_array_equal(result["output"]["mean"][9], result["prior"]["mean"][9])
+    before, after = (result[name]["covariance"][5, 0, 0] for name in ("prior", "output"))
     assert before == pytest.approx(after, rel=1e-14)
 
 
@@ -325,9 +325,9 @@ def test_a_filter_starts_from_its_first_measurement(method):
     built = tracker.build(start=first(GPS, believe), method=method)
     result = (all_engines if method == extended() else simulate)(built, inputs)
     fix = inputs["fix"]
-    assert result["output"].time[0] == fix.time[0] == result["filter/prior"].time[0]
+    assert result["output"].time[0] == fix.time[0] == result["prior"].time[0]
     np.testing.assert_array_equal(result["output"]["mean"][0], [*fix["position"][0], 0.3, 5.0])
-    np.testing.assert_array_equal(result["filter/innovation"].time, fix.time[1:])
+    np.testing.assert_array_equal(result["innovation"].time, fix.time[1:])
     later = {name: series[series.time >= fix.time[0]] for name, series in inputs.items()}
     start = Gaussian(mean=result["output"]["mean"][0], covariance=result["output"]["covariance"][0])
     later["fix"] = later["fix"][1:]

@@ -51,7 +51,7 @@ def test_it_is_equal_in_all_engines_lowered_and_drawn(proposal):
     _, inputs = driven(2.0)
     built = tracker.build(method=particles(40, proposal=proposal))
     result = all_engines(built, inputs)
-    assert len(result["filter/effective_sample_size"]) == len(inputs["fix"])
+    assert len(result["effective_sample_size"]) == len(inputs["fix"])
     assert {"filter/carry", "filter/resample"} <= {stage.path for stage in lower(built).stages}
     assert "resample" in built.text()
 
@@ -63,8 +63,8 @@ def test_the_likelihood_is_the_exact_one_within_its_spread(proposal):
     exact = simulate(point.build(method=linear()), inputs)
     method = lambda seed: particles(500, proposal=proposal, seed=seed)
     runs = [simulate(point.build(method=method(k)), inputs, seed=k, engine="reference") for k in range(12)]
-    expected = exact["filter/log_likelihood"]["value"].sum()
-    found = np.array([r["filter/log_likelihood"]["value"].sum() for r in runs])
+    expected = exact["log_likelihood"]["value"].sum()
+    found = np.array([r["log_likelihood"]["value"].sum() for r in runs])
     ratio = np.exp(found - expected)
     assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio)) + 0.05
     apart = np.mean([r["output"]["mean"] for r in runs], axis=0) - exact["output"]["mean"]
@@ -89,8 +89,8 @@ def test_a_guided_cloud_keeps_its_particles_where_a_measurement_is_sharp():
     size, error = {}, {}
     for proposal in ("bootstrap", "guided"):
         result = simulate(sharp.build(method=particles(200, proposal=proposal)), inputs)
-        size[proposal] = result["filter/effective_sample_size"]["value"][1:].mean()
-        likely = result["filter/log_likelihood"]["value"][1:] - exact["filter/log_likelihood"]["value"][1:]
+        size[proposal] = result["effective_sample_size"]["value"][1:].mean()
+        likely = result["log_likelihood"]["value"][1:] - exact["log_likelihood"]["value"][1:]
         error[proposal] = np.abs(likely).mean()
     assert size["guided"] > 190.0, "for a linear model each weight is that of the prediction"
     assert size["bootstrap"] < 20.0
@@ -128,7 +128,7 @@ def test_noise_that_is_multiplied_is_followed_by_particles_and_not_by_a_derivati
     for name, method in {"extended": extended(), "particles": particles(500)}.items():
         result = simulate(followed.build(method=method), inputs, engine="reference")
         error[name] = np.sqrt(np.mean((result["output"]["mean"][:, 0] - levels) ** 2))
-        likely[name] = result["filter/log_likelihood"]["value"].sum()
+        likely[name] = result["log_likelihood"]["value"].sum()
     assert error["particles"] < 0.9 * error["extended"]
     assert likely["particles"] > likely["extended"]
 
