@@ -17,29 +17,31 @@ import numpy as np
 
 from flowgraph.errors import DeclarationError, LoweringError
 from flowgraph.recorder.dual import Dual
-from flowgraph.recorder.dual_rules import RULES, plain
+from flowgraph.recorder.dual_rules import RULES
+from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic_namespace import namespace as symbolic
-from flowgraph.recorder.tangents import Tangent, pruned, spread
+from flowgraph.recorder.tangents import LINALG, Tangent, plain, pruned, spread
 from flowgraph.types import Array
 
 __all__ = ["jacobian"]
 
 
 def jacobian(
-    f: Callable[..., Array], x: Array, xp: Any, *, along: Array | None = None
+    f: Callable[..., Array], x: Array, xp: Any, *, along: Array | Sequence[Array] | None = None
 ) -> tuple[Array, Array]:
     """The value of f at x, and its derivative.
 
     Args:
-        f: `f(x, xp) -> y`, on x (..., n), a point a row, and y (..., m), of each row its own. It must take its
-            functions from the `xp` that it is handed; what else it needs, it closes over, and that counts as
-            constant. It may itself call `jacobian`.
+        f: `f(x, xp) -> y`, on x (..., n), a point a row, and y (..., m), of each row its own. It must take
+            its functions from the `xp` that it is handed; what else it needs, it closes over, and that counts
+            as constant. It may itself call `jacobian`.
         x: real numbers (..., n).
         xp: the namespace of x, as a block is handed it.
         along: (n, k), constant or not: the derivative along these k directions, in place of along each of
-            the n numbers. Without leading axes, or with those of x.
+            the n numbers. Without leading axes, or with those of x. Several such matrices are taken as beside
+            each other; what directions of one do not change is then not computed for them.
 
     Returns:
         y (..., m), and dy/dx (..., m, n), or (..., m, k): entry (i, j) is how y_i changes with x_j. Where y
@@ -52,15 +54,21 @@ def jacobian(
     x = xp.asarray(x)
     n = _needs_real(x)
     if along is None:
-        start = xp.reshape(xp.eye(n, dtype=x.dtype), (n, *(1,) * (len(x.shape) - 1), n))
+        parts = [xp.reshape(xp.eye(n, dtype=x.dtype), (n, *(1,) * (len(x.shape) - 1), n))]
     else:
-        start = _directions(xp.asarray(along), x, xp)
-    k = start.shape[0]
+        given = along if isinstance(along, list | tuple) else [along]
+        parts = [_directions(xp.asarray(d), x, xp) for d in given]
+    start: Tangent = {}
+    k = 0
+    for d in parts:
+        start[tuple(range(k, k + d.shape[0]))] = d
+        k += d.shape[0]
     inner = Duals(xp)
-    y = f(inner.made(x, {tuple(range(k)): start}), inner)
+    y = f(inner.made(x, start), inner)
     if not isinstance(y, Dual) or y.xp is not inner:
         y = xp.asarray(y)
-        return y, xp.zeros((*y.shape, k), dtype=x.dtype)
+        kind = y.dtype if np.dtype(y.dtype).kind == "f" else x.dtype
+        return y, xp.zeros((*y.shape, k), dtype=kind)
     return y.value, _assembled(y, k, xp)
 
 
@@ -126,69 +134,24 @@ class Duals:
     """
 
     def __init__(self, below: Any) -> None:
-        self.below = below
+        self.below = NUMPY if below is np else below
         self.depth: int = below.depth + 1 if isinstance(below, Duals) else 1
         self.sparse: bool = below.sparse if isinstance(below, Duals) else below is symbolic
-        """Whether zeros are looked for: where work is recorded that is done many times, not where it is done."""
+        """Whether zeros are looked for: where work is recorded, to be done many times."""
         self.linalg = _Linalg(self)
 
     def made(self, value: Any, tangent: Tangent) -> Any:
-        """A dual array; the value itself where it does not change."""
+        """A dual array, in one precision; the value itself where it does not change."""
         if self.sparse:
             tangent = pruned(tangent)
+        for key, d in tangent.items():
+            if d.dtype != value.dtype:
+                tangent = {**tangent, key: self.below.astype(d, value.dtype)}
         return Dual(self, value, tangent) if tangent else value
-
-    def _is_mine(self, x: Any) -> bool:
-        return type(x) is Dual and x.xp is self
-
-    def _apply(self, name: str, args: Sequence[Any], attrs: dict[str, Any]) -> Any:
-        mine = [self._is_mine(a) for a in args]
-        values = [a.value if m else a for a, m in zip(args, mine, strict=True)]
-        tangents = [a.tangent if m else {} for a, m in zip(args, mine, strict=True)]
-        rule = RULES.get(name)
-        if rule is None:
-            refuse(
-                f"xp.{name} has no derivative",
-                "operations on real numbers",
-                f"xp.{name}(x)",
-                "keep it outside of the function that is differentiated",
-                in_every_engine=True,
-            )
-        return self.made(*rule(self.below, values, tangents, **attrs))
-
-    def _operation(self, name: str) -> Callable[..., Any]:
-        function = None if name == "getitem" else plain(self.below, name)
-
-        def call(*args: Any, **attrs: Any) -> Any:
-            if function is not None and not any(self._is_mine(a) for a in args):
-                return function(*args, **attrs)
-            return self._apply(name, args, attrs)
-
-        return call
-
-    def _joining(self, name: str) -> Callable[..., Any]:
-        def call(arrays: Sequence[Any], /, *, axis: int = 0) -> Any:
-            if not any(self._is_mine(a) for a in arrays):
-                return getattr(self.below, name)(arrays, axis=axis)
-            return self._apply(name, arrays, {"axis": axis})
-
-        return call
-
-    def _shaping(self, name: str, attr: str) -> Callable[..., Any]:
-        def call(x: Any, /, value: Any) -> Any:
-            if not self._is_mine(x):
-                return getattr(self.below, name)(x, value)
-            return self._apply(name, [x], {attr: value})
-
-        return call
-
-    def getitem(self, x: Dual, index: tuple[Any, ...]) -> Any:
-        """x[index], with an entry for each axis."""
-        return self._apply("getitem", [x], {"index": index})
 
     def asarray(self, x: Any, /, *, dtype: Any = None) -> Any:
         """The array itself, or a new one."""
-        if self._is_mine(x):
+        if isinstance(x, Dual) and x.xp is self:
             return x if dtype is None else self.astype(x, dtype)
         if isinstance(x, list | tuple) and any(isinstance(a, Dual) for a in x):
             refuse(
@@ -199,6 +162,34 @@ class Duals:
                 in_every_engine=True,
             )
         return self.below.asarray(x, dtype=dtype)
+
+    def concat(self, arrays: Sequence[Any], /, *, axis: int = 0) -> Any:
+        """Arrays one behind the other."""
+        return _applied(self, "concat", arrays, {"axis": axis}, joined=True)
+
+    def stack(self, arrays: Sequence[Any], /, *, axis: int = 0) -> Any:
+        """Arrays of one shape along a new axis."""
+        return _applied(self, "stack", arrays, {"axis": axis}, joined=True)
+
+    def astype(self, x: Any, dtype: Any, /) -> Any:
+        """x as another kind of number; a whole number has no derivative."""
+        return _applied(self, "astype", [x], {"dtype": dtype}, placed=True)
+
+    def reshape(self, x: Any, /, shape: tuple[int, ...]) -> Any:
+        """The elements of x in another shape."""
+        return _applied(self, "reshape", [x], {"shape": shape}, placed=True)
+
+    def broadcast_to(self, x: Any, /, shape: tuple[int, ...]) -> Any:
+        """x, repeated along axes."""
+        return _applied(self, "broadcast_to", [x], {"shape": shape}, placed=True)
+
+    def permute_dims(self, x: Any, /, axes: tuple[int, ...]) -> Any:
+        """x with its axes in another order."""
+        return _applied(self, "permute_dims", [x], {"axes": axes}, placed=True)
+
+    def roll(self, x: Any, /, shift: int, *, axis: int | None = None) -> Any:
+        """x with its elements moved on, those beyond the end to the start."""
+        return _applied(self, "roll", [x], {"shift": shift, "axis": axis})
 
     def expand_dims(self, x: Any, /, *, axis: int = 0) -> Any:
         """x with an axis of size 1 more."""
@@ -219,31 +210,17 @@ class Duals:
 
     def zeros_like(self, x: Any, /) -> Any:
         """Zeros of a shape and kind."""
-        return self.below.zeros_like(x.value if self._is_mine(x) else x)
+        return self.below.zeros_like(x.value if isinstance(x, Dual) and x.xp is self else x)
 
     def ones_like(self, x: Any, /) -> Any:
         """Ones of a shape and kind."""
-        return self.below.ones_like(x.value if self._is_mine(x) else x)
+        return self.below.ones_like(x.value if isinstance(x, Dual) and x.xp is self else x)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        if name in ("concat", "stack"):
-            found: Any = self._joining(name)
-        elif name in _SHAPING:
-            found = self._shaping(name, _SHAPING[name])
-        else:
-            try:
-                listed = getattr(symbolic, name)  # refuses what is no operation, by line
-            except LoweringError as error:
-                error.in_every_engine = True
-                raise
-            found = self._operation(name) if name in OPS and callable(listed) else getattr(self.below, name)
+        _need_listed(symbolic, name)
+        found = getattr(self.below, name)
         setattr(self, name, found)
         return found
-
-
-_SHAPING = {"reshape": "shape", "broadcast_to": "shape", "permute_dims": "axes", "astype": "dtype"}
 
 
 class _Linalg:
@@ -253,13 +230,82 @@ class _Linalg:
         self._duals = duals
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        try:
-            getattr(symbolic.linalg, name)  # refuses what is no operation, by line
-        except LoweringError as error:
-            error.in_every_engine = True
-            raise
-        found = self._duals._operation(name)
-        setattr(self, name, found)
-        return found
+        _need_listed(symbolic.linalg, name)
+        return getattr(self._duals, name)
+
+
+def _need_listed(namespace: Any, name: str) -> None:
+    """Refuse what is no operation, by line."""
+    if name.startswith("__"):
+        raise AttributeError(name)
+    try:
+        getattr(namespace, name)
+    except LoweringError as error:
+        error.in_every_engine = True
+        raise
+
+
+def _applied(
+    duals: Duals,
+    name: str,
+    args: Sequence[Any],
+    attrs: dict[str, Any],
+    *,
+    joined: bool = False,
+    placed: bool = False,
+) -> Any:
+    """An operation by its rule, where an argument is a dual array of this namespace; else the one below.
+
+    Args:
+        duals: the namespace.
+        name, args, attrs: of the operation.
+        joined: whether it takes its arrays as one list.
+        placed: whether it takes its attributes by their place.
+    """
+    values, tangents, found = [], [], False
+    for a in args:
+        if type(a) is Dual and a.xp is duals:
+            values.append(a.value)
+            tangents.append(a.tangent)
+            found = True
+        else:
+            values.append(a)
+            tangents.append(_NONE)
+    if found:
+        return duals.made(*RULES[name](duals.below, values, tangents, **attrs))
+    function = plain(duals.below, name)
+    if joined:
+        return function(args, **attrs)
+    return function(*args, *attrs.values()) if placed else function(*args, **attrs)
+
+
+_NONE: Tangent = {}
+
+
+def _method(name: str) -> Callable[..., Any]:
+    def call(self: Duals | _Linalg, *args: Any, **attrs: Any) -> Any:
+        return _applied(self if isinstance(self, Duals) else self._duals, name, args, attrs)
+
+    return call
+
+
+def _refusing(name: str) -> Callable[..., Any]:
+    def call(self: Duals, *args: Any, **attrs: Any) -> Any:
+        if any(isinstance(a, Dual) for a in args):
+            refuse(
+                f"xp.{name} has no derivative",
+                "operations on real numbers",
+                f"xp.{name}(x)",
+                "keep it outside of the function that is differentiated",
+                in_every_engine=True,
+            )
+        return plain(self.below, name)(*args, **attrs)
+
+    return call
+
+
+for _name in OPS:
+    if _name in LINALG:
+        setattr(_Linalg, _name, _method(_name))
+    elif not hasattr(Duals, _name):
+        setattr(Duals, _name, _method(_name) if _name in RULES else _refusing(_name))

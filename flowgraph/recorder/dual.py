@@ -54,7 +54,7 @@ class Dual:
 
     def __getitem__(self, index: Any) -> Any:
         entries = list(index) if isinstance(index, tuple) else [index]
-        if len(entries) == 1 and getattr(entries[0], "shape", ()):
+        if len(entries) == 1 and getattr(entries[0], "shape", None):
             if np.dtype(entries[0].dtype) == np.bool_:
                 refuse(
                     "the shape of x[mask] depends on data",
@@ -64,21 +64,22 @@ class Dual:
                     in_every_engine=True,
                 )
             return self.xp.take(self, entries[0], axis=0)
-        return self.xp.getitem(self, self._full(entries))
+        return self.xp.getitem(self, index=self._full(entries))
 
     def _full(self, entries: list[Any]) -> tuple[Any, ...]:
         """The index with one entry for each axis, and those that are None."""
+        rank = len(self.value.shape)
         used = sum(e is not None and e is not Ellipsis for e in entries)
-        if used > self.ndim:
+        if used > rank:
             refuse(
                 f"too many indices for shape {self.shape}",
-                f"at most {self.ndim}",
+                f"at most {rank}",
                 str(used),
                 "drop some",
                 in_every_engine=True,
             )
         at = next((i for i, e in enumerate(entries) if e is Ellipsis), len(entries))
-        entries[at : at + 1] = [slice(None)] * (self.ndim - used)
+        entries[at : at + 1] = [slice(None)] * (rank - used)
         return tuple(e if e is None or isinstance(e, slice) else operator.index(e) for e in entries)
 
     def __setitem__(self, index: Any, value: Any) -> None:
@@ -148,9 +149,9 @@ def _needs_xp(got: str) -> NoReturn:
 
 def _operator(op: str, swap: bool = False) -> Callable[..., Any]:
     def method(self: Dual, other: Any) -> Any:
-        if isinstance(other, Dual) and other.xp.depth > self.xp.depth:
-            return NotImplemented  # to the inner derivative this one is a constant
-        apply = getattr(self.xp, op)
+        # to an inner derivative the arrays of the outer one are constants
+        inner = isinstance(other, Dual) and other.xp.depth > self.xp.depth
+        apply = getattr(other.xp if inner else self.xp, op)
         return apply(other, self) if swap else apply(self, other)
 
     return method

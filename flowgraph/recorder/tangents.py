@@ -18,6 +18,23 @@ import numpy as np
 
 Directions = tuple[int, ...]
 Tangent = dict[Directions, Any]
+Made = tuple[Any, Tangent]
+Rule = Callable[..., Made]
+"""`rule(xp, values, tangents, **attrs)`: the value and the tangent of a result, from those of the arguments.
+`xp` is the namespace of the values."""
+
+LINALG = ("cholesky", "solve", "cross", "vecdot", "outer")
+"""Operations of the extension `linalg`."""
+
+
+def plain(xp: Any, name: str) -> Any:
+    """The function of that name in a namespace of values."""
+    return getattr(xp.linalg if name in LINALG else xp, name)
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """The shape of an array or number."""
+    return tuple(getattr(x, "shape", ()))
 
 
 def mapped(tangent: Tangent, function: Callable[[Any], Any]) -> Tangent:
@@ -26,10 +43,9 @@ def mapped(tangent: Tangent, function: Callable[[Any], Any]) -> Tangent:
 
 
 def aligned(xp: Any, *tangents: Tangent) -> list[tuple[Directions, list[Any]]]:
-    """The parts of several tangents side by side, over keys that all share; None where one has no such part."""
+    """The parts of several tangents side by side, over keys that all share; None where one has none."""
     keys = list(dict.fromkeys(key for t in tangents for key in t))
-    whole = len({i for key in keys for i in key}) == sum(map(len, keys))
-    if not whole:
+    if len(keys) > 1 and len({i for key in keys for i in key}) < sum(map(len, keys)):
         owners = [{i: key for key in t for i in key} for t in tangents]
         groups: dict[tuple[Directions | None, ...], list[int]] = {}
         for i in sorted({i for key in keys for i in key}):
@@ -46,6 +62,8 @@ def added(xp: Any, a: Tangent, b: Tangent) -> Tangent:
     """The sum of two tangents, whose arrays broadcast."""
     if not a or not b:
         return a or b
+    if a.keys() == b.keys():
+        return {key: d + b[key] for key, d in a.items()}
     pairs = aligned(xp, a, b)
     return {key: d if e is None else e if d is None else d + e for key, (d, e) in pairs}
 
