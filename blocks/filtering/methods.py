@@ -118,7 +118,7 @@ def correct(
     if message is None:
         return prior, None, None
     posterior, found, likely = method.corrected(prior, message, measurement, gate, xp)
-    return posterior, found, when(found.present, likely)
+    return posterior, when(*found), when(found.present, likely)
 
 
 @predict.limited
@@ -149,8 +149,9 @@ class GaussianFilter(Method):
         self, kept: Any, control: Any, motion: Motion, seen: Sequence[Seen], *,
         at: Any, gate: float | None, patience: int,
     ) -> Advanced:  # fmt: skip
-        for model in (motion, *(one.model for one in seen)):
-            self.maths.need(model)
+        self.maths.need(motion)
+        for one in seen:
+            self.maths.need(one.model)
         kept = predict(kept, control, motion=motion, method=self.maths, at=at, name="predict")
         prior, innovations, likelihoods = self._belief(kept, motion, "prior"), {}, {}
         for one in seen:

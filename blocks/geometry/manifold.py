@@ -24,7 +24,7 @@ import abc
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Part(abc.ABC):
     size: int
     tangent: int
 
-    fields = ()
+    fields: ClassVar[Any] = ()
     """Names of parts of the part, each with its place in `size`."""
 
     @property

@@ -112,7 +112,7 @@ def _operated(name: str, swap: bool) -> Any:
 for _name in ("add", "sub", "mul", "truediv", "matmul"):
     setattr(View, f"__{_name}__", _operated(_name, False))
     setattr(View, f"__r{_name}__", _operated(_name, True))
-View.__neg__ = lambda self: -self.array  # type: ignore[attr-defined]
+setattr(View, "__neg__", lambda self: -self.array)  # noqa: B010 (as those above)
 
 
 def array_of(x: Any) -> Array:

@@ -160,12 +160,9 @@ class DiscreteModel:
             tuple(np.shape(m)) for m in (self.F, self.G) if m is not None and not callable(m)
         ]  # rows of each are those of the state
         Q = Covariance(self.Q, "DiscreteModel.Q")
-        fits = space is not None and space.size == space.tangent and Q.size in (None, space.size)
-        if (
-            not fits
-            or any(len(s) != 2 or s[0] != space.size for s in shapes)
-            or size not in (None, space.size)
-        ):
+        n = None if space is None or space.size != space.tangent else space.size
+        fits = n is not None and Q.size in (None, n) and size in (None, n)
+        if not fits or any(len(s) != 2 or s[0] != n for s in shapes):
             raise DeclarationError(
                 "the matrices of a linear model do not fit together",
                 path="DiscreteModel",
