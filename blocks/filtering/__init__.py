@@ -13,6 +13,7 @@ from flowgraph.blocks.filtering.gaussian import (
     Extended,
     GaussianMethod,
     Linear,
+    SquareRoot,
     Unscented,
     innovation_log_likelihood,
 )
@@ -25,6 +26,7 @@ from flowgraph.blocks.filtering.methods import (
     extended,
     linear,
     predict,
+    square_root,
     unscented,
 )
 from flowgraph.blocks.filtering.particles import (
@@ -70,6 +72,7 @@ __all__ = [
     "FirstMeasurement",
     "linear",
     "extended",
+    "square_root",
     "unscented",
     "cubature",
     "SigmaPoints",
@@ -92,6 +95,7 @@ __all__ = [
     "GaussianMethod",
     "Linear",
     "Extended",
+    "SquareRoot",
     "Unscented",
     "innovation_log_likelihood",
 ]

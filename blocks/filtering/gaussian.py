@@ -5,6 +5,7 @@ makes of it. The corrections are those of `kalman` and `unscented`.
 
     linear       the Kalman filter, of models that are linear
     extended     with the derivatives of the model; iterated, with those at the corrected state
+    square root  the same on a triangular root of the covariance, with twice the digits
     unscented    with sigma points of state and noise
     cubature     with the 2n points of equal weight
 
@@ -29,15 +30,16 @@ from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import correct as correct_jointly
 from flowgraph.blocks.kalman.filters import moved, where_any
-from flowgraph.blocks.kalman.triangles import semidefinite_root
-from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph.blocks.kalman.roots import correct_root
+from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
+from flowgraph.blocks.signals import Gaussian, GaussianRoot, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.blocks.unscented.filters import through_motion, through_observation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import Limit, When
 
-__all__ = ["Extended", "GaussianMethod", "Linear", "Unscented", "innovation_log_likelihood"]
+__all__ = ["Extended", "GaussianMethod", "Linear", "SquareRoot", "Unscented", "innovation_log_likelihood"]
 
 
 class GaussianMethod(abc.ABC):
@@ -121,6 +123,36 @@ class Linear(Extended):
                 got=repr(model),
                 fix="write method=extended(): it takes any model, and is the same filter for a linear one",
             )
+
+
+@dataclass(frozen=True)
+class SquareRoot(GaussianMethod):
+    """The extended Kalman filter on a triangular root of the covariance; see `square_root`."""
+
+    def begin(self, start: Gaussian, space: StateSpace, xp: Any) -> GaussianRoot:
+        return GaussianRoot(mean=start.mean, root=semidefinite_root(start.covariance, xp=xp))
+
+    def believed(self, kept: GaussianRoot, space: StateSpace, xp: Any) -> Gaussian:
+        return Gaussian(mean=kept.mean, covariance=kept.root @ kept.root.mT)
+
+    def predicted(self, kept: GaussianRoot, control: Any, motion: Motion, dt: Any, xp: Any) -> GaussianRoot:
+        mean, F, Q = motion.linearised(kept.mean, control, dt, xp)
+        wide = F @ kept.root
+        wide = wide if Q is None else xp.concat([wide, semidefinite_root(Q, xp=xp)], axis=-1)
+        return GaussianRoot(mean=mean, root=lower_root(wide, xp=xp))
+
+    def corrected(
+        self, kept: GaussianRoot, message: Any, measurement: Measurement, gate: float | None, xp: Any
+    ) -> tuple[GaussianRoot, When, Array]:
+        still = xp.zeros((kept.root.shape[-1],), dtype=kept.mean.dtype)
+        z, H, R = measurement.linearised(kept.mean, still, message, xp)
+        apart = measurement.apart(measurement.vector(message, xp), z, xp)
+        present, space = ~xp.isnan(apart), measurement.space
+        shift, root, innovation = correct_root(
+            kept.root, xp.where(present, apart, 0.0), H, R, present=present, gate=gate, space=space, xp=xp
+        )
+        posterior = GaussianRoot(mean=moved(kept.mean, shift, space, xp), root=root)
+        return posterior, where_any(present, innovation, xp), innovation_log_likelihood(innovation, xp=xp)
 
 
 @dataclass(frozen=True)

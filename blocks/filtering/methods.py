@@ -17,6 +17,7 @@ from flowgraph.blocks.filtering.gaussian import (
     Extended,
     GaussianMethod,
     Linear,
+    SquareRoot,
     Unscented,
 )
 from flowgraph.blocks.kalman.lost import find_back
@@ -26,7 +27,18 @@ from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import Limit
 
-__all__ = ["Advanced", "Method", "Seen", "correct", "cubature", "extended", "linear", "predict", "unscented"]
+__all__ = [
+    "Advanced",
+    "Method",
+    "Seen",
+    "correct",
+    "cubature",
+    "extended",
+    "linear",
+    "predict",
+    "square_root",
+    "unscented",
+]
 
 
 class Seen(NamedTuple):
@@ -189,6 +201,12 @@ def extended(*, iterations: int = 1) -> Method:
             that came of it, which helps where a measurement is sharp and curved.
     """
     return GaussianFilter(Extended(_at_least_one(iterations)))
+
+
+def square_root() -> Method:
+    """The extended Kalman filter on a triangular root of the covariance: it has twice the digits, and its
+    square cannot become negative."""
+    return GaussianFilter(SquareRoot())
 
 
 def unscented(points: SigmaPoints = GAUSSIAN) -> Method:

@@ -25,7 +25,7 @@ from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
 from flowgraph.blocks.signals import GaussianRoot, KalmanInnovation
 
-__all__ = ["predict_root", "update_extended_root", "update_root"]
+__all__ = ["correct_root", "predict_root", "update_extended_root", "update_root"]
 
 
 @block
@@ -96,11 +96,27 @@ def _update(
     prior: GaussianRoot, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
 ) -> tuple[GaussianRoot, Any]:  # fmt: skip
-    kind, m = prior.mean.dtype, H.shape[-2]
-    R = noise_matrix(R, m, "R", kind=kind, xp=xp)
+    R = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
     residual, present = innovate(measured, predicted, measured_space, xp)
+    shift, root, innovation = correct_root(
+        prior.root, residual, H, R, present=present, gate=gate, space=space, xp=xp
+    )
+    posterior = GaussianRoot(mean=moved(prior.mean, shift, space, xp), root=root)
+    return posterior, where_any(present, innovation, xp)
+
+
+def correct_root(
+    L: Array, residual: Array, H: Array, R: Array, *,
+    present: Array, gate: float | None = None, space: StateSpace | None = None, xp: Any,
+) -> tuple[Array, Array, KalmanInnovation]:  # fmt: skip
+    """The correction on a root: the gain times the residual, the new root, and the innovation.
+
+    Args:
+        L: prior root (..., t, t).
+        residual, H, R, present, gate, space: as for `correct`; a missing entry of the residual is 0.
+    """
+    kind, m = L.dtype, H.shape[-2]
     H, R = masked(H, R, present, xp)
-    L = prior.root
     top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
     below = xp.concat([0.0 * (H @ L).mT, L], axis=-1)
     whole = lower_root(xp.concat([top, below], axis=-2), xp=xp)
@@ -118,6 +134,4 @@ def _update(
         parts=xp.sum(xp.astype(present, kind), axis=-1),
         accepted=accepted,
     )
-    root = xp.where(accepted[..., None, None], new, L)
-    posterior = GaussianRoot(mean=moved(prior.mean, shift, space, xp), root=root)
-    return posterior, where_any(present, innovation, xp)
+    return shift, xp.where(accepted[..., None, None], new, L), innovation

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.graphs.benches.model_problems import Drawn, Problem
+from flowgraph.graphs.benches.model_problems import BEACONS, Drawn, Problem
 
 __all__ = ["PEERS"]
 
@@ -77,14 +77,23 @@ def _stone_soup(updater: str, **settings: Any) -> Callable[[Problem, Drawn], Fou
         # a peer, which is there with the extra `bench` alone
         from datetime import datetime, timedelta
 
-        from stonesoup.models.measurement.nonlinear import CartesianToBearingRange
+        from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
+        from stonesoup.types.array import StateVector, StateVectors
         from stonesoup.types.detection import Detection
         from stonesoup.types.hypothesis import SingleHypothesis
         from stonesoup.types.prediction import GaussianStatePrediction
         from stonesoup.updater import kalman
 
+        class Ranges(NonLinearGaussianMeasurement):
+            ndim_meas = 2
+
+            def function(self, state: Any, noise: Any = False, **_: Any) -> Any:
+                p = np.array(state.state_vector, dtype=float)[:2]
+                z = np.stack([np.hypot(*(p - np.reshape(b, (2, 1)))) for b in BEACONS])
+                return z.view(StateVectors) if z.shape[1] > 1 else StateVector(z)
+
         F, Q = _step(problem)
-        seen = CartesianToBearingRange(ndim_state=4, mapping=(0, 1), noise_covar=np.diag([4e-4, 4.0]))
+        seen = Ranges(ndim_state=4, mapping=(0, 1), noise_covar=np.diag([4.0, 4.0]))
         one = getattr(kalman, updater)(measurement_model=seen, **settings)
         x, P = np.array(problem.start.mean)[:, None], np.array(problem.start.covariance)
         now, means, covariances = datetime(2020, 1, 1), [], []
@@ -92,7 +101,7 @@ def _stone_soup(updater: str, **settings: Any) -> Callable[[Problem, Drawn], Fou
             if k:
                 x, P = F @ x, F @ P @ F.T + Q
             prior = GaussianStatePrediction(x, P, timestamp=now)
-            what = Detection(np.array([[z[1]], [z[0]]]), timestamp=now, measurement_model=seen)
+            what = Detection(np.array(z)[:, None], timestamp=now, measurement_model=seen)
             posterior = one.update(SingleHypothesis(prior, what))
             x, P = np.array(posterior.mean, dtype=float), np.array(posterior.covar, dtype=float)
             means.append(x[:, 0].copy())
@@ -108,9 +117,9 @@ PEERS: dict[tuple[str, str], tuple[str, Callable[[Problem, Drawn], Found]]] = {
     ("point", "extended"): ("filterpy", _filterpy_kalman),
     ("point", "unscented"): ("filterpy", _filterpy_kalman),
     ("radar", "extended"): ("filterpy", _filterpy_extended),
-    ("radar", "unscented"): (
+    ("ranges", "unscented"): (
         "stonesoup", _stone_soup("UnscentedKalmanUpdater", alpha=1.0, beta=2.0, kappa=0.0)
     ),
-    ("radar", "cubature"): ("stonesoup", _stone_soup("CubatureKalmanUpdater")),
+    ("ranges", "cubature"): ("stonesoup", _stone_soup("CubatureKalmanUpdater")),
 }  # fmt: skip
 """By problem and method: the library, and its run."""

@@ -38,7 +38,7 @@ from flowgraph.blocks.models.tracking import (
 from flowgraph.blocks.signals import Imu, Steering
 from flowgraph.language.declare import GraphFunction
 
-__all__ = ["PROBLEMS", "Drawn", "Measured", "Problem", "declared", "drawn"]
+__all__ = ["BEACONS", "PROBLEMS", "Drawn", "Measured", "Problem", "declared", "distances", "drawn"]
 
 SECOND = 1_000_000_000
 
@@ -160,6 +160,23 @@ def _radar() -> Problem:
     return Problem(motion, seen, start, 0.5, 100)
 
 
+BEACONS = np.array([[0.0, 0.0], [400.0, 100.0]])
+"""Whose distances are measured in `ranges`, m."""
+
+
+def distances(p: Array, xp: Any) -> Array:
+    """From each of the `BEACONS` (..., 2) to a position (..., 2)."""
+    apart = p[..., None, :] - xp.asarray(BEACONS)
+    return xp.sqrt(xp.sum(apart * apart, axis=-1))
+
+
+def _ranges() -> Problem:
+    motion = constant_velocity(0.5)
+    seen = MeasurementModel(motion.space, lambda x, xp: distances(x.position, xp), noise=[4.0, 4.0])
+    start = motion.space.gaussian(position=((150.0, 200.0), 10.0), velocity=((-3.0, 2.0), 2.0))
+    return Problem(motion, seen, start, 0.5, 100)
+
+
 _STATIONS = np.array([[0.0, 0.0], [200.0, 0.0]])
 
 
@@ -216,11 +233,12 @@ def _volatility() -> Problem:
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "point": _point,
     "radar": _radar,
+    "ranges": _ranges,
     "turn": _turn,
     "bicycle": _bicycle,
     "pendulum": _pendulum,
     "pose": _pose,
     "volatility": _volatility,
 }
-"""A point seen in place, and by range and bearing; a turn seen by two bearings; a car with GPS; a pendulum
-seen from the side; a pose by an IMU and motion capture; a noise whose level is sought."""
+"""A point seen in place, by range and bearing, and by two ranges; a turn seen by two bearings; a car with
+GPS; a pendulum seen from the side; a pose by an IMU and motion capture; a noise whose level is sought."""

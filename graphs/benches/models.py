@@ -41,10 +41,10 @@ def models(
     engine: str = "c",
     seed: int = 0,
 ) -> Report:
-    """Filters of one model by many methods, beside peers: point, radar, turn, bicycle, pendulum, pose, volatility.
+    """Filters of a model by every method, beside peers: from a point to a pose and a stochastic volatility.
 
     Args:
-        problem: one of these, or all.
+        problem: point, radar, ranges, turn, bicycle, pendulum, pose, volatility, or all.
         method: linear, extended, iterated, unscented, cubature, bootstrap, guided, or all.
         runs: drawn from the model, over which errors are averaged.
         particles: how many.
@@ -92,7 +92,7 @@ def _row(
     engine: str,
     seed: int,
 ) -> dict[str, Any]:
-    built = declaration.build(method=METHODS[name](count))
+    built = declaration.build(method=METHODS[name](count), sizes=_sizes(some[0]))
     space, squares, nees, likely, seconds, ticks = made.motion.space, [], [], [], 0.0, 0
     first = None
     for k, run in enumerate(some):
@@ -119,6 +119,10 @@ def _row(
     }
 
 
+def _sizes(run: Drawn) -> dict[str, int]:
+    return {"m": run.inputs["z"]["value"].shape[-1]}
+
+
 def _peer(
     which: str,
     name: str,
@@ -131,7 +135,7 @@ def _peer(
 ) -> tuple[str | None, float | None]:
     """Who has the same method, and how far it is from ours on the first run."""
     if made.linear and name in ("bootstrap", "guided"):
-        exact = simulate(declaration.build(method=linear()), run.inputs, engine=engine)
+        exact = simulate(declaration.build(method=linear(), sizes=_sizes(run)), run.inputs, engine=engine)
         return "linear", float(likely - exact["log_likelihood"]["value"].sum())
     peer, theirs = PEERS.get((which, name), (None, None))
     if peer is None or theirs is None or importlib.util.find_spec(peer) is None:

@@ -36,6 +36,7 @@ from flowgraph.blocks.filtering import (
     filtered,
     first,
     linear,
+    square_root,
     unscented,
 )
 from flowgraph.blocks.inertial.imu import ImuNoise
@@ -107,13 +108,15 @@ def driven(seconds: float = 10.0, seed: int = 0):
 METHODS = {
     "extended": extended(),
     "iterated": extended(iterations=3),
+    "root": square_root(),
     "unscented": unscented(),
     "cubature": cubature(),
 }
 
 
 @pytest.mark.parametrize(
-    "name", ["extended", "unscented", *(pytest.param(n, marks=SLOW) for n in ("iterated", "cubature"))]
+    "name",
+    ["extended", "unscented", *(pytest.param(n, marks=SLOW) for n in ("iterated", "root", "cubature"))],
 )
 def test_a_method_is_equal_in_all_engines_lowered_and_drawn(name):
     _, inputs = driven(3.0)
@@ -190,7 +193,7 @@ def spots(n: int = 40, seed: int = 0, **changed) -> dict[str, Series]:
     return {"spot": arrays(time, Spot(position=position), not_finite="keep")}
 
 
-@pytest.mark.parametrize("method", [linear(), extended(), extended(iterations=4), unscented(), cubature()])
+@pytest.mark.parametrize("method", [linear(), *METHODS.values()])
 def test_all_methods_are_the_kalman_filter_for_a_linear_model(method):
     @graph
     def known(spot: Stream[Spot]):
@@ -285,10 +288,24 @@ def test_matrices_may_come_with_each_message():
     np.testing.assert_allclose(a["output"]["mean"], b["output"]["mean"], atol=1e-14)
 
 
+def test_on_a_root_a_sharp_measurement_leaves_a_covariance_in_single_precision():
+    """Deviations of 1e-4 m beside 1e3 m: more digits than a covariance has in float32."""
+    wide = POINT.space.gaussian(position=((0.0, 0.0), 1e3), velocity=((1.0, 0.0), 1.0))
+    sharp = LinearMeasurement(POINT.space, np.eye(2, 4), noise=1e-8)
+    inputs = spots(30)
+    built = point.build(seen=sharp, start=wide, method=square_root())
+    exact = simulate(built, inputs)["output"]["covariance"]
+    single = simulate(built, inputs, engine="reference", dtype="float32")["output"]["covariance"]
+    deviations = np.sqrt(np.einsum("nii->ni", exact))
+    apart = np.abs(single - exact) / (deviations[:, :, None] * deviations[:, None, :])
+    assert apart.max() < 1e-3
+    assert (np.linalg.eigvalsh(exact) > 0.0).all()
+
+
 # -- what goes wrong in the field ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", [extended(), unscented()])
+@pytest.mark.parametrize("method", [extended(), square_root(), unscented()])
 def test_a_gate_refuses_and_finds_its_way_back(method):
     jump = {k: (50.0, 50.0) for k in range(20, 40)}
     built = point.build(method=method, gate=0.999)
@@ -300,7 +317,7 @@ def test_a_gate_refuses_and_finds_its_way_back(method):
     assert np.abs(result["output"]["mean"][-1][:2] - 50.0).max() < 1.0
 
 
-@pytest.mark.parametrize("method", [extended(), extended(iterations=2), unscented()])
+@pytest.mark.parametrize("method", METHODS.values())
 def test_entries_that_are_missing_say_nothing(method):
     at = {5: (np.nan, 0.1), 9: (np.nan, np.nan)}
     inputs = spots(at=at)
@@ -315,7 +332,7 @@ def test_entries_that_are_missing_say_nothing(method):
     assert before == pytest.approx(after, rel=1e-14)
 
 
-@pytest.mark.parametrize("method", [extended(), unscented()])
+@pytest.mark.parametrize("method", [extended(), square_root(), unscented()])
 def test_a_filter_starts_from_its_first_measurement(method):
     def believe(fix, xp):
         mean = xp.concat([fix.position, xp.asarray([0.3, 5.0])])
