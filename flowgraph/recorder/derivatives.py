@@ -10,6 +10,7 @@ Source: A. Griewank and A. Walther, "Evaluating Derivatives", 2nd ed., SIAM 2008
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,6 +27,10 @@ from flowgraph.recorder.tangents import LINALG, Tangent, plain, pruned, spread
 from flowgraph.types import Array
 
 __all__ = ["jacobian"]
+
+
+MOST_APART = 40
+"""Directions up to which each is recorded by itself, so that the optimiser sees what it does not change."""
 
 
 def jacobian(
@@ -58,12 +63,12 @@ def jacobian(
     else:
         given = along if isinstance(along, list | tuple) else [along]
         parts = [_directions(xp.asarray(d), x, xp) for d in given]
-    start: Tangent = {}
-    k = 0
-    for d in parts:
-        start[tuple(range(k, k + d.shape[0]))] = d
-        k += d.shape[0]
     inner = Duals(xp)
+    k = sum(d.shape[0] for d in parts)
+    if inner.sparse and k <= MOST_APART:
+        parts = [d[i : i + 1, ...] for d in parts for i in range(d.shape[0])]
+    ends = [0, *itertools.accumulate(d.shape[0] for d in parts)]
+    start = {tuple(range(a, b)): d for a, b, d in zip(ends, ends[1:], parts, strict=False)}
     y = f(inner.made(x, start), inner)
     if not isinstance(y, Dual) or y.xp is not inner:
         y = xp.asarray(y)

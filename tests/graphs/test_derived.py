@@ -1,4 +1,4 @@
-"""Jacobians that nobody wrote: a filter of them is as accurate as one by hand, and the same in all engines."""
+"""Jacobians that nobody wrote: their filter is as accurate as one by hand, and the same in all engines."""
 
 from __future__ import annotations
 
