@@ -207,7 +207,7 @@ def _write_report(out: Path, case: Case, flight: Flight, result: Result, report:
             write_tum(estimate, file)
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         with writing(out / "navigation.png") as file:
-            plot_navigation(estimate, flight.truth, file)
+            plot_navigation(estimate, flight.truth, file, order=case.order)
         observed = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
         if observed is not None:
             with writing(out / "trajectory.png") as file:

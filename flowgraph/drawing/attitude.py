@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flowgraph.data.series import Series
-from flowgraph.drawing.plot import BAND, COLOURS, TRUTH, _angles, _figure, _find, _need, _save
+from flowgraph.drawing.plot import BAND, COLOURS, TRUTH, _angles, _figure, _find, _need, _save, angle_rates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,18 +79,7 @@ def _matrices(q: np.ndarray) -> np.ndarray:
 def _angle_sigmas(q: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """(n, 3) standard deviations of roll, pitch and yaw in degrees: the angles' rates for a body rate, from
     the same kinematics, applied to a small rotation in the body."""
-    roll, pitch, _ = np.deg2rad(_angles(q)).T
-    cosine = np.maximum(np.abs(np.cos(pitch)), 1e-3)  # at the pole roll and yaw have no meaning
-    tangent = np.sin(pitch) / cosine
-    zero, one = np.zeros_like(roll), np.ones_like(roll)
-    J = np.array(
-        [
-            [one, np.sin(roll) * tangent, np.cos(roll) * tangent],
-            [zero, np.cos(roll), -np.sin(roll)],
-            [zero, np.sin(roll) / cosine, np.cos(roll) / cosine],
-        ]
-    )
-    J = np.moveaxis(J, 2, 0)
+    J = angle_rates(q)
     variance = np.einsum("nij,njk,nik->ni", J, spread, J)
     return np.asarray(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))))
 

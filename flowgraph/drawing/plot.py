@@ -116,6 +116,7 @@ def plot_navigation(
     file: str | Path | None = None,
     *,
     extra: Mapping[str, npt.ArrayLike] | None = None,
+    order: str = "zyx",
 ) -> Figure:
     """One page on a navigation filter: trajectory, errors, attitude and biases; only what exists is drawn.
 
@@ -127,6 +128,7 @@ def plot_navigation(
         file: ending in .png, .svg or .pdf.
         extra: more panels, by title: an array with one value for each time of the estimate, such as
             `{"tilt error [deg]": tilt, "heading error [deg]": heading}`.
+        order: convention of roll, pitch and yaw: "zyx", R = Rz Ry Rx, or "zxy", R = Rz Rx Ry.
 
     Raises:
         UnknownNameError: where the estimate has no position, or for an unknown file ending.
@@ -152,7 +154,7 @@ def plot_navigation(
         for k in range(3):
             axis = figure.add_subplot(grid[row, k])
             if field == "attitude":
-                _angle(axis, estimate, truth, k, start)
+                _angle(axis, estimate, truth, k, start, order)
             elif truth is not None and _find(truth, field) is not None and field in ("position", "velocity"):
                 _error(axis, estimate, truth, field, k, start)
             else:
@@ -297,54 +299,70 @@ def _value(axis: Axes, estimate: Series, truth: Series | None, field: str, k: in
     _label(axis, f"{field.replace('_', ' ')} {'xyz'[k]}", type_, sigma is not None)
 
 
-def _angles(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 3) roll, pitch and yaw in degrees, without jumps."""
+def _angles(quaternion: np.ndarray, order: str = "zyx") -> np.ndarray:
+    """(n, 3) roll, pitch and yaw in degrees, without jumps: R = Rz(yaw) Ry(pitch) Rx(roll), or for "zxy"
+    R = Rz(yaw) Rx(roll) Ry(pitch)."""
     w, x, y, z = quaternion.T
+    if order == "zxy":
+        roll = np.arcsin(np.clip(2 * (w * x + y * z), -1.0, 1.0))
+        pitch = np.arctan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y))
+        yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z))
+        return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
 
 
-def _angle_sigma(estimate: Series, k: int) -> np.ndarray | None:
+def angle_rates(quaternion: np.ndarray, order: str = "zyx") -> np.ndarray:
+    """E (n, 3, 3) with d(roll, pitch, yaw) = E d(rotation vector in the body).
+
+    It has no bound where the middle angle is 90 degrees: the pitch of "zyx", the roll of "zxy".
+    """
+    roll, pitch, _ = np.deg2rad(_angles(quaternion, order)).T
+    one, none = np.ones_like(roll), np.zeros_like(roll)
+    if order == "zxy":
+        s, c, level = np.sin(pitch), np.cos(pitch), np.maximum(np.abs(np.cos(roll)), 1e-3)
+        slope = np.sin(roll) / level
+        rows = ([c, none, s], [s * slope, one, -c * slope], [-s / level, none, c / level])
+    else:
+        s, c, level = np.sin(roll), np.cos(roll), np.maximum(np.abs(np.cos(pitch)), 1e-3)
+        slope = np.sin(pitch) / level
+        rows = ([one, s * slope, c * slope], [none, c, -s], [none, s / level, c / level])
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def _angle_sigma(estimate: Series, k: int, order: str = "zyx") -> np.ndarray | None:
     """(n,) degrees: the deviation of roll, pitch or yaw, from that of the rotation vector in the body.
 
-    By the rates of the angles, d(roll, pitch, yaw) = E d(rotation vector), which has no bound at a pitch of
-    90 degrees; the band ends at half a turn.
+    The band ends at 60 degrees: it has no bound where the angles fail.
     """
     found = _find(estimate, "covariance")
     if found is None or found[0].shape[-1] not in SIZES or found[0].shape[-1] < 9:
         return None
     P, q = found[0][:, 6:9, 6:9], _need(estimate, "attitude")[0]
-    roll, pitch, _ = np.deg2rad(_angles(q)).T
-    s, c, level = np.sin(roll), np.cos(roll), np.maximum(np.abs(np.cos(pitch)), 1e-3)
-    one, none = np.ones_like(s), np.zeros_like(s)
-    rows = (
-        [one, s * np.sin(pitch) / level, c * np.sin(pitch) / level],
-        [none, c, -s],
-        [none, s / level, c / level],
-    )
-    row = np.stack(rows[k], axis=-1)
+    row = angle_rates(q, order)[:, k]
     variance = np.einsum("ni,nij,nj->n", row, P, row)
     return np.asarray(np.minimum(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))), 60.0))
 
 
-def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, start: int) -> None:
-    angle = _angles(_need(estimate, "attitude")[0])[:, k]
-    sigma = _angle_sigma(estimate, k)
+def _angle(
+    axis: Axes, estimate: Series, truth: Series | None, k: int, start: int, order: str = "zyx"
+) -> None:
+    angle = _angles(_need(estimate, "attitude")[0], order)[:, k]
+    sigma = _angle_sigma(estimate, k, order)
     if sigma is not None:
         seconds = (estimate.time - start) * 1e-9
         axis.fill_between(seconds, angle - 3 * sigma, angle + 3 * sigma, color=BAND, alpha=0.35, lw=0)
     axis.plot((estimate.time - start) * 1e-9, angle, color=COLOURS[k], lw=1.0)
     known = None if truth is None else _find(truth, "attitude")
     if truth is not None and known is not None:
-        right = _angles(known[0])[:, k]
+        right = _angles(known[0], order)[:, k]
         begin = np.interp(0, truth.time - start, right)
         right = right + 360 * np.round((angle[0] - begin) / 360)  # the same turn as the estimate
         axis.plot((truth.time - start) * 1e-9, right, color=TRUTH, lw=0.9, ls="--")
-    axis.set_title(
-        ("roll", "pitch", "yaw")[k] + (", with 3σ" if sigma is not None else ""), loc="left", fontsize=9
-    )
+    name = ("roll", "pitch", "yaw")[k] + (f" ({order})" if order != "zyx" else "")
+    axis.set_title(name + (", with 3σ" if sigma is not None else ""), loc="left", fontsize=9)
     axis.set_ylabel("[deg]")
 
 
@@ -387,4 +405,4 @@ def _from_above(axis: Axes, estimate: Series, truth: Series | None) -> None:
     axis.set_ylabel(f"y [{unit}]" if unit else "y")
 
 
-__all__ = ["plot_navigation", "plot_result", "plot_trajectory"]
+__all__ = ["angle_rates", "plot_navigation", "plot_result", "plot_trajectory"]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph.data.series import Series
-from flowgraph.drawing.plot import BAND, COLOURS, STATES, TRUTH, _figure, _save
+from flowgraph.drawing.plot import BAND, COLOURS, STATES, TRUTH, _angle_sigma, _angles, _figure, _save
 from flowgraph.errors import DataError
 
 if TYPE_CHECKING:
@@ -79,6 +79,8 @@ def plot_ins(
     truth: Series | None = None,
     observed: Series | None = None,
     file: str | Path | None = None,
+    *,
+    order: str = "zyx",
 ) -> Figure:
     """States over time with 3-sigma bands, and the errors; written to `file` if given.
 
@@ -87,6 +89,7 @@ def plot_ins(
         truth: with `position` and `attitude`, and perhaps `velocity` and biases; or None.
         observed: with `position` and `attitude`, drawn as dots; or None.
         file: ending in .png, .svg or .pdf.
+        order: convention of roll, pitch and yaw: "zyx" or "zxy".
 
     Raises:
         DataError: where a series is empty or has no positions.
@@ -104,7 +107,7 @@ def plot_ins(
             axis = axes[row, k]
             sigma = deviation[:, STATES[name] + k]
             if name == "attitude":
-                _angles(axis, estimate, truth, observed, k, seconds, sigma)
+                _attitude(axis, estimate, truth, observed, k, order)
             else:
                 unit, letters = _UNITS[name]
                 _state(axis, estimate, truth, observed, name, k, seconds, sigma)
@@ -165,26 +168,24 @@ def _rotations(series: Series) -> Rotation:
     return Rotation.from_quat(series["attitude"][:, [1, 2, 3, 0]])
 
 
-def _angles(
-    axis: Axes, estimate: Series, truth: Series | None, observed: Series | None, k: int,
-    seconds: np.ndarray, sigma: np.ndarray,
-) -> None:  # fmt: skip
-    """Roll, pitch or yaw (Z-Y-X), degrees, without jumps of a turn; the band is that of the body's axis."""
-
-    def drawn(series: Series) -> np.ndarray:
-        turned: np.ndarray = _rotations(series).as_euler("ZYX")
-        return np.degrees(np.unwrap(turned[:, 2 - k]))
-
-    value = drawn(estimate)
-    wide = 3.0 * np.degrees(sigma)
-    axis.fill_between(seconds, value - wide, value + wide, color=BAND, alpha=0.4, lw=0)
+def _attitude(
+    axis: Axes, estimate: Series, truth: Series | None, observed: Series | None, k: int, order: str
+) -> None:
+    """Roll, pitch or yaw, degrees, without jumps of a turn, in the band that the filter claims for it."""
+    drawn = lambda series: _angles(series["attitude"], order)[:, k]
+    value, seconds = drawn(estimate), estimate.seconds
+    sigma = _angle_sigma(estimate, k, order)
+    if sigma is not None:
+        axis.fill_between(seconds, value - 3 * sigma, value + 3 * sigma, color=BAND, alpha=0.4, lw=0)
     if observed is not None and "attitude" in observed.leaves:
         axis.plot(_since(observed, estimate), drawn(observed), ".", ms=1.5, color=_SEEN)
     if truth is not None and "attitude" in truth.leaves:
         inside = _within(truth, estimate)
         axis.plot(_since(truth, estimate)[inside], drawn(truth)[inside], color=TRUTH, lw=1)
     axis.plot(seconds, value, color=COLOURS[0], lw=1)
-    axis.set_title(("roll", "pitch", "yaw")[k], loc="left", fontsize=9)
+    axis.set_title(
+        ("roll", "pitch", "yaw")[k] + (f" ({order})" if order != "zyx" else ""), loc="left", fontsize=9
+    )
     axis.set_ylabel("[deg]")
 
 
