@@ -1,6 +1,7 @@
 """Filters as graphs: one file each, short enough to read beside its paper."""
 
 from flowgraph.graphs.async_kalman import async_kalman
+from flowgraph.graphs.attitude_mekf import attitude_mekf
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
@@ -33,6 +34,7 @@ __all__ = [
     "imu_calibration",
     "ins_eskf",
     "marg",
+    "attitude_mekf",
     "rbpf_indoor",
     "ukf",
     "tag_pose",

@@ -34,18 +34,20 @@ def ins_ekf_pose(
     order: str = "zxy",
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state extended Kalman filter with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     return euler_loop(
-        imu, pose, start=start, order=order, gate=gate, patience=patience, held=held,
-        predict=lambda belief, reading: predict_extended(
-            belief, reading, order=order, noise=noise, name="predict"
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=lambda belief, drive: predict_extended(
+            belief, drive, order=order, noise=noise, name="predict"
         ),
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"

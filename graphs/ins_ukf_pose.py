@@ -44,20 +44,23 @@ def ins_ukf_pose(
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     points: SigmaPoints = FAR,
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
-    predict = lambda belief, reading: predict_unscented(
-        belief, reading, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+    predict = lambda belief, drive: predict_unscented(
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points, name="predict",
     )  # fmt: skip
     return euler_loop(
-        imu, pose, start=start, order=order, gate=gate, patience=patience, held=held, predict=predict,
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=predict,
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
         ),

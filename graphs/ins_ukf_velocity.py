@@ -52,20 +52,23 @@ def ins_ukf_velocity(
     rate: str = "gyro",
     order: str = "zyx",
     points: tuple[SigmaPoints, SigmaPoints] = FAR,
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
-    predict = lambda belief, reading: predict_unscented(
-        belief, reading, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+    predict = lambda belief, drive: predict_unscented(
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points[0], name="predict",
     )  # fmt: skip
     return euler_loop(
-        imu, motion, start=start, order=order, gate=gate, patience=patience, held=held, predict=predict,
+        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=predict,
         update=lambda prior, control: update_camera_velocity(
             prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
             rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, name="update",

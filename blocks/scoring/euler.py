@@ -32,7 +32,7 @@ from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, named
 from flowgraph.blocks.scoring.start import Started
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.tuning import given, reading_of
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.errors import DeclarationError
@@ -110,6 +110,7 @@ class EulerModel(ScaledFactors, Scored):
             start=start,
             noise=self.imu_noise(on),
             order=self.order,
+            reading=reading_of(on.flight),
             **settings,
         )
 

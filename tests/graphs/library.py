@@ -21,6 +21,7 @@ _FEW = "particles=60"
 
 OWN = {
     "orientation_complementary": ("sim:thesis", ["sensors=gyro,coordinate_acceleration,thrust"]),
+    "attitude_mekf": ("sim:thesis", ["sensors=body_rate,magnetic_attitude"]),
     "outdoor_eskf": ("sim:thesis", [_THESIS]),
     "rbpf_outdoor": ("sim:thesis", [_THESIS, _FEW]),
     "rbpf_indoor": ("sim", [_FEW]),

@@ -20,16 +20,24 @@ def flight(**settings: str) -> Flight:
 
 
 @pytest.mark.parametrize(
-    ("gyro", "push", "reading"), [("1", "1", "instant"), ("10", "10", "mean"), ("10", "1", "mean")]
+    ("gyro", "push", "turn", "reading"),
+    [
+        ("1", "1", "0", "instant"),
+        ("10", "10", "0", "mean"),
+        ("10", "1", "0", "mean"),
+        ("1", "1", "1", "mean"),
+        ("1", "10", "1", "mean"),
+    ],
 )
-def test_a_unit_made_of_parts_oversamples_as_they_do(gyro, push, reading):
-    made = with_imu(flight(gyro__oversample=gyro, coordinate_acceleration__oversample=push))
+def test_a_unit_made_of_parts_reads_as_they_do(gyro, push, turn, reading):
+    looks = {"gyro__oversample": gyro, "coordinate_acceleration__oversample": push}
+    made = with_imu(flight(gyro__turn=turn, **looks))
     assert reading_of(made) == reading
     assert made.info["imu_period_ns"] == 5_000_000
     gyro_part, push_part = made.streams["gyro"]["rate"], made.streams["coordinate_acceleration"]
     np.testing.assert_array_equal(made.streams["imu"]["gyro"], gyro_part)
     force = push_part["acceleration"]
-    if (gyro, push) == ("10", "1"):  # of an instant: the mean of the two at the ends of the step
+    if reading == "mean" and push == "1":  # of an instant: the mean of the two at the ends of the step
         force = np.concatenate([force[:1], 0.5 * (force[1:] + force[:-1])])
     np.testing.assert_array_equal(made.streams["imu"]["specific_force"], force)
     assert len(told_acceleration(made)) == len(made.streams["imu"])
@@ -53,6 +61,7 @@ def test_the_faster_of_two_oversampling_parts_is_averaged_over_the_step():
 def test_a_filter_that_knows_that_readings_are_means_is_better(graph):
     quiet = dict.fromkeys(("gyro__noise", "coordinate_acceleration__noise"), "1e-4")
     quiet |= {"vicon__noise": "1e-3", "vicon__attitude_noise": "1e-3", "gyro__oversample": "10"}
+    quiet["gyro__turn"] = "0"
     made = with_imu(flight(coordinate_acceleration__oversample="10", **quiet))
     error = {}
     for looks in (10, 1):
