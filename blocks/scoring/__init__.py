@@ -25,7 +25,7 @@ from flowgraph.blocks.scoring.cases import (
     on_capture,
     on_flight,
 )
-from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
+from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
 from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, StartPose
 from flowgraph.blocks.scoring.streams import (
@@ -81,6 +81,7 @@ __all__ = [
     "told_acceleration",
     "with_parts",
     "Share",
+    "counted",
     "counted_errors",
     "scored_errors",
 ]
