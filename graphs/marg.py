@@ -43,6 +43,7 @@ from flowgraph.blocks.orientation.marg import (
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import counted_errors
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import HeadingBelief, Imu, LevelBelief, MagneticField
 
 _REST, _TRUST = RestRule(), FieldTrust()
@@ -56,7 +57,7 @@ def marg(
     start: LevelBelief,
     heading: HeadingBelief,
     noise: ImuNoise,
-    speed: float = 0.25,
+    speed: float = 0.6,
     speed_memory: float = 0.3,
     drift: float = 5e-3,
     scale: float = 0.0035,
@@ -87,7 +88,7 @@ def marg(
 def for_flight(
     on: OnFlight,
     *,
-    speed: Positive = 0.25,
+    speed: Positive | None = None,
     speed_memory: Positive = 0.3,
     drift: NotNegative = 5e-3,
     scale: NotNegative = 0.0035,
@@ -104,7 +105,8 @@ def for_flight(
 
     Args:
         flight: with the streams `imu` and `magnetometer` (MagneticField).
-        speed: m/s, how fast the body usually moves; speed_memory: s, for how long one way.
+        speed: m/s, how fast the body usually moves; the flight's `speed`, or else 0.6.
+        speed_memory: s, for how long it moves one way.
         drift: rad/s/sqrt(Hz), of the heading without a field.
         scale: s^(1/2), how fast an error of the gyroscope's scale adds up.
         force: m/s^2, error of the accelerometer by its bias and scale, over `speed_memory` seconds the same.
@@ -127,7 +129,7 @@ def for_flight(
         start=start_level(found),
         heading=start_heading(found, field["field"][int(np.argmax(usable(field["field"], 0.0)))]),
         noise=replace(noise, accelerometer=accelerometer),
-        speed=speed,
+        speed=given(speed, on.flight.info.get("speed", 0.6)),
         speed_memory=speed_memory,
         drift=drift,
         scale=scale,
