@@ -28,7 +28,7 @@ from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_rec
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
-from flowgraph.blocks.scoring.tuning import imu_noise_of
+from flowgraph.blocks.scoring.tuning import imu_noise_of, reading_of
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
 
@@ -42,16 +42,18 @@ def augmented_complementary(
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
     gravity: tuple[float, float, float] = GRAVITY,
+    reading: str = "instant",
     covariance: PoseNoise | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
     The three shares are the IMU's, of position, velocity and attitude, at each pose; 1 is the IMU alone.
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before.
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
     control = latest(imu, init=Imu.at_rest(), name="control")
-    prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
+    prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
     corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")
@@ -93,4 +95,5 @@ def for_flight(
         velocity_alpha=velocity_alpha,
         attitude_alpha=attitude_alpha,
         covariance=noise,
+        reading=reading_of(on.flight),
     )

@@ -21,7 +21,7 @@ from flowgraph.blocks.models.euler_ins import (
     predict_extended,
     update_pose_angles,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
@@ -38,18 +38,22 @@ def ins_ekf_pose(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state extended Kalman filter with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
-    prior = predict_extended(belief, between_imu(last, control), order=order, noise=noise, name="predict")
+    prior = predict_extended(
+        belief, driving(last, control, reading), order=order, noise=noise, name="predict"
+    )
     if held is not None:
         prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(

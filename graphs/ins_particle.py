@@ -24,7 +24,7 @@ from flowgraph.blocks.models.particle_ins import (
     start_states,
     weigh_states,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
@@ -44,6 +44,7 @@ def ins_particle(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    reading: str = "instant",
     resample_below: float = 0.5,
     spread: float = 0.1,
     scheme: str = "systematic",
@@ -51,6 +52,7 @@ def ins_particle(
 ):
     """Particle filter of 15 states with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` (the particles' mean and covariance, before resampling) and `angles` at every tick;
     `effective_sample_size` and `ancestors` at every pose.
     """
@@ -58,7 +60,12 @@ def ins_particle(
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
     prior = propagate_states(
-        cloud, between_imu(last, control), order=order, noise=noise, draws=f"{draws}.process", name="predict"
+        cloud,
+        driving(last, control, reading),
+        order=order,
+        noise=noise,
+        draws=f"{draws}.process",
+        name="predict",
     )
     weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
     fresh, size, ancestors = resample_states(

@@ -25,7 +25,7 @@ from flowgraph.blocks.models.euler_ins import (
     navigation_belief,
     update_pose_angles,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
@@ -44,19 +44,22 @@ def ins_ukf_pose(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
+    drive = driving(last, control, reading)
     prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
     if held is not None:

@@ -28,12 +28,12 @@ from flowgraph.blocks.models.euler_ins import (
     navigation_belief,
     start_gaussian,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
 from flowgraph.blocks.scoring.settings import Positive, named
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.tuning import given, reading_of
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
@@ -51,19 +51,22 @@ def ins_ukf_velocity(
     rate_noise: float,
     rate: str = "gyro",
     order: str = "zyx",
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | motion, name="control")
+    drive = driving(last, control, reading)
     prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
     if held is not None:
@@ -128,6 +131,7 @@ def for_flight(
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         order=order,
+        reading=reading_of(on.flight),
         held=control.held(on, on.inputs["imu"]),
         **gated.gating(),
     )

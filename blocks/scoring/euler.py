@@ -20,7 +20,7 @@ from flowgraph.blocks.scoring.cases import Factors, OnFlight, PoseAided, PoseFil
 from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.start import Started
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.tuning import given, reading_of
 from flowgraph.blocks.signals import Gaussian
 
 __all__ = [
@@ -109,6 +109,7 @@ def on_measured_pose(
         noise=filter.imu_noise(on),
         R=filter.covariance(on) * inflate**2,
         order=filter.order,
+        reading=reading_of(on.flight),
         **settings,
     )
 
