@@ -162,7 +162,7 @@ def test_a_field_that_is_normal_for_an_instant_is_not_trusted(magnet):
 
 
 def test_a_doubt_fades_and_a_clean_field_is_followed():
-    """With no magnet the held doubt changes nothing; some seconds after one the heading is corrected again."""
+    """With no magnet the held doubt changes nothing; seconds after one the heading is corrected again."""
     turned = np.tile([-20e-6 * np.sin(0.1), 20e-6 * np.cos(0.1), -40e-6], (500, 1))
     assert beside_a_magnet(turned, 0.3) == pytest.approx(beside_a_magnet(turned, 0.0), rel=1e-9)
     after = turned + 0.0
