@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
@@ -20,7 +21,7 @@ from flowgraph.blocks.signals import Attitude, Gyro, Imu
 
 
 @graph
-def gyro_integration(imu: Stream[Imu], *, start: Attitude):
+def gyro_integration(imu: Stream[Imu], *, start: Attitude, longest: float | None = None):
     """Integral of the gyroscope's rate from a given attitude.
 
     Collected: `attitude` at every reading.
@@ -28,11 +29,13 @@ def gyro_integration(imu: Stream[Imu], *, start: Attitude):
     previous = delay(start, name="previous")
     rate = imu.map(lambda reading: Gyro(rate=reading.gyro), name="gyro")
     attitude = turn_by_gyro(previous, rate, name="attitude")
+    if longest is not None:
+        attitude = stay(previous, attitude, longest=longest)
     previous.feed(attitude)
     return {"attitude": attitude}
 
 
-@on_flight(gyro_integration, "imu")
+@on_flight(gyro_integration, "imu", measured=None)
 def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored) -> Case:
     """Start it on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
@@ -42,4 +45,4 @@ def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored
     """
     begin = orientation_start(on.flight, on.inputs["imu"], still)
     score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
-    return on.case(score, start=Attitude(attitude=begin.attitude))
+    return on.case(score, start=Attitude(attitude=begin.attitude), longest=on.longest())

@@ -14,7 +14,7 @@ from typing import Any
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import (
     euler_angles,
     navigation_belief,
@@ -50,8 +50,7 @@ def ins_ekf_pose(
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
     prior = predict_extended(belief, between_imu(last, control), order=order, noise=noise, name="predict")
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(
         prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
     )
@@ -79,5 +78,5 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
+    held = filter.held(on, on.inputs["imu"], {**on.inputs, "pose": poses})
     return on_measured_pose(on, filter, poses, held=held, **filter.gating())

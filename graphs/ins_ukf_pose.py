@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
@@ -59,8 +59,7 @@ def ins_ukf_pose(
         belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(
         prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
     )
@@ -88,5 +87,5 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
+    held = filter.held(on, on.inputs["imu"], {**on.inputs, "pose": poses})
     return on_measured_pose(on, filter, poses, held=held, **filter.gating())

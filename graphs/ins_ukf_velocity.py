@@ -19,7 +19,7 @@ import numpy as np
 
 from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -66,8 +66,7 @@ def ins_ukf_velocity(
         belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
         space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_camera_velocity(
         prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
         rate_noise=rate_noise, rate=rate, gate=gate, name="update",

@@ -23,6 +23,7 @@ import numpy as np
 from flowgraph import Case, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import static_alignment, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
     join_orientation,
@@ -61,6 +62,7 @@ def marg(
     rest: RestRule = _REST,
     trust: FieldTrust = _TRUST,
     north: float = np.pi / 2.0,
+    longest: float | None = None,
 ):
     """Orientation and gyroscope bias from nine axes, tilt and heading apart.
 
@@ -71,6 +73,8 @@ def marg(
     reading = latest(imu, init=Imu.at_rest(), at=ticks, name="reading")
     still = detect_rest(reading, rule=rest, name="rest")
     moved = predict_level(tilt, reading, noise=noise, scale=scale)
+    if longest is not None:
+        moved = stay(tilt, moved, longest=longest)
     level = hold_velocity(
         moved, reading, still, noise=noise, speed=speed, speed_memory=speed_memory, name="level"
     )
@@ -81,7 +85,7 @@ def marg(
     return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}
 
 
-@on_flight(marg, "imu", "magnetometer")
+@on_flight(marg, "imu", "magnetometer", measured=None)
 def for_flight(
     on: OnFlight,
     *,
@@ -125,4 +129,5 @@ def for_flight(
         scale=scale,
         trust=FieldTrust(density=heading_density),
         north=north,
+        longest=on.longest(),
     )

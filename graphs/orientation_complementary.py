@@ -30,6 +30,7 @@ import numpy as np
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import level_attitude
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import (
     blend,
@@ -62,6 +63,7 @@ def orientation_complementary(
     alpha: float = 0.98,
     heading: str = "shortest_arc",
     covariance: AttitudeNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of a quadrotor's attitude: thrust is removed, and gravity remains.
 
@@ -73,6 +75,8 @@ def orientation_complementary(
     previous = delay(start, name="previous")
     rate = latest(gyro, init=_STILL, name="rate")
     turned = turn_by_gyro(previous, rate, at=gyro | coordinate_acceleration, name="gyroscope")
+    if longest is not None:
+        turned = stay(previous, turned, longest=longest)
     up = remove_thrust(coordinate_acceleration, latest(thrust, init=_HOVER, name="last_thrust"))
     if heading == "shortest_arc":
         seen = level_attitude(up, name="seen")
@@ -90,7 +94,7 @@ _STREAMS = ("gyro", "coordinate_acceleration", "thrust")
 _FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
 
 
-@on_flight(orientation_complementary, *_STREAMS, told=with_parts, fix=_FIX)
+@on_flight(orientation_complementary, *_STREAMS, told=with_parts, measured=None, fix=_FIX)
 def for_flight(
     on: OnFlight,
     *,
@@ -136,6 +140,7 @@ def for_flight(
         alpha=alpha,
         heading=heading,
         covariance=noise,
+        longest=on.longest(),
     )
 
 

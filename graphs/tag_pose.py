@@ -50,7 +50,7 @@ def tag_pose(
     return {"pose": pose}
 
 
-@on_flight(tag_pose, "tags")
+@on_flight(tag_pose, "tags", ranged=False)
 def for_flight(
     on: OnFlight,
     *,
@@ -122,7 +122,7 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
         vicon = flight.need(graph_name, "vicon")["vicon"]
         pose: Any = vicon.values
         assert isinstance(pose, Pose)
-        return Series(vicon.time, as_measurements(pose.position, pose.attitude), name="pose")
+        return Series(vicon.time, as_measurements(pose.position, pose.attitude), name="pose", gaps=vicon.gaps)
     raise DataError(
         f"this flight lacks what {graph_name} needs",
         path=flight.name,

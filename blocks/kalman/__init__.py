@@ -18,7 +18,7 @@ from flowgraph.blocks.kalman.filters import (
     update_linear,
 )
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, aged, bridge, bridged, find_back, stay
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.roots import (
     covariance_root,
@@ -36,7 +36,10 @@ __all__ = [
     "observation_matrix",
     "PATIENCE",
     "Held",
+    "aged",
     "bridge",
+    "bridged",
+    "stay",
     "find_back",
     "covariance_root",
     "LinearModel",

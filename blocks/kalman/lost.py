@@ -2,7 +2,8 @@
 
 `bridge` makes a prior less sure when the control that drove it is old. `find_back` makes a belief less sure
 when a gate has refused a run of measurements, until one passes: then the belief is all but that measurement.
-Both change the covariance alone, of any belief that has one, and both do nothing while all is well.
+Both change the covariance alone, of any belief that has one. `stay` leaves a belief of any kind where it was
+over a step that is no step but a jump of the stamps. All do nothing while all is well.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.metrics.consistency import IN_A_ROW
 
-__all__ = ["PATIENCE", "Held", "bridge", "find_back"]
+__all__ = ["PATIENCE", "Held", "aged", "bridge", "bridged", "find_back", "stay"]
 
 PATIENCE = IN_A_ROW
 """How many refusals in a row are taken for outliers."""
@@ -27,11 +28,40 @@ class Held(NamedTuple):
         after: s, how old a control may be before it is said to be held.
         rate: rad/s, by how much the rate of the body differs from a reading after one second.
         force: m/s^2, the same of its acceleration.
+        longest: s, a step over which nothing is predicted, and the age that counts most; None: any step is.
     """
 
     after: float
     rate: float = 1.0
     force: float = 5.0
+    longest: float | None = None
+
+
+def bridged(before: Any, prior: Any, control: Any, *, held: Held | None, **places: Any) -> Any:
+    """The streams of a prior after `stay` and `bridge`, as far as `held` asks for them; wires, and no block.
+
+    Args:
+        before: the belief that was predicted.
+        prior, control, held, places: as for `bridge`.
+    """
+    if held is None:
+        return prior
+    if held.longest is not None:
+        prior = stay(before, prior, longest=held.longest)
+    return bridge(prior, control, held=held, **places)
+
+
+@block
+def stay(before: Any, prior: Any, *, longest: float, dt: float, xp: Any):  # type: ignore[no-untyped-def]
+    """What was predicted, or what was there before where the step is longer than `longest` (s).
+
+    Any signal of arrays: a belief, a cloud of particles, an attitude.
+
+    So after a pause of all streams, or a jump of their stamps, a belief is where it was.
+    """
+    still = dt > longest
+    kept = {name: xp.where(still, getattr(before, name), getattr(prior, name)) for name in prior._fields}
+    return type(prior)(**kept)
 
 
 @block
@@ -68,9 +98,7 @@ def bridge(  # type: ignore[no-untyped-def]
     State: the age of the control, s.
     """
     P = prior.covariance
-    age = state + dt
-    part = xp.minimum(xp.maximum(age - held.after, 0.0 * age), 0.0 * age + dt)
-    w = 2.0 * (age - 0.5 * part) * part
+    rest, part, w = aged(state, control, held, dt, xp)
     n = P.shape[-1]
     table = np.zeros((3, n, n))
     one = np.eye(3)
@@ -89,8 +117,16 @@ def bridge(  # type: ignore[no-untyped-def]
             where = np.zeros((n, n))
             where[attitude : attitude + 3, attitude : attitude + 3] = one
             more = more + xp.asarray(where, dtype=P.dtype) * turn
-    rest = age if control is None else 0.0 * age
     return rest, _with(prior, P + more)
+
+
+def aged(age: Array, control: Any | None, held: Held, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
+    """The age of a control (s) after this step, which part s of the step it was old, and w of `bridge`."""
+    age = age + dt
+    part = xp.minimum(xp.maximum(age - held.after, 0.0 * age), 0.0 * age + dt)
+    if held.longest is not None:
+        age, part = xp.minimum(age, held.longest), xp.minimum(part, held.longest)
+    return (age if control is None else 0.0 * age), part, 2.0 * (age - 0.5 * part) * part
 
 
 def _with(belief: Any, covariance: Array) -> Any:

@@ -60,7 +60,7 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
 
 def positions(vicon: Series) -> Series:
     """The positions of a motion capture."""
-    return Series(vicon.time, Position(position=vicon["position"]), name="position")
+    return Series(vicon.time, Position(position=vicon["position"]), name="position", gaps=vicon.gaps)
 
 
 def readings(flight: Flight) -> Series:

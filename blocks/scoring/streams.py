@@ -52,9 +52,9 @@ def with_parts(flight: Flight) -> Flight:
     streams = dict(flight.streams)
     if "imu" in streams:
         imu = streams["imu"]
-        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
+        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro", gaps=imu.gaps))
         force = SpecificForce(force=imu["specific_force"])
-        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
+        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer", gaps=imu.gaps))
     return replace(flight, streams=streams)
 
 

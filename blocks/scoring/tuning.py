@@ -106,7 +106,7 @@ def with_imu(flight: Flight) -> Flight:
     gyro, push = (flight.streams[name] for name in parts)
     kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
     values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
-    streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
+    streams = {"imu": Series(kept, values, name="imu", gaps=gyro.gaps or push.gaps), **flight.streams}
     told = [flight.info["noise"][name] for name in parts]
     noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
     return replace(flight, streams=streams, info={**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS})
