@@ -34,7 +34,6 @@ from flowgraph.blocks.signals import (
     SpecificForce,
     Thrust,
     Velocity,
-    WorldAcceleration,
 )
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
@@ -44,7 +43,6 @@ __all__ = ["Ranges", "gap_notes", "pause", "taken"]
 
 CONTROLS = (
     Imu, Gyro, SpecificForce, CoordinateAcceleration, Thrust, BodyRate, ImuCounts, PlaneVelocity,
-    WorldAcceleration,
 )  # fmt: skip
 MEASURED = (
     Pose, PoseMeasurement, Position, Attitude, Velocity, MagneticField, Range, OpticalFlow, PlanePosition,
@@ -57,7 +55,12 @@ GAP, MEASURED_GAP = 4.0, 10.0
 PAUSE, USUAL = 10.0, 100.0
 """s, and median steps of all streams together: what is longer is a jump of the stamps, or a pause."""
 
-RANGED = {"gyro": ((Imu, "gyro"), (Gyro, "rate")), "specific_force": ((Imu, "specific_force"), (SpecificForce, "force"))}  # fmt: skip
+RANGED = {
+    "gyro": ((Imu, "gyro"), (Gyro, "rate")),
+    "specific_force": ((Imu, "specific_force"), (SpecificForce, "force")),
+}
+"""By the name of the setting: what signals read it, in which field."""
+
 UNITS = {"gyro": ("rad/s", 40.0), "specific_force": ("m/s^2", 320.0)}
 """The unit, and what hardly a unit on a vehicle reads beyond: 2300 deg/s, and 32 g."""
 
@@ -79,7 +82,9 @@ class Ranges(Settings):
         return {"gyro": self.gyro_range, "specific_force": self.specific_force_range}
 
 
-def taken(flight: Flight, ranges: Ranges, graph: str, measured: Collection[str] | None) -> tuple[Flight, list[str]]:  # fmt: skip
+def taken(
+    flight: Flight, ranges: Ranges, graph: str, measured: Collection[str] | None
+) -> tuple[Flight, list[str]]:
     """The flight without what a filter cannot take, and notes.
 
     Only series whose NaN are data (`gaps`) have some; others are refused by the run.
@@ -140,7 +145,8 @@ def _finite(name: str, series: Series, entries: bool) -> tuple[Series, list[str]
     if entries:
         kept = np.hstack(known).any(axis=1) & (np.arange(n) >= int(np.argmax(whole))) & whole.any()
         leaves = (np.where(np.isfinite(leaf), leaf, np.nan) for leaf in series.leaves.values())
-        series = Series(series.time, unflatten(series.type, iter(leaves)), type=series.type, name=series.name, gaps=True)  # fmt: skip
+        values = unflatten(series.type, leaves)
+        series = Series(series.time, values, type=series.type, name=series.name, gaps=True)
     said, part = [], int((kept & ~whole).sum())
     if not kept.all():
         said.append(note("skipped", f"{name}: {int((~kept).sum())} of {n} readings are not finite"))

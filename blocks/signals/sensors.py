@@ -108,7 +108,7 @@ class BodyRate(Signal):
 class PointReading(Signal):
     """A control and what was measured with it: acceleration (m/s^2) and position (m), both world.
 
-    A coordinate that was not measured is NaN.
+    A coordinate that was not measured is NaN; an acceleration too, where there was no control.
     """
 
     acceleration: Array = real(3, unit="m/s^2", frame="world")
