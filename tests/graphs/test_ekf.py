@@ -254,12 +254,14 @@ def is_consistent(make: Callable[[int], Flight], base: int, factor: float = 1.0)
     return inside(nees_of_50(make, base, factor)[1], chi_square_band(9, runs=RUNS)) >= 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [smooth, averaged])
 @pytest.mark.parametrize("base", BASES)
 def test_the_nees_of_50_runs_lies_in_its_band(base, make):
     assert is_consistent(make, base)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.0, 0.5])
 @pytest.mark.parametrize("make", [smooth, averaged])
 @pytest.mark.parametrize("base", BASES)
@@ -267,6 +269,7 @@ def test_the_same_test_fails_with_a_wrong_noise(base, make, factor):
     assert not is_consistent(make, base, factor)
 
 
+@pytest.mark.slow
 def test_readings_of_an_instant_cannot_tell_when_a_rate_jumped():
     """The thesis's body rate jumps at the key points. Before the first, instants are as good as means."""
     time, found = nees_of_50(thesis, 0, 1.0)

@@ -106,6 +106,7 @@ def test_without_bias_and_noise_the_integral_is_exact():
     assert found["compared_ticks"] == 3801
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [{"mean": "markley"}, {"weighted": True}, {"weighted": True, "alpha": 0.1}]
 )
@@ -147,6 +148,7 @@ def a_case(name: str) -> Case:
     return GRAPHS[name].case(trip(0, "2"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GRAPHS)
 def test_the_engines_agree(name):
     pytest.importorskip("jax")

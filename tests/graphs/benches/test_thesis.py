@@ -27,6 +27,7 @@ def test_the_flight_is_that_of_a_world_without_gravity():
     assert 0.28 < np.std(flight.streams["imu"]["gyro"] - exact.rate) < 0.36  # and one of 0.1
 
 
+@pytest.mark.slow
 def test_a_row_a_setting_and_filter(tmp_path):
     arguments = [
         "--flights",
