@@ -23,9 +23,10 @@ import numpy as np
 from flowgraph import Case, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import static_alignment, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import stay
+from flowgraph.blocks.kalman.lost import Held, bridged
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
+    doubt_heading,
     join_orientation,
     predict_heading,
     start_heading,
@@ -39,7 +40,7 @@ from flowgraph.blocks.orientation.marg import (
     predict_level,
     start_level,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import counted_errors
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.signals import HeadingBelief, Imu, LevelBelief, MagneticField
@@ -62,7 +63,7 @@ def marg(
     rest: RestRule = _REST,
     trust: FieldTrust = _TRUST,
     north: float = np.pi / 2.0,
-    longest: float | None = None,
+    held: Held | None = None,
 ):
     """Orientation and gyroscope bias from nine axes, tilt and heading apart.
 
@@ -73,12 +74,13 @@ def marg(
     reading = latest(imu, init=Imu.at_rest(), at=ticks, name="reading")
     still = detect_rest(reading, rule=rest, name="rest")
     moved = predict_level(tilt, reading, noise=noise, scale=scale)
-    if longest is not None:
-        moved = stay(tilt, moved, longest=longest)
+    moved = bridged(tilt, moved, imu, held=held, velocity=0, attitude=3)
     level = hold_velocity(
         moved, reading, still, noise=noise, speed=speed, speed_memory=speed_memory, name="level"
     )
     wandered = predict_heading(angle, level, reading, still, drift=drift, scale=scale)
+    if held is not None:
+        wandered = doubt_heading(wandered, imu, held=held)
     found = update_heading(wandered, level, magnetometer, trust=trust, north=north, name="heading")
     tilt.feed(level)
     angle.feed(found)
@@ -95,6 +97,7 @@ def for_flight(
     scale: NotNegative = 0.01,
     heading_density: Positive = 0.2,
     align: Positive = 2.0,
+    control: HeldControl,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight with an IMU and a magnetometer, aligned by its first readings.
@@ -129,5 +132,5 @@ def for_flight(
         scale=scale,
         trust=FieldTrust(density=heading_density),
         north=north,
-        longest=on.longest(),
+        held=control.held(on, imu),
     )

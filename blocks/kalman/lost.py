@@ -20,6 +20,9 @@ __all__ = ["PATIENCE", "Held", "aged", "bridge", "bridged", "find_back", "stay"]
 PATIENCE = IN_A_ROW
 """How many refusals in a row are taken for outliers."""
 
+PAUSE = 1.0
+"""s: a pause of all streams, or a jump of their stamps, makes as unsure as a gap of the control so long."""
+
 
 class Held(NamedTuple):
     """What a control is worth that is held for longer than its own period.
@@ -28,7 +31,8 @@ class Held(NamedTuple):
         after: s, how old a control may be before it is said to be held.
         rate: rad/s, by how much the rate of the body differs from a reading after one second.
         force: m/s^2, the same of its acceleration.
-        longest: s, a step over which nothing is predicted, and the age that counts most; None: any step is.
+        longest: s, the longest step over which anything is predicted; None: any is. A longer one counts as
+            `PAUSE`.
     """
 
     after: float
@@ -71,7 +75,7 @@ def bridge(  # type: ignore[no-untyped-def]
     control: Any | None,
     *,
     held: Held,
-    position: int,
+    position: int | None = None,
     velocity: int,
     attitude: int | None = None,
     dt: float,
@@ -93,7 +97,8 @@ def bridge(  # type: ignore[no-untyped-def]
         control: where there is a fresh one; the age of the one before counts in the step that ends with it.
         held: from which age on, and how fast, it becomes worthless.
         position, velocity, attitude: where these stand in the covariance. An attitude of three numbers is an
-            error in the body or angles; of a belief with ten, it is the quaternion.
+            error in the body or angles; of a belief with ten, it is the quaternion. A position or attitude
+            may be left out.
 
     State: the age of the control, s.
     """
@@ -102,8 +107,11 @@ def bridge(  # type: ignore[no-untyped-def]
     n = P.shape[-1]
     table = np.zeros((3, n, n))
     one = np.eye(3)
-    p, v = slice(position, position + 3), slice(velocity, velocity + 3)
-    table[0, v, v] = table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
+    v = slice(velocity, velocity + 3)
+    table[0, v, v] = one * held.force**2
+    if position is not None:
+        p = slice(position, position + 3)
+        table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
     push = [xp.asarray(part_, dtype=P.dtype) for part_ in table]
     more = push[0] * w + push[1] * (0.5 * part * w) + push[2] * (part * part * w / 3.0)
     if attitude is not None:
@@ -120,12 +128,19 @@ def bridge(  # type: ignore[no-untyped-def]
     return rest, _with(prior, P + more)
 
 
-def aged(age: Array, control: Any | None, held: Held, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
-    """The age of a control (s) after this step, which part s of the step it was old, and w of `bridge`."""
+def aged(
+    age: Array, control: Any | None, held: Held, dt: Any, xp: Any, *, pause: float = PAUSE
+) -> tuple[Array, Array, Array]:
+    """The age of a control (s) after this step, which part s of the step it was old, and w of `bridge`.
+
+    Args:
+        pause: s, as how long a step counts that is longer than `held.longest`.
+    """
     age = age + dt
     part = xp.minimum(xp.maximum(age - held.after, 0.0 * age), 0.0 * age + dt)
     if held.longest is not None:
-        age, part = xp.minimum(age, held.longest), xp.minimum(part, held.longest)
+        jumped = dt > held.longest
+        age, part = (xp.where(jumped, pause, x) for x in (age, part))
     return (age if control is None else 0.0 * age), part, 2.0 * (age - 0.5 * part) * part
 
 

@@ -2,7 +2,8 @@
 
 What is Gaussian given a particle becomes less sure; what is drawn is drawn farther. With T, s and w of
 `bridge`, a velocity is spread by force^2 w, the position with it, and an attitude by rate^2 w. While controls
-come as they should, s is 0, and clouds stay as they are, to the bit.
+come as they should, s is 0, and clouds stay as they are, to the bit. What is drawn is too
+few to be everywhere: over a pause of all streams such clouds stay.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def spread_cloud(  # type: ignore[no-untyped-def]
 
     Draws `held` (3, n). State: the age of the control, s.
     """
-    rest, part, w = aged(state, control, held, dt, xp)
+    rest, part, w = aged(state, control, held, dt, xp, pause=0.0)
     kind = cloud.position.dtype
     one = xp.asarray(np.eye(3)[:, :, None] * held.force**2, dtype=kind)
     errors = xp.asarray(draw.normal("held", (3, cloud.log_weight.shape[-1])), dtype=kind)
@@ -74,7 +75,7 @@ def spread_states(  # type: ignore[no-untyped-def]
 
     Draws `held` (9, n). State: the age of the control, s.
     """
-    rest, part, w = aged(state, control, held, dt, xp)
+    rest, part, w = aged(state, control, held, dt, xp, pause=0.0)
     x = cloud.state
     errors = xp.asarray(draw.normal("held", (9, x.shape[0])), dtype=x.dtype).mT * xp.sqrt(w)
     push, apart, turn = errors[:, 0:3] * held.force, errors[:, 3:6] * held.force, errors[:, 6:9] * held.rate
@@ -91,7 +92,7 @@ def spread_plane(  # type: ignore[no-untyped-def]
 
     Draws `held` (2, n). State: the age of the control, s.
     """
-    rest, _, w = aged(state, control, held, dt, xp)
+    rest, _, w = aged(state, control, held, dt, xp, pause=0.0)
     errors = xp.asarray(draw.normal("held", cloud.position.shape), dtype=cloud.position.dtype)
     return rest, cloud.replace(position=cloud.position + errors * (held.force * xp.sqrt(w)))
 

@@ -99,7 +99,7 @@ def taken(
         DataError: where nothing is left of a stream.
         DeclarationError: for a range of what no stream reads.
     """
-    streams, notes = dict(flight.streams), list[str]()
+    streams, notes = dict(flight.streams), dict[str, str]()
     for name, series in flight.streams.items():
         cls = _class(series)
         if cls not in CONTROLS and cls not in MEASURED:
@@ -115,7 +115,9 @@ def taken(
                 got="; ".join([*said, *more]),
                 fix="check the columns and units of the sensor, and its range",
             )
-        streams[name], notes = found, [*notes, *said, *more]
+        streams[name] = found
+        for one in (*said, *more):  # of the parts of an imu the same is not said again
+            notes.setdefault(one.partition(f"{name}: ")[2], one)
     for what, most in ranges.most().items():
         if most is not None and not any(_field(s, what) for s in streams.values()):
             raise DeclarationError(
@@ -125,7 +127,7 @@ def taken(
                 got=", ".join(streams),
                 fix=f"leave {what}.range out",
             )
-    return replace(flight, streams=streams) if notes else flight, notes
+    return replace(flight, streams=streams) if notes else flight, list(notes.values())
 
 
 def _class(series: Series) -> type | None:
