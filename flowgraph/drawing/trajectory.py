@@ -14,7 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph.data.series import Series
-from flowgraph.drawing.plot import BAND, COLOURS, STATES, TRUTH, _figure, _save
+from flowgraph.drawing import canvas
+from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
+from flowgraph.drawing.fields import STATES
 from flowgraph.errors import DataError
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ _UNITS = {
 }
 
 
+@canvas.picture
 def plot_space(
     estimate: Series,
     truth: Series | None = None,
@@ -49,7 +52,7 @@ def plot_space(
         DataError: where a series is empty or has no positions.
         UnknownNameError: for an unknown file ending.
     """
-    figure = _figure(8.0, 7.0)
+    figure = canvas.new_figure(8.0, 7.0)
     axis: Any = figure.add_subplot(projection="3d")
     _need_positions(estimate)
     spans = [estimate["position"]]
@@ -71,9 +74,10 @@ def plot_space(
         getattr(axis, f"set_{name}label")(f"{name} [m]")
     axis.set_box_aspect((1, 1, 1))
     axis.legend(loc="upper left")
-    return _save(figure, file)
+    return canvas.save(figure, file)
 
 
+@canvas.picture
 def plot_ins(
     estimate: Series,
     truth: Series | None = None,
@@ -95,10 +99,10 @@ def plot_ins(
     _need_positions(estimate)
     rows = [*_UNITS]
     rows.insert(1, "attitude")
-    figure = _figure(13.0, 2.0 * (len(rows) + (truth is not None)) + 0.6)
+    figure = canvas.new_figure(13.0, 2.0 * (len(rows) + (truth is not None)) + 0.6)
     axes = figure.subplots(len(rows) + (truth is not None), 3, sharex=True, squeeze=False)
     seconds = estimate.seconds
-    deviation = np.sqrt(np.maximum(np.einsum("nii->ni", estimate["covariance"]), 0.0))
+    deviation = canvas.deviation(np.einsum("nii->ni", estimate["covariance"]))
     for row, name in enumerate(rows):
         for k in range(3):
             axis = axes[row, k]
@@ -115,7 +119,7 @@ def plot_ins(
     for axis in axes[-1]:
         axis.set_xlabel("time since the start [s]")
     axes[0, 0].legend(loc="best", fontsize=8)
-    return _save(figure, file)
+    return canvas.save(figure, file)
 
 
 def _need_positions(series: Series) -> None:
@@ -156,7 +160,7 @@ def _state(
         axis.plot(_since(truth, estimate)[inside], truth[name][inside, k], color=TRUTH, lw=1, label="truth")
     axis.plot(seconds, value, color=COLOURS[0], lw=1, label="estimate")
     reach = value[len(value) // 20 :]
-    around = max(float(np.ptp(reach)), 6.0 * float(np.median(sigma)), 1e-9)
+    around = max(float(np.ptp(reach)), 6.0 * float(np.nanmedian(sigma)), 1e-9)
     middle = 0.5 * float(reach.max() + reach.min())
     axis.set_ylim(middle - 0.75 * around, middle + 0.75 * around)
 

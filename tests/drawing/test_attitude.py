@@ -13,7 +13,8 @@ from flowgraph import DataError, Series, UnknownNameError
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.signals import Attitude, AttitudeBiasBelief
 from flowgraph.cli import app
-from flowgraph.drawing.attitude import _angle_sigmas, plot_orientation
+from flowgraph.drawing.angles import euler_angles, euler_variances
+from flowgraph.drawing.attitude import plot_orientation
 
 
 def belief(n: int = 50) -> tuple[Series, Series]:
@@ -68,14 +69,12 @@ def test_only_what_exists_is_drawn():
 
 def test_the_band_of_an_angle_is_what_small_turns_make_of_it():
     """Sampled: roll, pitch and yaw of q * Exp(e) with e of the covariance."""
-    from flowgraph.drawing.plot import _angles
-
     rng = np.random.default_rng(0)
     q = from_rotation_vector(np.array([[0.4, -0.5, 1.0]]), xp=np)
     P = np.array([[[4e-4, 1e-4, 0.0], [1e-4, 2e-4, 0.0], [0.0, 0.0, 9e-4]]])
     errors = rng.multivariate_normal(np.zeros(3), P[0], size=20000)
-    angles = _angles(multiply(np.tile(q, (20000, 1)), from_rotation_vector(errors, xp=np), xp=np))
-    np.testing.assert_allclose(_angle_sigmas(q, P)[0], angles.std(axis=0), rtol=0.03)
+    angles = euler_angles(multiply(np.tile(q, (20000, 1)), from_rotation_vector(errors, xp=np), xp=np))
+    np.testing.assert_allclose(np.sqrt(euler_variances(q, P)[0]), angles.std(axis=0), rtol=0.03)
 
 
 def test_the_command_draws_them(tmp_path: Path):
