@@ -289,6 +289,7 @@ def test_a_filter_that_takes_whole_measurements_takes_no_parts(name):
     made = in_part(base, "position", [0], 30)
     few = {"particles": 50} if name == "rbpf_indoor" else {}
     case = find_graph(name).case(made, **few)
+    assert isinstance(case.inputs, dict)
     assert len(case.inputs["vicon"]) == 30
     assert any(note.startswith("skipped: vicon: ") for note in case.notes)
     assert np.isfinite(simulate(case.graph, case.inputs)["pose"]["position"]).all()
