@@ -47,6 +47,7 @@ if _TYPE_CHECKING:
     from flowgraph.engines.state import load_state, save_state
     from flowgraph.pipeline.lowering import lower
     from flowgraph.pipeline.pipeline import Pipeline
+    from flowgraph.recorder.derivatives import jacobian
 
 # What is done with a graph is imported when it is first asked for: who declares pays for no engine.
 _LATER = {
@@ -71,6 +72,7 @@ _LATER = {
     "save_state": "flowgraph.engines.state",
     "lower": "flowgraph.pipeline.lowering",
     "Pipeline": "flowgraph.pipeline.pipeline",
+    "jacobian": "flowgraph.recorder.derivatives",
 }
 
 _import_module("flowgraph.engines")  # watches for forks from here on
@@ -156,6 +158,7 @@ __all__ = [
     "high_pass",
     "integer",
     "integrate",
+    "jacobian",
     "latest",
     "load_flight",
     "load_state",

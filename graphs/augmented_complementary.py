@@ -29,7 +29,7 @@ from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_rec
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
-from flowgraph.blocks.scoring.tuning import imu_noise_of
+from flowgraph.blocks.scoring.tuning import imu_noise_of, reading_of
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
 
@@ -43,17 +43,19 @@ def augmented_complementary(
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
     gravity: tuple[float, float, float] = GRAVITY,
+    reading: str = "instant",
     covariance: PoseNoise | None = None,
     longest: float | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
     The three shares are the IMU's, of position, velocity and attitude, at each pose; 1 is the IMU alone.
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before.
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
     control = latest(imu, init=Imu.at_rest(gravity), name="control")
-    prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
+    prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
     if longest is not None:
         prior = stay(previous, prior, longest=longest)
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
@@ -98,4 +100,5 @@ def for_flight(
         attitude_alpha=attitude_alpha,
         covariance=noise,
         longest=on.longest(),
+        reading=reading_of(on.flight),
     )

@@ -29,6 +29,7 @@ from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
 from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
 
@@ -39,13 +40,15 @@ def complementary(
     *,
     start: Attitude,
     alpha: float = 0.98,
+    reading: str = "instant",
     covariance: AttitudeNoise | None = None,
     longest: float | None = None,
 ):
     """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
 
     `alpha` is the gyroscope's share at each reading of the accelerometer; 1 is the gyroscope alone. Its time
-    constant is period * alpha / (1 - alpha): 0.245 s for 0.98 at 200 Hz.
+    constant is period * alpha / (1 - alpha): 0.245 s for 0.98 at 200 Hz. `reading` of the gyroscope as in
+    `turn_by_gyro`.
 
     Collected: at each reading of the gyroscope `attitude`, and for comparison `gyroscope` and
     `accelerometer`, the attitudes by one of them alone; at each reading of the accelerometer `rejected`, what
@@ -54,7 +57,7 @@ def complementary(
     """
     at_rest = WorldForce.at_rest()
     previous = delay(start, name="turned")
-    turned = turn_by_gyro(previous, gyro, name="gyroscope")
+    turned = turn_by_gyro(previous, gyro, reading=reading, name="gyroscope")
     if longest is not None:
         turned = stay(previous, turned, longest=longest)
     previous.feed(turned)
@@ -105,6 +108,7 @@ def for_flight(
         scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
         start=first_attitude(flight, gyro, on.first_up("accelerometer", push["force"])),
         alpha=alpha,
+        reading=reading_of(flight, "gyro"),
         covariance=noise,
         longest=on.longest(),
     )

@@ -17,18 +17,21 @@ from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, Gyro, Imu
 
 
 @graph
-def gyro_integration(imu: Stream[Imu], *, start: Attitude, longest: float | None = None):
-    """Integral of the gyroscope's rate from a given attitude.
+def gyro_integration(
+    imu: Stream[Imu], *, start: Attitude, reading: str = "instant", longest: float | None = None
+):
+    """Integral of the gyroscope's rate from a given attitude; `reading` as in `turn_by_gyro`.
 
     Collected: `attitude` at every reading.
     """
     previous = delay(start, name="previous")
     rate = imu.map(lambda reading: Gyro(rate=reading.gyro), name="gyro")
-    attitude = turn_by_gyro(previous, rate, name="attitude")
+    attitude = turn_by_gyro(previous, rate, reading=reading, name="attitude")
     if longest is not None:
         attitude = stay(previous, attitude, longest=longest)
     previous.feed(attitude)
@@ -45,4 +48,5 @@ def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored
     """
     begin = orientation_start(on.flight, on.inputs["imu"], still)
     score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
-    return on.case(score, start=Attitude(attitude=begin.attitude), longest=on.longest())
+    start = Attitude(attitude=begin.attitude)
+    return on.case(score, start=start, reading=reading_of(on.flight), longest=on.longest())

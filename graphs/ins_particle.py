@@ -25,7 +25,7 @@ from flowgraph.blocks.models.particle_ins import (
     start_states,
     weigh_states,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.spread import spread_states
 from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
@@ -46,6 +46,8 @@ def ins_particle(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    reading: str = "instant",
     resample_below: float = 0.5,
     spread: float = 0.1,
     scheme: str = "systematic",
@@ -54,6 +56,7 @@ def ins_particle(
 ):
     """Particle filter of 15 states with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` (the particles' mean and covariance, before resampling) and `angles` at every tick;
     `effective_sample_size` and `ancestors` at every pose.
     """
@@ -61,12 +64,17 @@ def ins_particle(
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
     prior = propagate_states(
-        cloud, between_imu(last, control), order=order, noise=noise, draws=f"{draws}.process", name="predict"
+        cloud,
+        driving(last, control, reading),
+        order=order,
+        noise=noise,
+        draws=f"{draws}.process",
+        name="predict",
     )
     if held is not None:
         prior = prior if held.longest is None else stay(cloud, prior, longest=held.longest)
         prior = spread_states(prior, imu, held=held, draws=f"{draws}.held")
-    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
+    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, lever=lever, at=pose, name="update")
     fresh, size, ancestors = resample_states(
         weighed,
         below=resample_below,

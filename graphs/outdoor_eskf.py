@@ -19,7 +19,7 @@ from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.belief import (
     FLOW,
     OUTDOOR,
@@ -35,6 +35,7 @@ from flowgraph.blocks.outdoor.belief import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
 
@@ -49,12 +50,14 @@ def outdoor_eskf(
     *,
     start: Gaussian,
     sensors: OutdoorSensors,
+    reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` at every tick, and the innovation of each sensor where there was a reading.
     """
     s = sensors
@@ -62,7 +65,7 @@ def outdoor_eskf(
     last = delay(Imu.at_rest(), name="last_control")
     ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
-    now = predict_clone(belief, between_imu(last, control), noise=s.imu, name="predict")
+    now = predict_clone(belief, driving(last, control, reading), noise=s.imu, name="predict")
     now = bridged(belief, now, imu, held=held, position=0, velocity=3, attitude=6)
 
     def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
@@ -78,10 +81,10 @@ def outdoor_eskf(
             magnetometer.map(lambda z: z.field / s.magnetometer), FieldObserver(s.field, s.magnetometer), 1.0,
         ),
     }  # fmt: skip
-    for name, (reading, observe, noise) in readings.items():
+    for name, (seen, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
         now, innovation = update_extended(
-            now, reading, observe=observe, R=R, space=OUTDOOR, gate=gate, name=f"fuse_{name}"
+            now, seen, observe=observe, R=R, space=OUTDOOR, gate=gate, name=f"fuse_{name}"
         )
         now = told(now, innovation, name)
     now, innovation = update_extended(
@@ -114,6 +117,7 @@ def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Scor
         inputs=inputs,
         start=start_outdoor(first),
         sensors=sensors,
+        reading=reading_of(on.flight),
         held=control.held(on, inputs["imu"], inputs),
         **gated.gating(),
     )
