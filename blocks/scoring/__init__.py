@@ -27,7 +27,7 @@ from flowgraph.blocks.scoring.cases import (
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
-from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
+from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
 from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, StartPose
 from flowgraph.blocks.scoring.streams import (
@@ -85,6 +85,7 @@ __all__ = [
     "told_acceleration",
     "with_parts",
     "Share",
+    "counted",
     "counted_errors",
     "scored_errors",
 ]

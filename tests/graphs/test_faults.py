@@ -36,8 +36,8 @@ from tests.graphs.library import OWN
 BEGINS, OVER, LASTS, HOUR = 2.0, 6.0, 9.0, 3600.0
 """s after the first reading: the fault, from when on errors count, the end; and by how much stamps jump."""
 
-NOT_INERTIAL = {"tag_pose", "particle", "imu_calibration"}
-"""They take images, velocities in the plane, and counts of converters."""
+NOT_INERTIAL = {"tag_pose", "particle", "imu_calibration", "attitude_mekf"}
+"""They take images, velocities in the plane, counts of converters, and commanded rates."""
 
 QUICK = {
     "async_kalman", "augmented_complementary", "ekf", "gyro_integration", "ins_eskf", "kalman",
