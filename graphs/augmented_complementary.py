@@ -23,6 +23,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_reckon
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
@@ -44,6 +45,7 @@ def augmented_complementary(
     gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     covariance: PoseNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
@@ -52,8 +54,10 @@ def augmented_complementary(
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
+    if longest is not None:
+        prior = stay(previous, prior, longest=longest)
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
     corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")
@@ -63,7 +67,7 @@ def augmented_complementary(
     return {"pose": pose}
 
 
-@on_flight(augmented_complementary, "imu", "vicon")
+@on_flight(augmented_complementary, "imu", "vicon", measured=None)
 def for_flight(
     on: OnFlight,
     *,
@@ -95,5 +99,6 @@ def for_flight(
         velocity_alpha=velocity_alpha,
         attitude_alpha=attitude_alpha,
         covariance=noise,
+        longest=on.longest(),
         reading=reading_of(on.flight),
     )

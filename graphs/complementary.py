@@ -21,6 +21,7 @@ group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (r
 from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, high_pass, latest, low_pass
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import carry_to_world, level_near, turn_by_gyro
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
@@ -41,6 +42,7 @@ def complementary(
     alpha: float = 0.98,
     reading: str = "instant",
     covariance: AttitudeNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
 
@@ -56,6 +58,8 @@ def complementary(
     at_rest = WorldForce.at_rest()
     previous = delay(start, name="turned")
     turned = turn_by_gyro(previous, gyro, reading=reading, name="gyroscope")
+    if longest is not None:
+        turned = stay(previous, turned, longest=longest)
     previous.feed(turned)
 
     force = carry_to_world(latest(turned, init=start, name="by_gyro"), accelerometer, name="carried")
@@ -73,7 +77,9 @@ def complementary(
     return {"attitude": attitude, "gyroscope": turned}
 
 
-@on_flight(complementary, "gyro", "accelerometer", told=with_parts, fix="choose a flight with an imu")
+@on_flight(
+    complementary, "gyro", "accelerometer", told=with_parts, measured=None, fix="choose a flight with an imu"
+)
 def for_flight(
     on: OnFlight,
     *,
@@ -104,4 +110,5 @@ def for_flight(
         alpha=alpha,
         reading=reading_of(flight, "gyro"),
         covariance=noise,
+        longest=on.longest(),
     )

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flowgraph import collect, delay, latest
-from flowgraph.blocks.kalman.lost import Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.signals import Gaussian, Imu
@@ -49,8 +49,7 @@ def euler_loop(
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | measured, name="control")
     prior = predict(belief, driving(last, control, reading))
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update(prior, control)
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
@@ -21,7 +22,9 @@ from flowgraph.blocks.signals import Attitude, Gyro, Imu
 
 
 @graph
-def gyro_integration(imu: Stream[Imu], *, start: Attitude, reading: str = "instant"):
+def gyro_integration(
+    imu: Stream[Imu], *, start: Attitude, reading: str = "instant", longest: float | None = None
+):
     """Integral of the gyroscope's rate from a given attitude; `reading` as in `turn_by_gyro`.
 
     Collected: `attitude` at every reading.
@@ -29,11 +32,13 @@ def gyro_integration(imu: Stream[Imu], *, start: Attitude, reading: str = "insta
     previous = delay(start, name="previous")
     rate = imu.map(lambda reading: Gyro(rate=reading.gyro), name="gyro")
     attitude = turn_by_gyro(previous, rate, reading=reading, name="attitude")
+    if longest is not None:
+        attitude = stay(previous, attitude, longest=longest)
     previous.feed(attitude)
     return {"attitude": attitude}
 
 
-@on_flight(gyro_integration, "imu")
+@on_flight(gyro_integration, "imu", measured=None)
 def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored) -> Case:
     """Start it on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
@@ -43,4 +48,5 @@ def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored
     """
     begin = orientation_start(on.flight, on.inputs["imu"], still)
     score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
-    return on.case(score, start=Attitude(attitude=begin.attitude), reading=reading_of(on.flight))
+    start = Attitude(attitude=begin.attitude)
+    return on.case(score, start=start, reading=reading_of(on.flight), longest=on.longest())

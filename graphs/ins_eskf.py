@@ -15,7 +15,7 @@ from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_flight
 from flowgraph.blocks.scoring.point import positions
@@ -49,10 +49,9 @@ def ins_eskf(
     """
     ticks = imu | position if attitude is None else imu | position | attitude
     belief = delay(start, name="belief")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = predict(belief, control, noise=noise, gravity=gravity, at=ticks)
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=3, attitude=6)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = aid_position(
         prior, position, noise=position_noise, lever=lever, gate=gate, invariant=invariant
     )
@@ -97,7 +96,7 @@ def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
         "noise": filter.imu_noise(on, (1.0, 1.0) if "position_noise" in info else (15.0, 20.0)),
         **filter.measured(on),
         "lever": info.get(lever, (0.0, 0.0, 0.0)),
-        "held": filter.held(on, imu),
+        "held": filter.held(on, imu, inputs),
         "invariant": begin.heading is not None,
         **filter.gating(),
     }
@@ -152,5 +151,5 @@ def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
         return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
     streams = on.need("imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
     vicon = streams["vicon"]
-    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude")
+    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude", gaps=vicon.gaps)
     return {"imu": streams["imu"], "position": positions(vicon), "attitude": turns}, "vicon_lever"

@@ -16,6 +16,7 @@ from typing import Any
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.particle_ins import (
     average_state,
@@ -25,7 +26,8 @@ from flowgraph.blocks.models.particle_ins import (
     weigh_states,
 )
 from flowgraph.blocks.models.pose import driving
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
+from flowgraph.blocks.models.spread import spread_states
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
@@ -50,6 +52,7 @@ def ins_particle(
     spread: float = 0.1,
     scheme: str = "systematic",
     draws: str = "ins_particle",
+    held: Held | None = None,
 ):
     """Particle filter of 15 states with Euler angles: IMU control, camera pose.
 
@@ -68,6 +71,9 @@ def ins_particle(
         draws=f"{draws}.process",
         name="predict",
     )
+    if held is not None:
+        prior = prior if held.longest is None else stay(cloud, prior, longest=held.longest)
+        prior = spread_states(prior, imu, held=held, draws=f"{draws}.held")
     weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, lever=lever, at=pose, name="update")
     fresh, size, ancestors = resample_states(
         weighed,
@@ -88,12 +94,13 @@ def ins_particle(
     }
 
 
-@on_flight(ins_particle, "imu")
+@on_flight(ins_particle, "imu", measured=None)
 def for_flight(
     on: OnFlight,
     *,
     cloud: Particles,
     filter: EulerPose = _ROOM,
+    control: HeldControl,
     inflate: Positive = 2.0,
     spread: NotNegative = 0.1,
 ) -> Case:
@@ -110,13 +117,15 @@ def for_flight(
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
+    poses = poses_of(on.name, on.flight, tags=filter.tags)
     return on_measured_pose(
         on,
         filter,
-        poses_of(on.name, on.flight, tags=filter.tags),
+        poses,
         inflate=inflate,
         start=lambda first: start_states(cloud.particles, first, seed=cloud.seed),
         factor=inflate**2,
         spread=spread,
+        held=control.held(on, on.inputs["imu"], {**on.inputs, "pose": poses}),
         **cloud.resampling(),
     )

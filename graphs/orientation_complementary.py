@@ -30,6 +30,7 @@ import numpy as np
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import level_attitude
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import (
     blend,
@@ -64,6 +65,7 @@ def orientation_complementary(
     heading: str = "shortest_arc",
     reading: str = "instant",
     covariance: AttitudeNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of a quadrotor's attitude: thrust is removed, and gravity remains.
 
@@ -77,6 +79,8 @@ def orientation_complementary(
     rate = latest(gyro, init=_STILL, name="rate")
     ticks = gyro | coordinate_acceleration
     turned = turn_by_gyro(previous, rate, reading=reading, at=ticks, name="gyroscope")
+    if longest is not None:
+        turned = stay(previous, turned, longest=longest)
     up = remove_thrust(coordinate_acceleration, latest(thrust, init=_HOVER, name="last_thrust"))
     if heading == "shortest_arc":
         seen = level_attitude(up, name="seen")
@@ -94,7 +98,7 @@ _STREAMS = ("gyro", "coordinate_acceleration", "thrust")
 _FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
 
 
-@on_flight(orientation_complementary, *_STREAMS, told=with_parts, fix=_FIX)
+@on_flight(orientation_complementary, *_STREAMS, told=with_parts, measured=None, fix=_FIX)
 def for_flight(
     on: OnFlight,
     *,
@@ -141,6 +145,7 @@ def for_flight(
         heading=heading,
         reading=reading_of(flight, "gyro"),
         covariance=noise,
+        longest=on.longest(),
     )
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.plane import (
     average_plane,
@@ -27,7 +28,8 @@ from flowgraph.blocks.models.plane import (
     start_plane,
     weigh_plane,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.models.spread import spread_plane
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
 
@@ -43,6 +45,7 @@ def particle(
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "particle",
+    held: Held | None = None,
 ):
     """Bootstrap particle filter of a point in the plane.
 
@@ -55,6 +58,9 @@ def particle(
     moved = move_plane(
         cloud, control, noise=velocity_noise, draws=f"{draws}.move", at=velocity | position, name="move"
     )
+    if held is not None:
+        moved = moved if held.longest is None else stay(cloud, moved, longest=held.longest)
+        moved = spread_plane(moved, velocity, held=held, draws=f"{draws}.held")
     weighed = weigh_plane(moved, position, noise=position_noise, at=position, name="weigh")
     size = plane_sample_size(weighed, name="size")
     fresh, ancestors = resample_plane(
@@ -65,7 +71,7 @@ def particle(
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(particle, "velocity", "position")
+@on_flight(particle, "velocity", "position", measured=None, ranged=False)
 def for_flight(
     on: OnFlight,
     *,
@@ -73,6 +79,7 @@ def for_flight(
     velocity_noise: Positive | None = None,
     position_noise: Positive | None = None,
     spread: Positive = 1.0,
+    control: HeldControl,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
@@ -91,5 +98,6 @@ def for_flight(
         start=start_plane(cloud.particles, seed=cloud.seed, spread=spread),
         velocity_noise=on.noise("velocity_noise", velocity_noise),
         position_noise=on.noise("position_noise", position_noise),
+        held=control.held(on, on.inputs["velocity"]),
         **cloud.resampling(),
     )

@@ -22,7 +22,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.inertial.alignment import orientation_start
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman.lost import PATIENCE, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, find_back, stay
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -58,6 +58,7 @@ def quaternion_ukf(
     frozen: float = 0.0,
     gate: float | None = None,
     patience: int = PATIENCE,
+    longest: float | None = None,
 ):
     """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
 
@@ -81,6 +82,8 @@ def quaternion_ukf(
         space=STATE,
         points=points,
     )
+    if longest is not None:
+        prior = stay(belief, prior, longest=longest)
     posterior, innovation = update_unscented(
         prior,
         stacked_imu(imu, name="reading"),
@@ -97,7 +100,7 @@ def quaternion_ukf(
     return {"belief": named_orientation(posterior)}
 
 
-@on_flight(quaternion_ukf, "imu")
+@on_flight(quaternion_ukf, "imu", measured=("imu",))
 def for_flight(
     on: OnFlight,
     *,
@@ -145,5 +148,6 @@ def for_flight(
         still=begin.still,
         up=begin.up,
         frozen=after,
+        longest=on.longest(),
         **gated.gating(),
     )

@@ -20,7 +20,9 @@ from flowgraph.blocks.geometry.rotations import level, to_matrix
 from flowgraph.blocks.inertial.alignment import StartSpread
 from flowgraph.blocks.inertial.calibration import subtract_rest_bias
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.spread import spread_cloud
 from flowgraph.blocks.particles.cloud import (
     attitude_likelihood,
     average_attitude,
@@ -34,7 +36,7 @@ from flowgraph.blocks.particles.cloud import (
 )
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.particles.resampling import draw_ancestors, take_ancestors
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, PoseAided, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, PoseAided, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Cloud, Imu, Pose
@@ -106,6 +108,7 @@ def rbpf_indoor(
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_indoor",
+    held: Held | None = None,
 ):
     """Rao-Blackwellized particle filter: attitude by particles, motion by a Kalman filter each.
 
@@ -116,10 +119,13 @@ def rbpf_indoor(
     every measured pose.
     """
     if still > 0.0:
-        imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
+        imu = subtract_rest_bias(imu, seconds=still, up=up, gravity=-gravity[2], name="calibrate")
     cloud = delay(start, name="cloud")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = predict(cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
+    if held is not None:
+        prior = prior if held.longest is None else stay(cloud, prior, longest=held.longest)
+        prior = spread_cloud(prior, imu, held=held, draws=f"{draws}.held")
     posterior = update(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
     )
@@ -131,13 +137,14 @@ def rbpf_indoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_indoor, "imu", "vicon")
+@on_flight(rbpf_indoor, "imu", "vicon", measured=None)
 def for_flight(
     on: OnFlight,
     *,
     cloud: Particles,
     unknown_yaw: bool = True,
     filter: PoseAided,
+    control: HeldControl,
     still: NotNegative | None = None,
 ) -> Case:
     """Start and tune the filter for a flight with an IMU and a motion capture.
@@ -174,6 +181,7 @@ def for_flight(
         lever=info.get("vicon_lever", (0.0, 0.0, 0.0)),
         still=still,
         up=tuple(up.tolist()),
+        held=control.held(on, imu),
         **cloud.resampling(),
     )
 

@@ -15,8 +15,10 @@ q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
 from __future__ import annotations
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.models.spread import spread_outdoor
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
     correct_distance,
@@ -31,7 +33,7 @@ from flowgraph.blocks.outdoor.cloud import (
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.resampling import draw_ancestors
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
@@ -58,6 +60,7 @@ def rbpf_outdoor(
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
+    held: Held | None = None,
 ):
     """Rao-Blackwellized particle filter of pose and velocity on asynchronous sensors.
 
@@ -73,6 +76,9 @@ def rbpf_outdoor(
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
     now = predict_outdoor(cloud, driving(last, control, reading), noise=s.imu, name="predict")
+    if held is not None:
+        now = now if held.longest is None else stay(cloud, now, longest=held.longest)
+        now = spread_outdoor(now, imu, held=held)
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
@@ -91,8 +97,8 @@ def rbpf_outdoor(
     return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_outdoor)
-def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
+@on_flight(rbpf_outdoor, measured=None)
+def for_flight(on: OnFlight, *, cloud: Particles, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
@@ -110,6 +116,7 @@ def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
         inputs=inputs,
         start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
         sensors=sensors,
+        held=control.held(on, inputs["imu"], inputs),
         reading=reading_of(on.flight),
         **cloud.resampling(),
     )

@@ -123,7 +123,7 @@ class EulerKalman(EulerModel, HeldControl, Gated):
         self, on: OnFlight, start: Any, *, inputs: Mapping[str, Series] | None = None, **settings: Any
     ) -> Case:
         """As of `EulerModel`, with a gate, and with what the age of the IMU's readings does."""
-        held = self.held(on, on.inputs["imu"])
+        held = self.held(on, on.inputs["imu"], inputs)
         return super().case(on, start, inputs=inputs, held=held, **self.gating(), **settings)
 
 

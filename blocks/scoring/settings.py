@@ -161,16 +161,21 @@ class Spliced:
         return left | made
 
 
-def spliced(function: Callable[..., Any]) -> Spliced:
+def spliced(function: Callable[..., Any], **more: type[Settings]) -> Spliced:
     """What a function of keyword-only settings and groups of settings takes, all told.
+
+    Args:
+        function: with keyword-only settings.
+        more: groups that are settings, too, and no parameters of the function.
 
     Raises:
         DeclarationError: where a setting is declared twice.
     """
-    kinds = typing.get_type_hints(function, include_extras=True)
+    kinds = typing.get_type_hints(function, include_extras=True) | more
+    added = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in more]
     found: dict[str, tuple[Any, Any, str]] = {}
     groups: dict[str, type[Settings]] = {}
-    for p in inspect.signature(function).parameters.values():
+    for p in [*inspect.signature(function).parameters.values(), *added]:
         if p.kind is not p.KEYWORD_ONLY:
             continue
         kind = kinds[p.name]
