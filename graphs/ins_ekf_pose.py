@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.euler_ins import (
     euler_angles,
@@ -24,6 +24,7 @@ from flowgraph.blocks.models.euler_ins import (
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.graphs.tag_pose import poses_of
 
@@ -37,6 +38,7 @@ def ins_ekf_pose(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
+    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -47,9 +49,11 @@ def ins_ekf_pose(
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
-    prior = predict_extended(belief, between_imu(last, control), order=order, noise=noise, name="predict")
+    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
+    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
+    prior = predict_extended(
+        belief, between_imu(last, control), order=order, noise=noise, gravity=gravity, name="predict"
+    )
     if held is not None:
         prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update_pose_angles(
@@ -66,7 +70,7 @@ def ins_ekf_pose(
     }
 
 
-@on_flight(ins_ekf_pose, "imu")
+@on_flight(ins_ekf_pose, "imu", told=with_imu)
 def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 
@@ -79,5 +83,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
-    return on_measured_pose(on, filter, poses, held=held, **filter.gating())
+    return on_measured_pose(on, filter, poses, **filter.gating())

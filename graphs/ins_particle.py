@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.particle_ins import (
     average_state,
@@ -28,6 +28,7 @@ from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.tag_pose import poses_of
 
@@ -43,6 +44,7 @@ def ins_particle(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
+    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     resample_below: float = 0.5,
     spread: float = 0.1,
@@ -55,10 +57,16 @@ def ins_particle(
     `effective_sample_size` and `ancestors` at every pose.
     """
     cloud = delay(start, name="cloud")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
+    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
+    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
     prior = propagate_states(
-        cloud, between_imu(last, control), order=order, noise=noise, draws=f"{draws}.process", name="predict"
+        cloud,
+        between_imu(last, control),
+        order=order,
+        noise=noise,
+        gravity=gravity,
+        draws=f"{draws}.process",
+        name="predict",
     )
     weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
     fresh, size, ancestors = resample_states(
@@ -80,7 +88,7 @@ def ins_particle(
     }
 
 
-@on_flight(ins_particle, "imu")
+@on_flight(ins_particle, "imu", told=with_imu)
 def for_flight(
     on: OnFlight,
     *,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -29,6 +29,7 @@ from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.graphs.tag_pose import poses_of
@@ -43,6 +44,7 @@ def ins_ukf_pose(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
+    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -53,11 +55,11 @@ def ins_ukf_pose(
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
+    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
+    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
     prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
-        space=STATE, points=far_points(12), name="predict",
+        belief, between_imu(last, control), move=carried(order, gravity),
+        noise=np.diag(increment_variances(noise)), space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
     if held is not None:
         prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
@@ -75,7 +77,7 @@ def ins_ukf_pose(
     }
 
 
-@on_flight(ins_ukf_pose, "imu")
+@on_flight(ins_ukf_pose, "imu", told=with_imu)
 def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 
@@ -88,5 +90,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
-    return on_measured_pose(on, filter, poses, held=held, **filter.gating())
+    return on_measured_pose(on, filter, poses, **filter.gating())

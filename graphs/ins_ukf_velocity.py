@@ -18,22 +18,24 @@ from typing import Annotated
 import numpy as np
 
 from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.geometry.rotations import level
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.metrics.errors import interpolate_pose
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     euler_angles,
     increment_variances,
     navigation_belief,
     start_gaussian,
+    with_heading,
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
 from flowgraph.blocks.scoring.settings import Positive, named
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, with_imu
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.vision.camera import Mount
@@ -51,6 +53,7 @@ def ins_ukf_velocity(
     rate_noise: float,
     rate: str = "gyro",
     order: str = "zyx",
+    gravity: tuple[float, float, float] = GRAVITY,
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
@@ -60,11 +63,11 @@ def ins_ukf_velocity(
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | motion, name="control")
+    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
+    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | motion, name="control")
     prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order), noise=np.diag(increment_variances(noise)),
-        space=STATE, points=far_points(12), name="predict",
+        belief, between_imu(last, control), move=carried(order, gravity),
+        noise=np.diag(increment_variances(noise)), space=STATE, points=far_points(12), name="predict",
     )  # fmt: skip
     if held is not None:
         prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
@@ -83,7 +86,7 @@ def ins_ukf_velocity(
     }
 
 
-@on_flight(ins_ukf_velocity, "imu", "motion")
+@on_flight(ins_ukf_velocity, "imu", "motion", told=with_imu)
 def for_flight(
     on: OnFlight,
     *,
@@ -95,39 +98,52 @@ def for_flight(
     gated: Gated,
     control: HeldControl,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
     Args:
-        flight: with the streams `imu` and `motion`, a truth, and the `mount` of the camera in its info.
+        flight: with the streams `imu` and `motion`, and the `mount` of the camera in its info. In place of
+            `imu` it may have the thesis's unit: `gyro` and `coordinate_acceleration`, with the same times.
         rate: gyro (the report's eq. 10) or camera (eq. 9).
         order: zxy (the course's) or zyx (the report's).
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
+        start: must be said where there is neither a truth nor a measured attitude; the position is then the
+            origin, and the first force levels the body.
 
     Raises:
-        DataError: where the flight lacks a stream or the truth.
+        DataError: where the flight lacks a stream, or does not tell where to start.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    if on.flight.truth is None or not {"position", "attitude"} <= set(on.flight.truth.leaves):
+    seen, imu = on.flight.streams.get("vicon"), on.inputs["imu"]
+    begin = started.pose(on, on.inputs, position=seen, attitude=seen)
+    if started == Started() and begin.unknown:
+        truth = on.flight.truth
         raise DataError(
             "this flight does not tell where ins_ukf_velocity starts",
             path=on.flight.name,
             expected="a truth of position and attitude",
-            got="none" if on.flight.truth is None else ", ".join(on.flight.truth.leaves),
-            fix="build the graph with a start of your own: start_gaussian(position, attitude, order=...)",
+            got="none" if truth is None else ", ".join(truth.leaves),
+            fix="write --set start=unknown_yaw, or build the graph with a start of your own",
         )
-    first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
-    position, attitude = interpolate_pose(on.flight.truth, first)
+    turn = begin.attitude
+    if not begin.tilted and not on.weightless:
+        force = on.first_up("imu", imu["specific_force"][imu.time >= begin.time])
+        turn = np.asarray(level(turn, force, xp=np))
+    tilt = 0.01 if begin.tilted else 0.1
+    first = start_gaussian(begin.position, turn, order=order, deviations=(0.01, tilt, 0.3, 0.02, 0.05))
     return on.case(
         euler_score(on, scored, order),
-        start=start_gaussian(position[0], attitude[0], order=order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)),
+        inputs=begin.inputs,
+        start=with_heading(first, begin.heading),
         noise=factors.imu_noise(on),
         mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         order=order,
-        held=control.held(on, on.inputs["imu"]),
+        gravity=on.gravity,
+        held=control.held(on, begin.inputs["imu"]),
         **gated.gating(),
     )

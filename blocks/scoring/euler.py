@@ -15,11 +15,10 @@ import numpy as np
 from flowgraph import Case, Result, Series
 from flowgraph.blocks.geometry.euler import ORDERS
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
-from flowgraph.blocks.scoring.cases import Factors, OnFlight, PoseAided, PoseFilter, Scored
+from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian, with_heading
+from flowgraph.blocks.scoring.cases import Factors, HeldControl, OnFlight, PoseAided, PoseFilter, Scored
 from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import Positive, named
-from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian
 
@@ -97,18 +96,18 @@ def on_measured_pose(
         start: makes the graph's start of a belief around the first measured pose.
         settings: of the graph itself.
     """
-    place, turn, more = pose["position"][0], pose["attitude"][0], {}
-    if isinstance(filter, Started):
-        place, turn, heading = filter.pose(on, int(pose.time[0]), place, turn, usual="file")
-        more = {} if heading is None else {"deviations": (0.05, heading, 0.3, 0.03, 0.15)}
-    first = start_gaussian(place, turn, order=filter.order, **more)
+    begin = filter.pose(on, {**on.inputs, "pose": pose}, position=pose, attitude=pose, usual="file")
+    first = start_gaussian(begin.position, begin.attitude, order=filter.order)
+    more = {"held": filter.held(on, begin.inputs["imu"])} if isinstance(filter, HeldControl) else {}
     return on.case(
         euler_score(on, filter, filter.order),
-        inputs={**on.inputs, "pose": pose},
-        start=start(first),
+        inputs=begin.inputs,
+        start=start(with_heading(first, begin.heading)),
         noise=filter.imu_noise(on),
         R=filter.covariance(on) * inflate**2,
         order=filter.order,
+        gravity=on.gravity,
+        **more,
         **settings,
     )
 

@@ -16,6 +16,7 @@ from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.scoring.start import from_first
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
 from flowgraph.blocks.signals import PointReading, Position
@@ -45,11 +46,12 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
     Raises:
         DataError: where the flight does not say its noise.
     """
+    place, inputs = from_first(on, inputs, on.inputs["vicon"], "position")
     density = given(filter.accelerometer_noise, imu_noise_of(on.name, on.flight).accelerometer)
     return on.case(
         filter.score(on, point_errors, steps=partial(point_steps, model=point_model(density))),
         inputs=inputs,
-        start=start_point(on.inputs["vicon"]["position"][0]),
+        start=start_point(place),
         noise=density,
         position_noise=on.noise("position_noise", filter.position_noise),
         control=reading_of(on.flight),

@@ -107,6 +107,8 @@ def with_imu(flight: Flight) -> Flight:
     kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
     values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
     streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
-    told = [flight.info["noise"][name] for name in parts]
-    noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
-    return replace(flight, streams=streams, info={**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS})
+    info = {**flight.info, "gravity": WEIGHTLESS}
+    if set(parts) <= set(flight.info.get("noise", ())):
+        told = [flight.info["noise"][name] for name in parts]
+        info["imu_noise"] = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
+    return replace(flight, streams=streams, info=info)
