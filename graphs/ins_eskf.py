@@ -33,7 +33,7 @@ NEAR, APART = 0.5, 30.0
 SURE = 40.0
 """By how much the best must foretell better than others, in -2 log of the likelihood."""
 
-MOVED = 0.5
+MOVED = 0.1
 """m: a body that has not come so far from where it was shows no heading."""
 
 
