@@ -1,17 +1,8 @@
 """Declare a filter once as a graph; draw it, simulate it, and lower it to a fixed-size pipeline."""
 
+from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
-from flowgraph.data.batch import Batch
-from flowgraph.data.export import write_tum
-from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
-from flowgraph.data.registry import Case, Report, find_graph, load_flight
-from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
-from flowgraph.engines.many import simulate_many
-from flowgraph.engines.python.run import Run
-from flowgraph.engines.simulate import simulate
-from flowgraph.engines.state import load_state, save_state
 from flowgraph.errors import (
     ClockError,
     CycleError,
@@ -39,16 +30,52 @@ from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
 from flowgraph.moved import lead as _lead
-from flowgraph.pipeline.lowering import lower
-from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
+    from flowgraph.data.batch import Batch
+    from flowgraph.data.export import write_tum
+    from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
+    from flowgraph.data.registry import Case, Report, find_graph, load_flight
+    from flowgraph.data.result import Result
+    from flowgraph.data.series import Flight, Series
+    from flowgraph.engines.many import simulate_many
+    from flowgraph.engines.python.run import Run
+    from flowgraph.engines.simulate import simulate
+    from flowgraph.engines.state import load_state, save_state
+    from flowgraph.pipeline.lowering import lower
+    from flowgraph.pipeline.pipeline import Pipeline
+    from flowgraph.recorder.derivatives import jacobian
 
+# What is done with a graph is imported when it is first asked for: who declares pays for no engine.
+_LATER = {
+    "Batch": "flowgraph.data.batch",
+    "write_tum": "flowgraph.data.export",
+    "arrays": "flowgraph.data.inputs",
+    "clocks_of": "flowgraph.data.inputs",
+    "ticks": "flowgraph.data.inputs",
+    "timing_of": "flowgraph.data.inputs",
+    "ProgressBar": "flowgraph.data.progress",
+    "Case": "flowgraph.data.registry",
+    "Report": "flowgraph.data.registry",
+    "find_graph": "flowgraph.data.registry",
+    "load_flight": "flowgraph.data.registry",
+    "Result": "flowgraph.data.result",
+    "Flight": "flowgraph.data.series",
+    "Series": "flowgraph.data.series",
+    "simulate_many": "flowgraph.engines.many",
+    "Run": "flowgraph.engines.python.run",
+    "simulate": "flowgraph.engines.simulate",
+    "load_state": "flowgraph.engines.state",
+    "save_state": "flowgraph.engines.state",
+    "lower": "flowgraph.pipeline.lowering",
+    "Pipeline": "flowgraph.pipeline.pipeline",
+    "jacobian": "flowgraph.recorder.derivatives",
+}
 
-_lead()
+_import_module("flowgraph.engines")  # watches for forks from here on
 _provide(
     {
         "Block.__call__": "flowgraph.language.wiring:wire",
@@ -70,11 +97,14 @@ _provide(
 
 
 def __getattr__(name: str) -> object:
-    if name == "ProgressBar":  # with it comes rich, which a program without a bar need not import
-        from flowgraph.data.progress import ProgressBar
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(_import_module(_LATER[name]), name)
+    return found
 
-        return ProgressBar
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))
 
 
 __all__ = [
@@ -128,6 +158,7 @@ __all__ = [
     "high_pass",
     "integer",
     "integrate",
+    "jacobian",
     "latest",
     "load_flight",
     "load_state",
@@ -158,3 +189,5 @@ __all__ = [
     "zip_latest",
     "zip_latest_right",
 ]
+
+_lead(_import_module(__name__))

@@ -88,13 +88,18 @@ class _Moved:
         module.__spec__ = self._own.pop(spec.name)
 
 
-def lead() -> None:
-    """Let old names lead to the modules: at once to those that are there, later to the others.
+class _Package(ModuleType):
+    """The package at the top: an old module never takes the place of the function of its name.
 
-    A module that is there is not imported again, so it cannot take the place of a function of its name: the
-    attribute `flowgraph.graph` stays the decorator.
+    To import `flowgraph.graph` would set the attribute `graph`, which is the decorator.
     """
-    for old, new in MOVED.items():
-        if new in sys.modules:
-            sys.modules.setdefault(old, sys.modules[new])
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (isinstance(value, ModuleType) and name in self.__all__):
+            super().__setattr__(name, value)
+
+
+def lead(package: ModuleType) -> None:
+    """Let old names lead to the modules, and let `package` keep what it lists in `__all__`."""
+    package.__class__ = _Package
     sys.meta_path.insert(0, _Moved())  # before files below a package that moved are found a second time

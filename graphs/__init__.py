@@ -1,6 +1,7 @@
 """Filters as graphs: one file each, short enough to read beside its paper."""
 
 from flowgraph.graphs.async_kalman import async_kalman
+from flowgraph.graphs.attitude_mekf import attitude_mekf
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
@@ -21,6 +22,7 @@ from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.graphs.roll_pitch import roll_pitch
 from flowgraph.graphs.tag_pose import tag_pose
+from flowgraph.graphs.tracker import tracker
 from flowgraph.graphs.ukf import ukf
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "imu_calibration",
     "ins_eskf",
     "marg",
+    "attitude_mekf",
     "rbpf_indoor",
     "ukf",
     "tag_pose",
@@ -44,6 +47,7 @@ __all__ = [
     "roll_pitch",
     "gyro_integration",
     "particle",
+    "tracker",
     "outdoor_eskf",
     "rbpf_outdoor",
 ]

@@ -28,8 +28,12 @@ from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_rec
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
+<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, with_imu
+=======
+from flowgraph.blocks.scoring.tuning import imu_noise_of, reading_of
+>>>>>>> main
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
 
@@ -43,16 +47,23 @@ def augmented_complementary(
     velocity_alpha: float = 0.6,
     attitude_alpha: float = 0.85,
     gravity: tuple[float, float, float] = GRAVITY,
+    reading: str = "instant",
     covariance: PoseNoise | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
     The three shares are the IMU's, of position, velocity and attitude, at each pose; 1 is the IMU alone.
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before.
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
+<<<<<<< HEAD
     control = latest(imu, init=Imu.at_rest(-gravity[2]), name="control")
     prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
+=======
+    control = latest(imu, init=Imu.at_rest(), name="control")
+    prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
+>>>>>>> main
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
     corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")
@@ -101,4 +112,5 @@ def for_flight(
         attitude_alpha=attitude_alpha,
         gravity=on.gravity,
         covariance=noise,
+        reading=reading_of(on.flight),
     )

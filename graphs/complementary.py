@@ -27,8 +27,13 @@ from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spre
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
+<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
+=======
+from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.tuning import reading_of
+>>>>>>> main
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
 
@@ -39,12 +44,14 @@ def complementary(
     *,
     start: Attitude,
     alpha: float = 0.98,
+    reading: str = "instant",
     covariance: AttitudeNoise | None = None,
 ):
     """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
 
     `alpha` is the gyroscope's share at each reading of the accelerometer; 1 is the gyroscope alone. Its time
-    constant is period * alpha / (1 - alpha): 0.245 s for 0.98 at 200 Hz.
+    constant is period * alpha / (1 - alpha): 0.245 s for 0.98 at 200 Hz. `reading` of the gyroscope as in
+    `turn_by_gyro`.
 
     Collected: at each reading of the gyroscope `attitude`, and for comparison `gyroscope` and
     `accelerometer`, the attitudes by one of them alone; at each reading of the accelerometer `rejected`, what
@@ -53,7 +60,7 @@ def complementary(
     """
     at_rest = WorldForce.at_rest()
     previous = delay(start, name="turned")
-    turned = turn_by_gyro(previous, gyro, name="gyroscope")
+    turned = turn_by_gyro(previous, gyro, reading=reading, name="gyroscope")
     previous.feed(turned)
 
     force = carry_to_world(latest(turned, init=start, name="by_gyro"), accelerometer, name="carried")
@@ -103,5 +110,6 @@ def for_flight(
         inputs=begin.inputs,
         start=Attitude(attitude=attitude),
         alpha=alpha,
+        reading=reading_of(flight, "gyro"),
         covariance=noise,
     )

@@ -21,7 +21,7 @@ from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.models.pose import (
-    between_imu,
+    driving,
     pose_belief,
     pose_steps,
     predict_pose,
@@ -60,7 +60,7 @@ def ekf(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     control = latest(imu, init=Imu.at_rest(), at=imu | vicon, name="control")
-    drive = control if reading == "mean" else between_imu(last, control)
+    drive = driving(last, control, reading)
     prior = predict_pose(belief, drive, noise=noise, gravity=gravity)
     if held is not None:
         prior = bridge(prior, imu, held=held, position=3, velocity=0, attitude=6)

@@ -17,20 +17,24 @@ from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
+<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import with_imu
+=======
+from flowgraph.blocks.scoring.tuning import reading_of
+>>>>>>> main
 from flowgraph.blocks.signals import Attitude, Gyro, Imu
 
 
 @graph
-def gyro_integration(imu: Stream[Imu], *, start: Attitude):
-    """Integral of the gyroscope's rate from a given attitude.
+def gyro_integration(imu: Stream[Imu], *, start: Attitude, reading: str = "instant"):
+    """Integral of the gyroscope's rate from a given attitude; `reading` as in `turn_by_gyro`.
 
     Collected: `attitude` at every reading.
     """
     previous = delay(start, name="previous")
     rate = imu.map(lambda reading: Gyro(rate=reading.gyro), name="gyro")
-    attitude = turn_by_gyro(previous, rate, name="attitude")
+    attitude = turn_by_gyro(previous, rate, reading=reading, name="attitude")
     previous.feed(attitude)
     return {"attitude": attitude}
 
@@ -45,6 +49,7 @@ def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored
     """
     attitude, inputs = _start(on, started, still)
     score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
+<<<<<<< HEAD
     return on.case(score, inputs=inputs, start=Attitude(attitude=attitude))
 
 
@@ -55,3 +60,6 @@ def _start(on: OnFlight, started: Started, still: float | None) -> tuple[np.ndar
         return pose.attitude, pose.inputs
     begin, pose = started.orientation(on, on.inputs["imu"], still, deviates=False)
     return begin.attitude, pose.inputs
+=======
+    return on.case(score, start=Attitude(attitude=begin.attitude), reading=reading_of(on.flight))
+>>>>>>> main

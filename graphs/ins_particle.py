@@ -24,7 +24,7 @@ from flowgraph.blocks.models.particle_ins import (
     start_states,
     weigh_states,
 )
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
@@ -46,6 +46,8 @@ def ins_particle(
     order: str = "zxy",
     gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    reading: str = "instant",
     resample_below: float = 0.5,
     spread: float = 0.1,
     scheme: str = "systematic",
@@ -53,6 +55,7 @@ def ins_particle(
 ):
     """Particle filter of 15 states with Euler angles: IMU control, camera pose.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` (the particles' mean and covariance, before resampling) and `angles` at every tick;
     `effective_sample_size` and `ancestors` at every pose.
     """
@@ -61,14 +64,20 @@ def ins_particle(
     control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
     prior = propagate_states(
         cloud,
+<<<<<<< HEAD
         between_imu(last, control),
         order=order,
         noise=noise,
         gravity=gravity,
+=======
+        driving(last, control, reading),
+        order=order,
+        noise=noise,
+>>>>>>> main
         draws=f"{draws}.process",
         name="predict",
     )
-    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
+    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, lever=lever, at=pose, name="update")
     fresh, size, ancestors = resample_states(
         weighed,
         below=resample_below,

@@ -17,6 +17,7 @@ from typing import Annotated
 
 import numpy as np
 
+<<<<<<< HEAD
 from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
 from flowgraph.blocks.geometry.rotations import level
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
@@ -30,15 +31,29 @@ from flowgraph.blocks.models.euler_ins import (
     with_heading,
 )
 from flowgraph.blocks.models.pose import between_imu
+=======
+from flowgraph import Case, DataError, Stream, graph
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian
+>>>>>>> main
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
-from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.euler import EulerKalman, FarPoints
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, with_imu
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.blocks.vision.camera import Mount
+from flowgraph.graphs.euler_loop import euler_loop
+
+FAR = (far_points(12), far_points(6))
+"""Of the state and the IMU's noises, and of the state and those of the camera's velocity."""
+
+_REPORTS = EulerKalman(order="zyx")
 
 
 @graph
@@ -53,37 +68,42 @@ def ins_ukf_velocity(
     rate_noise: float,
     rate: str = "gyro",
     order: str = "zyx",
+<<<<<<< HEAD
     gravity: tuple[float, float, float] = GRAVITY,
+=======
+    points: tuple[SigmaPoints, SigmaPoints] = FAR,
+    reading: str = "instant",
+>>>>>>> main
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
+<<<<<<< HEAD
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(-gravity[2]), name="last_control")
     control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | motion, name="control")
     prior = predict_unscented(
         belief, between_imu(last, control), move=carried(order, gravity),
         noise=np.diag(increment_variances(noise)), space=STATE, points=far_points(12), name="predict",
+=======
+    predict = lambda belief, drive: predict_unscented(
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        points=points[0], name="predict",
+>>>>>>> main
     )  # fmt: skip
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update_camera_velocity(
-        prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
-        rate_noise=rate_noise, rate=rate, gate=gate, name="update",
+    return euler_loop(
+        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=predict,
+        update=lambda prior, control: update_camera_velocity(
+            prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
+            rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, name="update",
+        ),
     )  # fmt: skip
-    if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
-    belief.feed(posterior)
-    last.feed(control)
-    collect(innovation, "innovation")
-    return {
-        "belief": navigation_belief(posterior, order=order),
-        "angles": euler_angles(posterior, order=order),
-    }
 
 
 @on_flight(ins_ukf_velocity, "imu", "motion", told=with_imu)
@@ -91,14 +111,17 @@ def for_flight(
     on: OnFlight,
     *,
     rate: Annotated[str, named("source of the rate", RATES)] = "gyro",
-    order: EulerOrder = "zyx",
-    factors: ScaledFactors,
     velocity_noise: Positive = 0.1,
     rate_noise: Positive | None = None,
+<<<<<<< HEAD
     gated: Gated,
     control: HeldControl,
     scored: Scored,
     started: Started,
+=======
+    filter: EulerKalman = _REPORTS,
+    sigma: FarPoints,
+>>>>>>> main
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
@@ -106,7 +129,6 @@ def for_flight(
         flight: with the streams `imu` and `motion`, and the `mount` of the camera in its info. In place of
             `imu` it may have the thesis's unit: `gyro` and `coordinate_acceleration`, with the same times.
         rate: gyro (the report's eq. 10) or camera (eq. 9).
-        order: zxy (the course's) or zyx (the report's).
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
         start: must be said where there is neither a truth nor a measured attitude; the position is then the
@@ -127,6 +149,7 @@ def for_flight(
             got="none" if truth is None else ", ".join(truth.leaves),
             fix="write --set start=unknown_yaw, or build the graph with a start of your own",
         )
+<<<<<<< HEAD
     turn = begin.attitude
     if not begin.tilted and not on.weightless:
         force = on.first_up("imu", imu["specific_force"][imu.time >= begin.time])
@@ -138,12 +161,25 @@ def for_flight(
         inputs=begin.inputs,
         start=with_heading(first, begin.heading),
         noise=factors.imu_noise(on),
+=======
+    first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
+    position, attitude = interpolate_pose(on.flight.truth, first)
+    return filter.case(
+        on,
+        start_gaussian(
+            position[0], attitude[0], order=filter.order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)
+        ),
+>>>>>>> main
         mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
+<<<<<<< HEAD
         order=order,
         gravity=on.gravity,
         held=control.held(on, begin.inputs["imu"]),
         **gated.gating(),
+=======
+        points=(sigma.points(12), sigma.points(6)),
+>>>>>>> main
     )

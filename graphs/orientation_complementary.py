@@ -44,6 +44,7 @@ from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative, one_of
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
 
 _STILL = Gyro(rate=np.zeros(3))
@@ -62,18 +63,21 @@ def orientation_complementary(
     start: Attitude,
     alpha: float = 0.98,
     heading: str = "shortest_arc",
+    reading: str = "instant",
     covariance: AttitudeNoise | None = None,
 ):
     """Complementary filter of a quadrotor's attitude: thrust is removed, and gravity remains.
 
     `alpha` is the gyroscope's share at each acceleration; 1 is the gyroscope alone. `heading` is
-    "shortest_arc" or "gyroscope". The last thrust is held; before the first, the vehicle hovers. Collected:
-    `attitude` at every tick of gyroscope or acceleration, and `seen`, by gravity alone, at every
-    acceleration. With the noise of a `covariance`, `belief` with every `attitude`.
+    "shortest_arc" or "gyroscope"; `reading` of the gyroscope as in `turn_by_gyro`. The last thrust is held;
+    before the first, the vehicle hovers. Collected: `attitude` at every tick of gyroscope or acceleration,
+    and `seen`, by gravity alone, at every acceleration. With the noise of a `covariance`, `belief` with every
+    `attitude`.
     """
     previous = delay(start, name="previous")
     rate = latest(gyro, init=_STILL, name="rate")
-    turned = turn_by_gyro(previous, rate, at=gyro | coordinate_acceleration, name="gyroscope")
+    ticks = gyro | coordinate_acceleration
+    turned = turn_by_gyro(previous, rate, reading=reading, at=ticks, name="gyroscope")
     up = remove_thrust(coordinate_acceleration, latest(thrust, init=_HOVER, name="last_thrust"))
     if heading == "shortest_arc":
         seen = level_attitude(up, name="seen")
@@ -141,6 +145,7 @@ def for_flight(
         start=Attitude(attitude=attitude),
         alpha=alpha,
         heading=heading,
+        reading=reading_of(flight, "gyro"),
         covariance=noise,
     )
 

@@ -18,7 +18,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.belief import (
     FLOW,
     OUTDOOR,
@@ -34,6 +34,7 @@ from flowgraph.blocks.outdoor.belief import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
 
@@ -48,9 +49,11 @@ def outdoor_eskf(
     *,
     start: Gaussian,
     sensors: OutdoorSensors,
+    reading: str = "instant",
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` at every tick, and the innovation of each sensor where there was a reading.
     """
     s = sensors
@@ -58,7 +61,7 @@ def outdoor_eskf(
     last = delay(Imu.at_rest(), name="last_control")
     ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
-    now = predict_clone(belief, between_imu(last, control), noise=s.imu, name="predict")
+    now = predict_clone(belief, driving(last, control, reading), noise=s.imu, name="predict")
     readings: dict[str, tuple[Stream, Any, float]] = {
         "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),
         "gps2": (gps2.map(lambda z: z.position), PositionObserver(s.gps2_lever), s.gps2),
@@ -66,11 +69,9 @@ def outdoor_eskf(
             magnetometer.map(lambda z: z.field / s.magnetometer), FieldObserver(s.field, s.magnetometer), 1.0,
         ),
     }  # fmt: skip
-    for name, (reading, observe, noise) in readings.items():
+    for name, (seen, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
-        now, innovation = update_extended(
-            now, reading, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}"
-        )
+        now, innovation = update_extended(now, seen, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}")
         collect(innovation, f"{name}_innovation")
     now, innovation = update_extended(
         now, altimeter.map(lambda z: z.distance[..., None]),
@@ -97,4 +98,6 @@ def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     """
     inputs, sensors, first = outdoor_flight(on.flight, on.name)
     score = scored.score(on, pose_errors)
-    return on.case(score, inputs=inputs, start=start_outdoor(first), sensors=sensors)
+    return on.case(
+        score, inputs=inputs, start=start_outdoor(first), sensors=sensors, reading=reading_of(on.flight)
+    )

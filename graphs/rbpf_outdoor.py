@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.pose import between_imu
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
     correct_distance,
@@ -32,6 +32,7 @@ from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.resampling import draw_ancestors
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
 
@@ -53,6 +54,7 @@ def rbpf_outdoor(
     *,
     start: OutdoorCloud,
     sensors: OutdoorSensors,
+    reading: str = "instant",
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
@@ -61,6 +63,7 @@ def rbpf_outdoor(
 
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
     resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
+    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `pose` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at
     every tick with a reading.
     """
@@ -69,7 +72,7 @@ def rbpf_outdoor(
     last = delay(Imu.at_rest(), name="last_control")
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
-    now = predict_outdoor(cloud, between_imu(last, control), noise=s.imu, name="predict")
+    now = predict_outdoor(cloud, driving(last, control, reading), noise=s.imu, name="predict")
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
@@ -107,5 +110,6 @@ def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
         inputs=inputs,
         start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
         sensors=sensors,
+        reading=reading_of(on.flight),
         **cloud.resampling(),
     )

@@ -26,7 +26,7 @@ import numpy as np
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.pose import POSE, between_imu
+from flowgraph.blocks.models.pose import POSE, driving
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
     carry_pose,
@@ -74,7 +74,7 @@ def ukf(
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(-gravity[2]), name="last_control")
     control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | vicon, name="control")
-    drive = control if reading == "mean" else between_imu(last, control)
+    drive = driving(last, control, reading)
     prior = predict_unscented(
         belief,
         drive,

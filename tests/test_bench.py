@@ -22,6 +22,7 @@ NEEDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BENCHES)
 def test_each_bench_gives_rows_beside_a_peer(name, capsys):
     for module in NEEDS.get(name, []):
@@ -96,6 +97,7 @@ def test_toy_peers_compute_what_numpy_says():
     np.testing.assert_allclose(toy.with_scan(23, inputs)(), wanted)
 
 
+@pytest.mark.slow
 def test_devices_are_compared_by_their_answers_too(capsys):
     pytest.importorskip("jax")
     rows = gpu.main(["--particles", "50", "--seconds", "0.3", "--repeats", "1", "--json"])

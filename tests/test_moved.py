@@ -13,12 +13,12 @@ from tests.support import isolated
 
 @pytest.mark.parametrize("old", MOVED)
 def test_an_old_name_is_the_same_module(old):
-    before = dict(vars(flowgraph))
+    before = {n: getattr(flowgraph, n) for n in flowgraph.__all__}
     new = importlib.import_module(MOVED[old])
     assert importlib.import_module(old) is new
     assert new.__spec__ is not None
     assert new.__spec__.name == MOVED[old]
-    assert [n for n in flowgraph.__all__ if vars(flowgraph).get(n) is not before.get(n)] == []
+    assert [n for n in before if getattr(flowgraph, n) is not before[n]] == []
 
 
 def test_a_module_below_one_that_was_moved():
@@ -41,4 +41,7 @@ def test_old_imports_in_a_fresh_process():
         "import flowgraph\n"
         "assert flowgraph.graph.__name__ == 'graph' and flowgraph.Graph is Graph\n"
         "assert callable(flowgraph.simulate) and callable(flowgraph.block)\n"
+    )
+    isolated(
+        "from flowgraph.simulate import simulate\nimport flowgraph\nassert flowgraph.simulate is simulate\n"
     )

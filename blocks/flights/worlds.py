@@ -5,6 +5,7 @@ sensors.
 on, that are refused where the flight has no such sensor. Left out, they are those of the thesis: variances
 per sample of 0.1 for gyroscope and accelerometer at 200 Hz, as continuous densities here, and of 0.01 for the
 motion capture at 4 Hz; no biases, no latency. The inertial unit of `sim:roundtrip` is another: see `TRIP`.
+Rates of `sim:thesis` are of the step since the last reading: see `OF_STEPS`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, the
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["MOST_SAMPLES", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
+__all__ = ["MOST_SAMPLES", "OF_STEPS", "SENSORS", "SETTINGS", "TRIP", "WORLDS", "check_samples", "load_world"]
 
 MOST_SAMPLES = 10_000_000
 """The most samples of one simulated sensor: 14 hours at 200 Hz."""
@@ -32,6 +33,7 @@ _CLOCK = {"phase": 0.0, "latency": 0.0, "jitter": 0.0}
 _DRIFT = {"bias": 0.0, "walk": 0.0}
 _TURN_DRIFT = {"attitude_bias": 0.0, "attitude_walk": 0.0}
 _LOOKS = {"oversample": 1.0}
+_TURN = {"turn": 0.0}
 _EARTH = {"geodetic": 0.0, "latitude": 0.0, "longitude": 0.0, "height": 0.0}
 _THESIS = math.sqrt(0.1 / 200.0)  # the density of a variance of 0.1 per sample at 200 Hz
 _DEVIATION = math.sqrt(0.1)
@@ -39,7 +41,7 @@ _LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
 
 SENSORS: Mapping[str, Mapping[str, float]] = {
     "imu": {"rate": 200.0, **_CLOCK, **_LOOKS},
-    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
+    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN, "noise": _THESIS, **_DRIFT},
     "accelerometer": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "coordinate_acceleration": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "position": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, **_LEVER},
@@ -57,17 +59,18 @@ SENSORS: Mapping[str, Mapping[str, float]] = {
         **{"rate": 20.0, **_CLOCK, "noise": 0.01, **_DRIFT, "attitude_noise": 0.01, **_TURN_DRIFT}
     },
     "thrust": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
-    "body_rate": {"rate": 200.0, **_CLOCK, "noise": _DEVIATION, **_DRIFT},
+    "body_rate": {"rate": 200.0, **_CLOCK, **_TURN, "noise": _DEVIATION, **_DRIFT},
 }
 """What each sensor can be set to, and what it is when left out, in SI units and radians. `noise` is a
 continuous density for gyro, accelerometer and coordinate_acceleration (the imu has theirs), and for all
 others a standard deviation per sample; `bias` is the standard deviation of a constant, `walk` the density of
-its random walk; `oversample` is how many looks a reading is the mean of. A GPS with geodetic=1 gives
+its random walk; `oversample` is how many looks a reading is the mean of, and with `turn` 1 a rate is that of
+the turn since the last reading. A GPS with geodetic=1 gives
 latitude, longitude and height, of a world whose origin is at `latitude`, `longitude` (rad) and `height`
 (m)."""
 
 WORLDS: Mapping[str, Mapping[str, float]] = {
-    "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 30.0, "most_rate": 35.0},
+    "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 20.0, "most_rate": 20.0},
     "roundtrip": {"duration": 20.0, "angle": 1.0, "trip": 5.0, "rest": 1.0},
     "hover": {"duration": 20.0, "drift": 0.0},
 }
@@ -79,6 +82,11 @@ whose gyroscope is biased. Its specific force alone shows roll and pitch to 0.00
 integrated with the bias, is off by some tenths of a rad within 20 s: the figures with which such data were
 first published."""
 
+OF_STEPS: Mapping[str, float] = {"gyro.turn": 1.0, "body_rate.turn": 1.0, "imu.oversample": 10.0}
+"""What `thesis` reads when left out: its gyroscope measures the rotation over the last step. The rate jumps
+there at each key point, and two readings of an instant do not tell when. Its accelerometers read an instant;
+the `imu`, which is not of the thesis, gives the means of both over the step."""
+
 SETTINGS: Mapping[str, str | float] = {
     "sensors": "imu,vicon",
     **{name: value for world in WORLDS.values() for name, value in world.items()},
@@ -88,8 +96,9 @@ SETTINGS: Mapping[str, str | float] = {
 
 _POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "rate", "strength", "most_tilt")
 _SIGNED = ("angle", "declination", "dip", "latitude", "longitude", "height", *_LEVER)
-_SWITCHES = ("geodetic",)
+_SWITCHES = ("geodetic", "turn")
 _PARTS_OF_IMU = ("gyro", "accelerometer")
+_OWN = {"roundtrip": TRIP, "thesis": OF_STEPS}
 
 Numbers = Mapping[str, float]
 
@@ -106,8 +115,8 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         A `Flight`: a stream for each sensor, by time of arrival. truth: `NavigationState` at the times of the
         fastest sensor, with the biases of the gyroscope and accelerometer. info:
         `world` (the `World`); `still` (s at rest at the start); `noise` (the settings of each sensor);
-        `NAME_period_ns`; `NAME_oversample` of an inertial sensor; `stamps` (when each reading of a late
-        sensor was true, int64 ns, row by row);
+        `NAME_period_ns`; `NAME_oversample` of an inertial sensor; `NAME_turn` of one that reads
+        rates; `stamps` (when each reading of a late sensor was true, int64 ns, row by row);
         `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `vicon_lever`, `gps_lever`,
         `gps2_lever`, `position_lever` (m, body), `magnetic_field` (T, world) and, where it is geodetic,
         `gps_origin` and `gps2_origin` (latitude and longitude in rad, height in m) where there are such
@@ -220,6 +229,8 @@ def _sensor(name: str, numbers: Numbers) -> s.Sensor:
     common: dict[str, Any] = {"name": name, "rate": n["rate"], **{k: n[k] for k in _CLOCK}}
     if "oversample" in n:
         common["oversample"] = int(n["oversample"])
+    if "turn" in n:
+        common["turn"] = bool(n["turn"])
     if name == "imu":
         gyro, push = (_noise(_of(part, numbers), density=True) for part in _PARTS_OF_IMU)
         return s.InertialUnit(**common, gyro=gyro, accelerometer=push)
@@ -254,6 +265,8 @@ def _calibration(sensor: s.Sensor) -> dict[str, Any]:
     """What a filter may know of a sensor, under the names that recorded flights use too."""
     if isinstance(sensor, s.InertialUnit):
         return {"imu_noise": sensor.densities, "imu_oversample": sensor.oversample}
+    if isinstance(sensor, s.RateSensor):
+        return {f"{sensor.name}_oversample": sensor.oversample, f"{sensor.name}_turn": sensor.turn}
     if isinstance(sensor, s.InertialSensor):
         return {f"{sensor.name}_oversample": sensor.oversample}
     if isinstance(sensor, s.Vicon):
@@ -302,7 +315,7 @@ def _chosen(text: str, path: str) -> list[str]:
 def _numbers(kind: str, chosen: list[str], given: Mapping[str, str | float], path: str) -> dict[str, float]:
     used = [*chosen, *(_PARTS_OF_IMU if "imu" in chosen else ())]
     known = {f"{name}.{part}": value for name, parts in SENSORS.items() for part, value in parts.items()}
-    known.update({**WORLDS[kind], **(TRIP if kind == "roundtrip" else {})})
+    known.update({**WORLDS[kind], **_OWN.get(kind, {})})
     for name, text in given.items():
         if name not in known:
             raise UnknownNameError("setting", name, ["sensors", *known], path=path)

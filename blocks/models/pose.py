@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Result, Series, block
+from flowgraph import Array, Result, Series, Stream, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
@@ -34,6 +34,7 @@ from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, Pose
 
 __all__ = [
     "between_imu",
+    "driving",
     "move",
     "move_jacobian",
     "observe_jacobian",
@@ -62,6 +63,16 @@ def between_imu(before: Imu, now: Imu) -> Imu:
         gyro=0.5 * (before.gyro + now.gyro),
         specific_force=0.5 * (before.specific_force + now.specific_force),
     )
+
+
+def driving(last: Stream[Imu], control: Stream[Imu], reading: str) -> Stream[Imu]:
+    """What drives the step to now, of the last control and this one.
+
+    Args:
+        reading: "mean" where a reading is the mean over the step since the one before, which is this one;
+            "instant" where it is of its stamp: then it is the mean of the two at the ends.
+    """
+    return control if reading == "mean" else between_imu(last, control)
 
 
 @block

@@ -3,7 +3,8 @@
 `accelerometer` has the state and the measurements of a filter of attitude and body rate on an inertial unit
 alone. `complementary` blends a gyroscope that drifts with a direction or a pose that is noisy, by shares set
 by hand; `fixed_gain` computes what such shares leave of noise. `marg` adds the magnetometer, with the tilt in
-one filter and the `heading` in another, so that no magnet can tip the horizon.
+one filter and the `heading` in another, so that no magnet can tip the horizon. `commanded` needs no inertial
+unit: a commanded rate, and a sensor of the whole attitude.
 """
 
 from __future__ import annotations
@@ -17,6 +18,15 @@ from flowgraph.blocks.orientation.accelerometer import (
     stacked_imu,
     start_orientation,
     turn_by_rate,
+)
+from flowgraph.blocks.orientation.commanded import (
+    TURN,
+    attitude_belief,
+    attitude_vector,
+    between_rates,
+    predict_turn,
+    see_attitude,
+    start_turn,
 )
 from flowgraph.blocks.orientation.complementary import (
     blend,
@@ -45,6 +55,13 @@ from flowgraph.blocks.orientation.marg import (
 )
 
 __all__ = [
+    "TURN",
+    "attitude_belief",
+    "attitude_vector",
+    "between_rates",
+    "predict_turn",
+    "see_attitude",
+    "start_turn",
     "STATE",
     "OrientationBelief",
     "named_orientation",

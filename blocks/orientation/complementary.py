@@ -58,20 +58,24 @@ __all__ = [
 
 
 @block
-def turn_by_gyro(last, attitude: Attitude, gyro: Gyro, *, dt: float, xp: Any) -> tuple[Any, Attitude]:
+def turn_by_gyro(  # type: ignore[no-untyped-def]
+    last, attitude: Attitude, gyro: Gyro, *, reading: str = "instant", dt: float, xp: Any
+) -> tuple[Any, Attitude]:
     """Turn an attitude over `dt` seconds by the mean of the rate before and the rate now.
 
         q' = q * Exp((w_last + w) dt / 2)
 
-    The mean, since either rate alone leads or lags by half a step. With dt = 0, as at the first firing, this
-    is the identity. Fires when its inputs do. State: the last rate (3,), rad/s.
+    The mean, since either rate alone leads or lags by half a step; but a `reading` that is the "mean" over
+    the step, not of an "instant", turns it alone. With dt = 0, as at the first firing, this is the identity.
+    Fires when its inputs do. State: the last rate (3,), rad/s.
     """
-    turn = from_rotation_vector(0.5 * (last + gyro.rate) * dt, xp=xp)
+    rate = gyro.rate if reading == "mean" else 0.5 * (last + gyro.rate)
+    turn = from_rotation_vector(rate * dt, xp=xp)
     return gyro.rate, Attitude(attitude=normalize(multiply(attitude.attitude, turn, xp=xp), xp=xp))
 
 
 @turn_by_gyro.init
-def _(attitude: Any, gyro: Any) -> Any:
+def _(attitude: Any, gyro: Any, **_: Any) -> Any:
     return np.zeros(3)
 
 
@@ -144,6 +148,7 @@ def dead_reckon(
     imu: Imu,
     *,
     gravity: tuple[float, float, float] = GRAVITY,
+    reading: str = "instant",
     dt: float,
     xp: Any,
 ) -> tuple[Any, PoseEstimate]:
@@ -153,14 +158,23 @@ def dead_reckon(
         p' = p + v dt + a dt^2 / 2              v' = v + a dt
 
     (The thesis adds the reading to the velocity as it is, in body coordinates; it is turned to the world
-    here.) With dt = 0 this is the identity. Fires when its inputs do. State: the last reading.
+    here.) A `reading` that is the "mean" over the step, not of an "instant", turns by w dt, and its force by
+    the attitude half way. With dt = 0 this is the identity. Fires when its inputs do. State: the last
+    reading.
     """
     kind = estimate.position.dtype
-    turn = from_rotation_vector(0.5 * (last.gyro + imu.gyro) * dt, xp=xp)
-    q = normalize(multiply(estimate.attitude, turn, xp=xp), xp=xp)
-    before = rotate(estimate.attitude, last.specific_force, xp=xp)
-    now = rotate(q, imu.specific_force, xp=xp)
-    step = (0.5 * (before + now) + xp.asarray(gravity, dtype=kind)) * dt
+    if reading == "mean":
+        half = from_rotation_vector(0.5 * imu.gyro * dt, xp=xp)
+        middle = multiply(estimate.attitude, half, xp=xp)
+        q = normalize(multiply(middle, half, xp=xp), xp=xp)
+        force = rotate(middle, imu.specific_force, xp=xp)
+    else:
+        turn = from_rotation_vector(0.5 * (last.gyro + imu.gyro) * dt, xp=xp)
+        q = normalize(multiply(estimate.attitude, turn, xp=xp), xp=xp)
+        before = rotate(estimate.attitude, last.specific_force, xp=xp)
+        now = rotate(q, imu.specific_force, xp=xp)
+        force = 0.5 * (before + now)
+    step = (force + xp.asarray(gravity, dtype=kind)) * dt
     return imu, PoseEstimate(
         position=estimate.position + (estimate.velocity + 0.5 * step) * dt,
         velocity=estimate.velocity + step,

@@ -193,7 +193,7 @@ class Started(Settings):
         still = rest_seconds(imu) if found is None else float(found)
         pose = self.pose(on, on.inputs, rests=still, deviates=deviates)
         rest = max(still - (pose.time - int(imu.time[0])) * 1e-9, 0.0)
-        return orientation_start(on.flight, pose.inputs[imu.name], rest, nearest=pose.attitude), pose
+        return orientation_start(on.flight, pose.inputs["imu"], rest, nearest=pose.attitude), pose
 
     def _truth(self, on: OnFlight, first: int) -> tuple[int, np.ndarray | None, np.ndarray] | None:
         """Time, position and attitude of the truth at a time, or at its first row if that is later; None

@@ -49,13 +49,15 @@ def told_acceleration(flight: Flight) -> Series:
 
 def with_parts(flight: Flight) -> Flight:
     """The flight, with `gyro` and `accelerometer` taken out of its `imu` where they are missing."""
-    streams = dict(flight.streams)
+    streams, info = dict(flight.streams), dict(flight.info)
     if "imu" in streams:
         imu = streams["imu"]
+        if "gyro" not in streams:
+            info.update(gyro_oversample=info.get("imu_oversample", 1), gyro_turn=info.get("imu_turn", False))
         streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
         force = SpecificForce(force=imu["specific_force"])
         streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
-    return replace(flight, streams=streams)
+    return replace(flight, streams=streams, info=info)
 
 
 def reading_deviation(flight: Flight, part: str, series: Series, density: float | None) -> float:

@@ -90,25 +90,62 @@ def unbiased_factors(graph: str, flight: Flight) -> tuple[float, float]:
     return factor, factor
 
 
-def reading_of(flight: Flight) -> str:
-    """Whether the flight's imu reads an "instant" or, oversampling, the "mean" since its last reading."""
-    return "mean" if flight.info.get("imu_oversample", 1) > 1 else "instant"
+def reading_of(flight: Flight, sensor: str = "imu") -> str:
+    """Whether the flight's sensor reads an "instant", or the "mean" since its last reading."""
+    info = flight.info
+    averages = info.get(f"{sensor}_oversample", 1) > 1 or info.get(f"{sensor}_turn", False)
+    return "mean" if averages else "instant"
 
 
 def with_imu(flight: Flight) -> Flight:
     """The flight, with an `imu` of the thesis's unit, `gyro` and `coordinate_acceleration`, if it has none.
 
     A coordinate acceleration is the specific force of a world without gravity, and the flight then says so.
+    Where one of the two oversamples, or the gyroscope reads turns, so does the `imu`: a reading of both is
+    then that of the step since the one before, which is the mean of such a sensor's own readings in it, and
+    of an instant's the mean of the two at its ends.
     """
     parts = ("gyro", "coordinate_acceleration")
     if "imu" in flight.streams or not set(parts) <= set(flight.streams):
         return flight
     gyro, push = (flight.streams[name] for name in parts)
-    kept, at, of = np.intersect1d(gyro.time, push.time, return_indices=True)
-    values = Imu(gyro=gyro["rate"][at], specific_force=push["acceleration"][of])
+    kept, *rows = np.intersect1d(gyro.time, push.time, return_indices=True)
+    looks = [int(flight.info.get(f"{name}_oversample", 1)) for name in parts]
+    turn = bool(flight.info.get("gyro_turn", False))
+    means = [looks[0] > 1 or turn, looks[1] > 1]
+    columns = [
+        _of_steps(values, row, mean=mean) if any(means) else values[row]
+        for values, row, mean in zip((gyro["rate"], push["acceleration"]), rows, means, strict=True)
+    ]
+    values = Imu(gyro=columns[0], specific_force=columns[1])
     streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
+<<<<<<< HEAD
     info = {**flight.info, "gravity": WEIGHTLESS}
     if set(parts) <= set(flight.info.get("noise", ())):
         told = [flight.info["noise"][name] for name in parts]
         info["imu_noise"] = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
     return replace(flight, streams=streams, info=info)
+=======
+    told = [flight.info["noise"][name] for name in parts]
+    noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
+    info = {**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS}
+    info |= {"imu_oversample": max(looks), "imu_turn": turn}
+    if len(kept) > 1:
+        info["imu_period_ns"] = int(np.median(np.diff(kept)))
+    return replace(flight, streams=streams, info=info)
+
+
+def _of_steps(values: np.ndarray, rows: np.ndarray, *, mean: bool) -> np.ndarray:
+    """What readings (n, 3) say of the steps that end at some of them: the mean of those in the step, where
+    each is a mean itself, or that of the two at its ends."""
+    before = np.concatenate([rows[:1], rows[:-1]])
+    if not mean:
+        return np.asarray(0.5 * (values[before] + values[rows]))
+    count = rows - before
+    if (count <= 1).all():
+        return values[rows]
+    total = np.cumsum(values, axis=0)
+    return np.where(
+        count[:, None], (total[rows] - total[before]) / np.maximum(count, 1)[:, None], values[rows]
+    )
+>>>>>>> main

@@ -18,6 +18,7 @@ from flowgraph.blocks.sensors.inertial import (
     Gyroscope,
     InertialSensor,
     InertialUnit,
+    RateSensor,
 )
 from flowgraph.blocks.sensors.magnetic import MagneticAttitude, Magnetometer, earth_field
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
@@ -35,6 +36,7 @@ __all__ = [
     "Accelerometer",
     "CoordinateAccelerometer",
     "InertialUnit",
+    "RateSensor",
     "PositionSensor",
     "AttitudeSensor",
     "Vicon",

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowgraph.blocks.sensors.inertial import RateSensor
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.sensor import Sensor
 from flowgraph.blocks.signals import BodyRate, Thrust
@@ -32,7 +33,7 @@ class ThrustInput(Sensor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BodyRateInput(Sensor):
+class BodyRateInput(RateSensor):
     """The body rate (`BodyRate`, rad/s, body): that of the motion + error."""
 
     name: str = "body_rate"
@@ -40,4 +41,5 @@ class BodyRateInput(Sensor):
     noise: Noise = NO_NOISE
 
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> BodyRate:
-        return BodyRate(rate=motion.rate + self.noise.error(self.name, seed, seconds, 3, rate=self.rate))
+        error = self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
+        return BodyRate(rate=self._turning(motion) + error)

@@ -6,9 +6,10 @@ by an attitude that nobody has). They are two sensors with two signal types here
 
 Noise is a continuous density by default; `Noise.variance` takes the thesis's variances per sample.
 
-A reading is what there was at its stamp, as the thesis has it, or, with `oversample`, the mean over the
-interval that ends there, as a unit gives it that samples fast inside and hands on averages. The two differ
-where a rate jumps: between two instants nobody knows when it did, but the mean holds all of the turn.
+A reading is what there was at its stamp or, with `oversample`, the mean over the interval that ends there, as
+a unit gives it that samples fast inside and hands on averages. A gyroscope may also read the `turn`: the
+rotation since its last reading, over the period, as the thesis's does. They differ where a rate jumps:
+between two instants nobody knows when it did, but the mean and the turn hold all of the rotation.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowgraph.blocks.geometry.rotations import conjugate, multiply, to_rotation_vector
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
 from flowgraph.blocks.sensors.sensor import Sensor
@@ -31,6 +33,7 @@ __all__ = [
     "Gyroscope",
     "InertialSensor",
     "InertialUnit",
+    "RateSensor",
 ]
 
 MOST_LOOKS = 1000
@@ -78,7 +81,46 @@ class InertialSensor(Sensor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gyroscope(InertialSensor):
+class RateSensor(InertialSensor):
+    """The base of those that read how fast the body turns, and nothing else.
+
+    Args:
+        turn: whether the rate is that of the whole turn since one period before, log(R(t - T)^T R(t)) / T,
+            rad/s in the body; so R(t) = R(t - T) Exp(rate T). Before the world begins, it stands still.
+    """
+
+    turn: bool = False
+
+    def _looks(self, seconds: np.ndarray) -> np.ndarray:
+        looks = super()._looks(seconds)
+        if not self.turn:
+            return looks
+        before = np.maximum(seconds - self.period * 1e-9, 0.0)
+        return np.column_stack([looks.reshape(len(seconds), -1), before, seconds]).ravel()
+
+    def _present(self, motion: Motion) -> np.ndarray:
+        return np.ones(len(motion) // self._each, dtype=bool)
+
+    def _mean(self, looks: np.ndarray) -> np.ndarray:
+        looks = looks.reshape(-1, self._each, 3)[:, : self.oversample]
+        return looks.mean(1) if self.oversample > 1 else looks[:, 0]
+
+    def _turning(self, motion: Motion) -> np.ndarray:
+        """The rate (n, 3) without its error."""
+        if not self.turn:
+            return self._mean(motion.rate)
+        before, now = np.moveaxis(motion.attitude.reshape(-1, self._each, 4)[:, -2:], 1, 0)
+        turn = to_rotation_vector(multiply(conjugate(before, xp=np), now, xp=np), xp=np)
+        return np.asarray(turn / (self.period * 1e-9))
+
+    @property
+    def _each(self) -> int:
+        """At how many times a reading needs the motion."""
+        return self.oversample + 2 * self.turn
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gyroscope(RateSensor):
     """Reads the angular rate in the body (`Gyro`, rad/s): rate + bias + noise."""
 
     name: str = "gyro"
@@ -86,9 +128,8 @@ class Gyroscope(InertialSensor):
     noise: Noise = NO_NOISE
 
     def _read(self, motion: Motion, seconds: np.ndarray, seed: int) -> Gyro:
-        return Gyro(
-            rate=self._mean(motion.rate) + self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
-        )
+        error = self.noise.error(self.name, seed, seconds, 3, rate=self.rate)
+        return Gyro(rate=self._turning(motion) + error)
 
 
 @dataclass(frozen=True, kw_only=True)

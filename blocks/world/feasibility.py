@@ -34,18 +34,18 @@ class Limits:
 
     Args:
         least_thrust, most_thrust: m/s^2, mass-normalised.
-        rate: rad/s, the norm of the whole body rate; 35 is 2000 deg/s, the range of usual gyroscopes.
+        rate: rad/s, the norm of the whole body rate.
         resolution: s, the shortest interval that is still halved.
     """
 
     least_thrust: float = 5.0
-    most_thrust: float = 30.0
-    rate: float = 35.0
+    most_thrust: float = 20.0
+    rate: float = 20.0
     resolution: float = 0.002
 
 
 LIMITS = Limits()
-"""Those of the thesis's family: about three times gravity, and the range of a gyroscope."""
+"""Those with which the thesis's program draws its flights."""
 
 
 def feasible(primitives: Primitives, limits: Limits = LIMITS) -> bool:

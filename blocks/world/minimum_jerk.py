@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph.errors import DeclarationError
 
-__all__ = ["KeyPoint", "Primitives", "join"]
+__all__ = ["KeyPoint", "Primitives", "join", "primitive"]
 
 Vector = tuple[float, float, float]
 
@@ -131,22 +131,12 @@ def join(
     state = np.array([position, velocity, acceleration], dtype=float)
     seconds, rows = [], []
     for point in key_points:
-        T = point.seconds
-        p, v, a = state
-        coasting = np.array([p + v * T + 0.5 * a * T**2, v + a * T, a])
-        goal = (point.position, point.velocity, point.acceleration)
-        wanted = np.array([c if g is None else g for g, c in zip(goal, coasting, strict=True)])
-        change = (wanted - coasting) * np.array([[1.0], [T], [T**2]])
-        alpha, beta, gamma = np.array(_CASES[point._given]) @ change / T ** np.array([[5], [4], [3]])
-        row = np.array([p, v, a / 2.0, gamma / 6.0, beta / 24.0, alpha / 120.0])
-        state = np.array(
-            [
-                _horner(row, np.array(T)),
-                _horner(row[1:] * np.arange(1, 6)[:, None], np.array(T)),
-                a + gamma * T + beta * T**2 / 2.0 + alpha * T**3 / 6.0,
-            ]
+        none = (np.nan,) * 3
+        goal = np.array(
+            [none if g is None else g for g in (point.position, point.velocity, point.acceleration)]
         )
-        seconds.append(T)
+        row, state = primitive(state, goal, point._given, point.seconds)
+        seconds.append(point.seconds)
         rows.append(row)
     if not rows:
         raise DeclarationError(
@@ -161,3 +151,31 @@ def join(
     for array in (start, *made):
         array.flags.writeable = False
     return Primitives(start, *made)
+
+
+def primitive(
+    state: np.ndarray, goal: np.ndarray, given: tuple[bool, bool, bool], seconds: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The coefficients (..., 6, 3) of one primitive, and the state (..., 3, 3) in which it ends.
+
+    Args:
+        state: (..., 3, 3) position, velocity and acceleration at its start, world; m, m/s, m/s^2.
+        goal: (..., 3, 3) those of the key point; what is not given is not looked at.
+        given: which of the three are.
+        seconds: s.
+    """
+    T = seconds
+    p, v, a = np.moveaxis(state, -2, 0)
+    coasting = np.stack([p + v * T + 0.5 * a * T**2, v + a * T, a], axis=-2)
+    wanted = np.where(np.array(given)[:, None], goal, coasting)
+    change = (wanted - coasting) * np.array([[1.0], [T], [T**2]])
+    alpha, beta, gamma = np.moveaxis(np.array(_CASES[given]) @ change / T ** np.array([[5], [4], [3]]), -2, 0)
+    row = np.stack([p, v, a / 2.0, gamma / 6.0, beta / 24.0, alpha / 120.0], axis=-2)
+    place = np.moveaxis(row, -2, 0)
+    speed = place[1:] * np.arange(1, 6).reshape(5, *[1] * (place.ndim - 1))
+    end = (
+        _horner(place, np.array(T)),
+        _horner(speed, np.array(T)),
+        a + gamma * T + beta * T**2 / 2.0 + alpha * T**3 / 6.0,
+    )
+    return row, np.stack(end, axis=-2)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from time import perf_counter
@@ -29,6 +30,7 @@ from flowgraph.cli.options import (
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
+    in_characters_of,
     make_ready,
     offered,
     out_console,
@@ -41,6 +43,7 @@ from flowgraph.cli.terminal import (
 )
 from flowgraph.data.export import write_tum
 from flowgraph.data.files import put
+from flowgraph.data.notes import note
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
@@ -69,6 +72,9 @@ def show(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
     ] = None,
+    fold: Annotated[
+        int | None, typer.Option(min=0, help="Draw graphs nested deeper than this as one box.")
+    ] = None,
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
@@ -77,10 +83,11 @@ def show(
     """Draw a graph: in the terminal, or to a file."""
     built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
     if output is None:
-        print(plain(built.text()))
+        width = out_console.width if out_console.is_terminal else None
+        print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
         return
     with writing(output), without_font_warnings():
-        built.draw(str(output))
+        built.draw(str(output), fold=fold)
 
 
 @app.command()
@@ -105,10 +112,10 @@ def run(
     notes: dict[str, None] = {}
 
     def say(found: tuple[str, ...]) -> None:
-        for note in found:
-            if note not in notes:
-                err_console.print(f"note: {note}", markup=False)
-            notes[note] = None
+        for words in found:
+            if words not in notes:
+                err_console.print(f"note: {words}", markup=False)
+            notes[words] = None
 
     spec = one_flight(data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
@@ -118,7 +125,7 @@ def run(
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
     if out is not None:
-        _write_report(out, case, flight, result, report)
+        report["notes"] += _write_report(out, case, flight, result, report)
     if as_json:
         return print_json(report)
     out_console.print(runs_table([row]))
@@ -187,34 +194,61 @@ def _recorded(case: Case) -> list[Series]:
     return [s for s in inputs.values() if isinstance(s, Series)]
 
 
-def _write_report(out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]) -> None:
+def _write_report(
+    out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]
+) -> list[str]:
+    """Write the figures, then the pictures; returns notes of the pictures that could not be made."""
+    with writes(out):
+        out.mkdir(parents=True, exist_ok=True)
+    estimate = result.series.get(case.estimate)
+    if estimate is not None and "attitude" in estimate.leaves and len(estimate):
+        with writing(out / "estimate.tum") as file:
+            write_tum(estimate, file)
+    metrics = out / "metrics.json"
+    with writing(metrics) as file:
+        put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
+    pictures = _pictures(case, flight, result, estimate)
+    failed = [failure for name, draw in pictures.items() if (failure := _draw(out / name, draw))]
+    if failed:
+        report = {**report, "notes": [*report.get("notes", ()), *failed]}
+        put(metrics, json.dumps(report, indent=1, allow_nan=False) + "\n")
+    return failed
+
+
+def _draw(file: Path, draw: Callable[[Path], object]) -> str | None:
+    """Make a picture, or return a note that says why there is none: it must not take the results with it."""
+    try:
+        with writing(file), without_font_warnings():
+            draw(file)
+    except Exception as error:
+        why = str(error) if isinstance(error, FlowgraphError) else f"{type(error).__name__}: {error}"
+        failure = note("skipped", f"the picture {file.name}: {plain(why)}")
+        err_console.print(f"note: {failure}", markup=False)
+        return failure
+    return None
+
+
+def _pictures(
+    case: Case, flight: Flight, result: Result, estimate: Series | None
+) -> dict[str, Callable[[Path], object]]:
+    """What is drawn of a run, by the name of its file."""
     # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
     from flowgraph.drawing.trajectory import plot_space
 
-    with writes(out):
-        out.mkdir(parents=True, exist_ok=True)
-    with writing(out / "diagram.svg") as file, without_font_warnings():
-        case.graph.draw(str(file))
-    with writing(out / "metrics.json") as file:
-        put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
-    if case.estimate not in result.series:
-        return
-    estimate = result[case.estimate]
-    if "attitude" in estimate.leaves and len(estimate):
-        with writing(out / "estimate.tum") as file:
-            write_tum(estimate, file)
+    found: dict[str, Callable[[Path], object]] = {"diagram.svg": lambda file: case.graph.draw(str(file))}
+    if estimate is None:
+        return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
-        with writing(out / "navigation.png") as file:
-            plot_navigation(estimate, flight.truth, file)
-        observed = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
-        if observed is not None:
-            with writing(out / "trajectory.png") as file:
-                plot_space(estimate, flight.truth, observed, file)
+        seen = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
+        found["navigation.png"] = lambda file: plot_navigation(
+            estimate, flight.truth, file, observed=seen, order=case.order
+        )
+        if seen is not None:
+            found["trajectory.png"] = lambda file: plot_space(estimate, flight.truth, seen, file)
     elif "attitude" in estimate.leaves:
-        with writing(out / "orientation.png") as file:
-            plot_orientation(estimate, flight.truth, file)
+        found["orientation.png"] = lambda file: plot_orientation(estimate, flight.truth, file)
     else:
-        with writing(out / "outputs.png") as file:
-            plot_result(result, file)
+        found["outputs.png"] = lambda file: plot_result(result, file)
+    return found

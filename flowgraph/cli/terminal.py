@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -22,16 +22,34 @@ from rich.table import Table
 from flowgraph.data.registry import installed
 from flowgraph.errors import DeclarationError, FlowgraphError, UnknownNameError, plain, writes
 
+_PLAIN = str.maketrans({
+    **dict.fromkeys("│┃╎", "|"), **dict.fromkeys("─━╌", "-"), **dict.fromkeys("├└╰╭┌┐┘┤┬┴┼╮╯", "+"),
+    "▷": ">", "◁": "<", "▪": "*", "●": "o", "…": "...", "≤": "<=", "≥": ">=", "×": "x", "·": ".", "→": "->",
+    "±": "+-", "°": "deg", "²": "2", "³": "3", "σ": "sigma", "–": "-", "—": "-", "µ": "u", "−": "-",
+})  # fmt: skip
+"""What stands for a character of ours where a terminal has not got it."""
+
+
+def in_characters_of(stream: TextIO | None, text: str) -> str:
+    """The text in characters that the stream can write: a terminal may be cp1252, cp437 or ASCII."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
+    return text
+
 
 class PlainConsole(Console):
-    """A console on which what comes from a file is text, and steers no terminal."""
+    """A console on which what comes from a file is text, steers no terminal, and can be written on it."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
-            if segment.control or segment.text.isprintable():
+            if segment.control:
                 yield segment
-            else:
-                yield Segment(plain(segment.text), segment.style)
+                continue
+            text = segment.text if segment.text.isprintable() else plain(segment.text)
+            yield Segment(in_characters_of(self.file, text), segment.style)  # type: ignore[arg-type]
 
 
 out_console = PlainConsole(soft_wrap=True)

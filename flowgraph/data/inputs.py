@@ -25,6 +25,10 @@ from flowgraph.types import StructType, Type, as_value, check_fits, flatten
 Inputs = Flight | Mapping[str, Any]
 
 
+NOT_FINITE = ("raise", "absent", "keep")
+"""What a value with a NaN or an infinity may be: an error, no event, or data."""
+
+
 def arrays(
     time: npt.ArrayLike,
     values: Any,
@@ -42,11 +46,11 @@ def arrays(
         not_finite: where a value is NaN, masked or infinite "raise", or treat the event as "absent"; "keep"
             lets NaN pass as data, for blocks that take it as an entry that was not measured.
     """
-    rule = _rule("not_finite", not_finite, ("raise", "absent", "keep"))
+    rule = rule_of("not_finite", not_finite, NOT_FINITE)
     series = Series(time, values, name=name, gaps=rule == "keep")
     if rule == "absent":
         series = series[~_broken_rows(series)]
-    if _rule("duplicates", duplicates, ("raise", "first", "last")) != "raise" and len(series):
+    if rule_of("duplicates", duplicates, ("raise", "first", "last")) != "raise" and len(series):
         same = np.diff(series.time) == 0
         series = series[np.r_[True, ~same] if duplicates == "first" else np.r_[~same, True]]
     return series
@@ -82,7 +86,7 @@ def clocks_of(inputs: Mapping[str, Series]) -> dict[str, Any]:
     return {name: timing_of(series) for name, series in inputs.items()}
 
 
-def _rule(what: str, given: str, valid: tuple[str, ...]) -> str:
+def rule_of(what: str, given: str, valid: tuple[str, ...]) -> str:
     if given not in valid:
         raise UnknownNameError(f"rule for {what}", given, valid)
     return given
@@ -283,10 +287,30 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
         )
 
 
-def check_event(
-    name: str, time: Any, value: Any, type_: Type, timing: Timing, before: int
-) -> tuple[int, Any]:
-    """Check one event as it arrives; returns it with an integer time and read-only arrays."""
+def periods_lost(name: str, time: int, timing: Timing, before: int) -> int:
+    """How many events of a live periodic source did not come between two that did: packets are lost.
+
+    Args:
+        time, before: stamps of this event and of the one that came last, `NEVER` where there was none.
+
+    Raises:
+        DataError, ClockError: where the step is no whole number of periods, each within the jitter.
+    """
+    step = time - before
+    if before != NEVER and timing.period is not None and step > timing.period + timing.jitter:
+        periods = round(step / timing.period)
+        if abs(step - periods * timing.period) <= periods * timing.jitter:
+            return periods - 1
+    check_times(name, np.asarray([time], dtype=np.int64), timing, before)
+    return 0
+
+
+def check_stamp(name: str, time: Any) -> int:
+    """A time as it arrives with an event, as an int.
+
+    Raises:
+        DataError: where it is no whole number of ns within 64 bits.
+    """
     if not isinstance(time, int | np.integer) or isinstance(time, bool):
         raise DataError(
             "times must be integer nanoseconds",
@@ -295,12 +319,35 @@ def check_event(
             got=f"{type(time).__name__} {time!r}",
             fix="round float seconds once, at the source: round(seconds * 1e9)",
         )
+    if not NEVER < time < 2**63:
+        raise DataError(
+            "this time does not fit 64 bits",
+            path=name,
+            expected="nanoseconds between -2^63 and 2^63, some 292 years to either side",
+            got=str(time) if abs(int(time)) < 10**30 else "a number of more than 30 digits",
+            fix="count nanoseconds from a nearer day",
+        )
+    return int(time)
+
+
+def check_event(
+    name: str, time: Any, value: Any, type_: Type, timing: Timing, before: int
+) -> tuple[int, Any]:
+    """Check one event as it arrives; returns it with an integer time and read-only arrays."""
+    time = check_stamp(name, time)
     check_times(name, np.asarray([time], dtype=np.int64), timing, before)
+    return time, check_value(name, time, value, type_)
+
+
+def check_value(name: str, time: int, value: Any, type_: Type, not_finite: str = "raise") -> Any:
+    """The value of one event as read-only arrays; None for one that is not finite, where that is "absent"."""
     made = as_value(unmasked(value, name, np.float64), type_, path=f"source {name}")
     for leaf in flatten(made, type_):
-        if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
-            _not_finite(name, int(time), "this event")
-    return int(time), made
+        if leaf.dtype.kind == "f" and not_finite != "keep" and not np.isfinite(leaf).all():
+            if not_finite == "absent":
+                return None
+            _not_finite(name, time, "this event")
+    return made
 
 
 def _events(

@@ -7,23 +7,28 @@ error is split as one would judge it, into a turn about the vertical (heading) a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flowgraph.data.series import Series
-from flowgraph.drawing.plot import BAND, COLOURS, TRUTH, _angles, _figure, _find, _need, _save
+from flowgraph.drawing import canvas
+from flowgraph.drawing.angles import NAMES, between, euler_angles, euler_variances, matrices
+from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
+from flowgraph.drawing.fields import find, need
+from flowgraph.errors import DataError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NAMES = ("roll", "pitch", "yaw")
 # where the attitude error and the gyroscope's bias stand in a covariance, by its size
 PLACES = {3: (0, None), 6: (0, 3), 9: (6, None), 15: (6, 9)}
 
 
+@canvas.picture
 def plot_orientation(estimate: Series, truth: Series | None = None, file: str | Path | None = None) -> Figure:
     """One page on an orientation filter; only what exists is drawn.
 
@@ -38,12 +43,12 @@ def plot_orientation(estimate: Series, truth: Series | None = None, file: str | 
         UnknownNameError: where the estimate has no attitude, or for an unknown file ending.
         DataError: where it has no values.
     """
-    q = _need(estimate, "attitude")[0]
-    bias = _find(estimate, "gyro_bias")
+    q = need(estimate, "attitude")[0]
+    bias = find(estimate, "gyro_bias")
     start = int(estimate.time[0])
-    known = truth if truth is not None and _find(truth, "attitude") is not None and len(truth) else None
+    known = truth if truth is not None and find(truth, "attitude") is not None and len(truth) else None
     rows = 1 + (known is not None) + (bias is not None)
-    figure = _figure(12, 2.3 * rows + 0.6)
+    figure = canvas.new_figure(12, 2.3 * rows + 0.6)
     axes = figure.subplots(rows, 3, squeeze=False, sharex=True)
     spread = _spread(estimate, "attitude")
     _draw_angles(axes[0], estimate, q, known, spread, start)
@@ -53,46 +58,61 @@ def plot_orientation(estimate: Series, truth: Series | None = None, file: str | 
         _draw_biases(axes[-1], estimate, bias[0], truth, start)
     for axis in axes[-1]:
         axis.set_xlabel("time since the start [s]")
-    return _save(figure, file)
+    return canvas.save(figure, file)
+
+
+@canvas.picture
+def plot_comparison(
+    estimates: Mapping[str, Series], truth: Series | None = None, file: str | Path | None = None
+) -> Figure:
+    """Roll, pitch and yaw of several filters over the truth, a panel an angle.
+
+    Args:
+        estimates: by name, each with `attitude`; the first is drawn on top.
+        truth: with `attitude`, at times of its own, NaN where it is not known.
+        file: ending in .png, .svg or .pdf.
+
+    Raises:
+        UnknownNameError: where an estimate has no attitude, or for an unknown file ending.
+        DataError: where one has no values, or there is none.
+    """
+    if not estimates:
+        raise DataError(
+            "there is nothing to compare",
+            path="estimates",
+            expected="the series of one filter at least",
+            got="none",
+            fix="run a filter that gives attitudes",
+        )
+    start = min(int(s.time[0]) if len(need(s, "attitude")[0]) else 0 for s in estimates.values())
+    figure = canvas.new_figure(11, 8.0)
+    axes = figure.subplots(3, 1, sharex=True)
+    looks: Any = [{"color": colour, "lw": 1.0} for colour in COLOURS]
+    shown = [(name, s, looks[k % len(looks)]) for k, (name, s) in enumerate(estimates.items())]
+    if truth is not None and len(truth) and find(truth, "attitude") is not None:
+        shown.append(("truth", truth, {"color": TRUTH, "lw": 1.0, "ls": "--"}))
+    for name, series, look in [*shown[1:], shown[0]]:
+        q = need(series, "attitude")[0]
+        known = np.isfinite(q).all(axis=1)
+        angles = np.full((len(q), 3), np.nan)
+        angles[known] = _wrapped(euler_angles(q[known]))
+        for axis, angle in zip(axes, angles.T, strict=True):
+            axis.plot((series.time - start) * 1e-9, _broken(angle), label=name, **look)
+    for k, axis in enumerate(axes):
+        _name(axis, NAMES[k], "[deg]")
+    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), loc="upper right")
+    axes[-1].set_xlabel("time since the start [s]")
+    return canvas.save(figure, file)
 
 
 def _spread(estimate: Series, part: str) -> np.ndarray | None:
     """The covariance (n, 3, 3) of the attitude error or the gyroscope's bias, where the estimate has it."""
-    found = _find(estimate, "covariance")
+    found = find(estimate, "covariance")
     if found is None or found[0].ndim != 3:
         return None
     places = PLACES.get(found[0].shape[1], (None, None))
     at = places[0 if part == "attitude" else 1]
     return None if at is None else np.asarray(found[0][:, at : at + 3, at : at + 3])
-
-
-def _matrices(q: np.ndarray) -> np.ndarray:
-    w, x, y, z = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _angle_sigmas(q: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(n, 3) standard deviations of roll, pitch and yaw in degrees: the angles' rates for a body rate, from
-    the same kinematics, applied to a small rotation in the body."""
-    roll, pitch, _ = np.deg2rad(_angles(q)).T
-    cosine = np.maximum(np.abs(np.cos(pitch)), 1e-3)  # at the pole roll and yaw have no meaning
-    tangent = np.sin(pitch) / cosine
-    zero, one = np.zeros_like(roll), np.ones_like(roll)
-    J = np.array(
-        [
-            [one, np.sin(roll) * tangent, np.cos(roll) * tangent],
-            [zero, np.cos(roll), -np.sin(roll)],
-            [zero, np.sin(roll) / cosine, np.cos(roll) / cosine],
-        ]
-    )
-    J = np.moveaxis(J, 2, 0)
-    variance = np.einsum("nij,njk,nik->ni", J, spread, J)
-    return np.asarray(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))))
 
 
 def _draw_angles(
@@ -103,8 +123,9 @@ def _draw_angles(
     spread: np.ndarray | None,
     start: int,
 ) -> None:
-    angles, seconds = _wrapped(_angles(q)), estimate.seconds
-    sigmas = None if spread is None else _angle_sigmas(q, spread)
+    angles, seconds = _wrapped(euler_angles(q)), estimate.seconds
+    variances = None if spread is None else euler_variances(q, spread)
+    sigmas = None if variances is None else canvas.deviation(variances)
     for k, axis in enumerate(axes):
         drawn = _broken(angles[:, k])
         if sigmas is not None:
@@ -112,10 +133,10 @@ def _draw_angles(
             axis.fill_between(seconds, drawn - band, drawn + band, color=BAND, alpha=0.35, lw=0)
         axis.plot(seconds, drawn, color=COLOURS[k], lw=1.0, label="estimate")
         if truth is not None:
-            right = _need(truth, "attitude")[0]
+            right = need(truth, "attitude")[0]
             known = np.isfinite(right).all(axis=1)
             angle = np.full(len(right), np.nan)
-            angle[known] = _wrapped(_angles(right[known]))[:, k]
+            angle[known] = _wrapped(euler_angles(right[known]))[:, k]
             axis.plot(
                 (truth.time - start) * 1e-9, _broken(angle), color=TRUTH, lw=0.9, ls="--", label="truth"
             )
@@ -125,7 +146,7 @@ def _draw_angles(
         if (
             sigmas is not None
         ):  # near the pole the band of roll and yaw has no bounds; it must not set the scale
-            room = max(room, min(3.3 * float(np.median(sigmas[:, k])), 60.0))
+            room = max(room, min(3.3 * float(np.nanmedian(sigmas[:, k])), 60.0))
         if len(shown):
             axis.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
         _name(axis, NAMES[k] + (", with 3σ" if sigmas is not None else ""), "[deg]")
@@ -135,28 +156,17 @@ def _draw_errors(
     axes: np.ndarray, estimate: Series, q: np.ndarray, truth: Series, spread: np.ndarray | None
 ) -> None:
     """Total, inclination and heading error, where the truth is known on both sides of a time."""
-    right = _need(truth, "attitude")[0]
-    place = np.searchsorted(truth.time, estimate.time)
-    inside = (place < len(truth)) & (estimate.time >= truth.time[0])
-    after = np.clip(place, 0, len(truth) - 1)
-    before = np.where(truth.time[after] == estimate.time, after, np.maximum(after - 1, 0))
-    a, b = right[before], right[after]
-    b = np.where(np.sum(a * b, axis=1, keepdims=True) < 0.0, -b, b)
-    step = np.maximum(truth.time[after] - truth.time[before], 1)
-    share = np.clip((estimate.time - truth.time[before]) / step, 0.0, 1.0)[:, None]
-    between = a + (b - a) * share  # of two attitudes that lie close together
-    between = between / np.linalg.norm(between, axis=1, keepdims=True)
-    between[~inside] = np.nan
-    R = _matrices(q) @ _matrices(between).transpose(0, 2, 1)
+    right = between(truth, "attitude", estimate.time)
+    R = matrices(q) @ matrices(right).transpose(0, 2, 1)
     total = np.rad2deg(np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
     tilt = np.rad2deg(np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)))
     heading = np.rad2deg(np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]))
     bands: list[np.ndarray | None] = [None, None, None]
     if spread is not None:
-        W = _matrices(q)
+        W = matrices(q)
         world = np.diagonal(W @ spread @ W.transpose(0, 2, 1), axis1=1, axis2=2)
-        bands[1] = np.rad2deg(3.0 * np.sqrt(np.maximum(world[:, 0] + world[:, 1], 0.0)))
-        bands[2] = np.rad2deg(3.0 * np.sqrt(np.maximum(world[:, 2], 0.0)))
+        bands[1] = np.rad2deg(3.0 * canvas.deviation(world[:, 0] + world[:, 1]))
+        bands[2] = np.rad2deg(3.0 * canvas.deviation(world[:, 2]))
     names = ("total error", "inclination error", "heading error")
     for k, (axis, error) in enumerate(zip(axes, (total, tilt, heading), strict=True)):
         band = bands[k]
@@ -172,10 +182,10 @@ def _draw_biases(
     axes: np.ndarray, estimate: Series, bias: np.ndarray, truth: Series | None, start: int
 ) -> None:
     spread = _spread(estimate, "gyro_bias")
-    right = None if truth is None else _find(truth, "gyro_bias")
+    right = None if truth is None else find(truth, "gyro_bias")
     for k, axis in enumerate(axes):
         if spread is not None:
-            band = 3.0 * np.sqrt(np.maximum(spread[:, k, k], 0.0))
+            band = 3.0 * canvas.deviation(spread[:, k, k])
             axis.fill_between(
                 estimate.seconds, bias[:, k] - band, bias[:, k] + band, color=BAND, alpha=0.35, lw=0
             )
@@ -196,8 +206,8 @@ def _broken(angle: np.ndarray) -> np.ndarray:
 
 
 def _name(axis: Axes, title: str, unit: str) -> None:
-    axis.set_title(title, loc="left", fontsize=9)
+    canvas.title(axis, title)
     axis.set_ylabel(unit)
 
 
-__all__ = ["plot_orientation"]
+__all__ = ["plot_comparison", "plot_orientation"]

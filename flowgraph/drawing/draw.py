@@ -11,6 +11,7 @@ from __future__ import annotations
 import html
 import re
 import shutil
+import struct
 from pathlib import Path
 
 from flowgraph.data.files import put
@@ -20,10 +21,12 @@ from flowgraph.drawing.text import (
     clock_words,
     doc_words,
     firing_words,
+    folded_scopes,
     initial_words,
     links,
     name_in,
     queue_words,
+    scope_depth,
     shorten,
     to_networkx,
     type_words,
@@ -33,6 +36,7 @@ from flowgraph.language.block import Port
 from flowgraph.language.clock import atoms
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 
+_LONGEST = 32_767
 ENDINGS = (".svg", ".png", ".pdf", ".dot", ".gv")
 # for each direction, the sides of a box at which values enter and leave
 COMPASS = {"LR": ("w", "e"), "TB": ("n", "s"), "RL": ("e", "w"), "BT": ("s", "n")}
@@ -70,6 +74,7 @@ def draw(
     Raises:
         UnknownNameError: for another ending or direction.
         MissingDependencyError: where nothing can lay out the diagram.
+        DeclarationError: for a .png that would be longer than the format allows.
         OutputError: where the file cannot be written.
     """
     path = None if file is None else Path(file)
@@ -81,40 +86,54 @@ def draw(
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
     made = source.encode() if ending in (".dot", ".gv") else _render(source, ending[1:])
+    if ending == ".png":
+        made = _whole_png(made)
     with writes(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     return put(path, made)
 
 
 def _render(source: str, kind: str) -> bytes:
-    """The laid-out diagram as bytes of an SVG, PNG or PDF."""
+    """The laid-out diagram as bytes of an SVG, PNG or PDF: by `dot`, else by the library in pygraphviz."""
     if kind == "png":
         source = source.replace("{", "{ dpi=144;", 1)
+    failed = "no dot program on PATH"
     if shutil.which("dot"):
         import graphviz  # only where its program is
 
-        return bytes(graphviz.Source(source).pipe(format=kind, encoding=None, quiet=True))
+        try:
+            return bytes(graphviz.Source(source).pipe(format=kind, encoding=None, quiet=True))
+        except (graphviz.CalledProcessError, graphviz.ExecutableNotFound, OSError) as error:
+            said = getattr(error, "stderr", None) or str(error)
+            words = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+            failed = f"a dot program that fails: {shorten(' '.join(words.split()), 200)}"
     try:
         import pygraphviz  # may be absent
     except ImportError:
         raise MissingDependencyError(
             "nothing here can lay out a diagram",
-            expected="a `dot` program on PATH, or the Python package pygraphviz",
-            got="neither",
+            expected="a `dot` program that works, or the Python package pygraphviz",
+            got=f"{failed}, and no pygraphviz",
             fix="pip install pygraphviz, or install Graphviz; graph.text() needs neither",
         ) from None
     return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
+
+
+def _whole_png(made: bytes) -> bytes:
+    """The picture itself; Graphviz shrinks one that is longer than a PNG can be until nobody can read it."""
+    pixels = struct.unpack(">II", made[16:24])  # width and height, as the header has them
+    if max(pixels) >= _LONGEST:
+        raise DeclarationError(
+            "the diagram is too large for a PNG", expected=f"less than {_LONGEST} pixels a side",
+            got="more", fix="write an .svg or .pdf, which have no such bound, or fold nested graphs (fold=0)",
+        )  # fmt: skip
+    return made
 
 
 def dot_source(graph: Graph, *, rankdir: str = "LR", fold: int | None = None, legend: bool = True) -> str:
     """The diagram in the DOT language; the arguments are those of `draw`."""
     if rankdir not in COMPASS:
         raise UnknownNameError("rankdir", rankdir, COMPASS, path=graph.name)
-    if fold is not None and (not isinstance(fold, int) or fold < 0):
-        raise DeclarationError(
-            "fold is a depth of nesting", path=graph.name, expected="None, or a whole number from 0",
-            got=repr(fold), fix="write fold=0 for the outermost boxes only",
-        )  # fmt: skip
     return _Diagram(graph, rankdir, fold).source(legend)
 
 
@@ -151,9 +170,8 @@ class _Diagram:
 
     def __init__(self, graph: Graph, rankdir: str, fold: int | None) -> None:
         self.graph, self.rankdir = graph, rankdir
-        depths = {s: sum(s.startswith(o + "/") for o in graph.scopes) for s in graph.scopes}
-        self.open = [s for s in graph.scopes if fold is None or depths[s] < fold]
-        self.folded = [s for s in graph.scopes if fold is not None and depths[s] == fold]
+        self.folded = folded_scopes(graph, fold)
+        self.open = [s for s in graph.scopes if fold is None or scope_depth(graph, s) < fold]
         self.links = list(links(graph))
         self.along = rankdir in ("LR", "RL")
         self.enter, self.leave = COMPASS[rankdir]

@@ -1,23 +1,24 @@
-"""Plots of what a run gave back: values over time, and trajectories with their errors.
+"""Plots of what a run gave back, a panel a field.
 
-A panel shows one field, with the unit and frame that its type declares on the axis, so that nobody has to
-guess. Errors are drawn with the 3-sigma band that the filter itself claims: an error that leaves its band
-more often than now and then is a filter that is wrong about itself. Figures are made without pyplot, so they
-need no display, keep no global state and may be made in threads.
+A panel shows one field over time, with the unit and frame that its type declares on the axis, so that nobody
+has to guess. What is not drawn is said at the foot of the figure: fields too large for lines, and fields that
+never change, which need no panel to be read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from flowgraph.data.files import whole
 from flowgraph.data.series import Series
-from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError, writes
+from flowgraph.drawing import canvas
+from flowgraph.drawing.fields import components, unit_words
+from flowgraph.drawing.navigation import plot_navigation, plot_trajectory
+from flowgraph.errors import DataError
 from flowgraph.types import ArrayType, leaves_of
 
 if TYPE_CHECKING:
@@ -26,23 +27,34 @@ if TYPE_CHECKING:
 
     from flowgraph.data.result import Result
 
-ENDINGS = (".png", ".svg", ".pdf")
-COLOURS = ("#3b6ea8", "#c8792b", "#4f8a5b", "#a85a6d", "#7a68a8", "#8b8378")
-TRUTH, BAND = "#22303c", "#9db4d0"
 MOST_COMPONENTS = 6
 PANELS_A_COLUMN = 8
-# where each quantity stands in the 15 error states; a covariance of 6 or 9 holds the first of them
-STATES = {"position": 0, "velocity": 3, "attitude": 6, "gyro_bias": 9, "accelerometer_bias": 12}
-SIZES = (6, 9, 15)
+FEW = 20
+"""So many values that are all the same may be chance; from here on they are a constant."""
 
 
+@dataclass(frozen=True)
+class _Panel:
+    words: str
+    unit: str
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+    seconds: np.ndarray
+    values: np.ndarray
+    broken: np.ndarray  # (n,) where a variance has no root
+    dots: bool
+
+
+@canvas.picture
 def plot_result(
     result: Result, file: str | Path | None = None, *, outputs: Sequence[str] | None = None
 ) -> Figure:
     """A figure with one panel a field of the collected streams; written to `file` if given.
 
-    Vectors of up to six components are drawn as lines, small square matrices as the roots of their
-    diagonal; what is larger is left out. Streams much slower than the fastest are drawn as dots.
+    Vectors of up to six components are drawn as lines, with a panel for each unit where the components have
+    several (`unit="m, rad"`); small square matrices as the roots of their diagonal, with a gap and a mark
+    where a variance is below zero. What is larger, and what is the same all the time, is named at the foot.
+    Streams much slower than the fastest are drawn as dots.
 
     Args:
         file: ending in .png, .svg or .pdf.
@@ -56,144 +68,67 @@ def plot_result(
     begins = [s.time[0] for s in result.series.values() if len(s)]
     start = min(begins, default=np.int64(0))
     fastest = min((_interval(s) for s in result.series.values()), default=np.inf)
-    panels = []
+    panels: list[_Panel] = []
+    still: list[tuple[str, list[_Panel]]] = []
+    large: list[str] = []
     for name, series in shown.items():
         dots = _interval(series) > 5 * fastest or len(series) < 2
         for (field, type_), array in zip(leaves_of(series.type), series.leaves.values(), strict=True):
+            words = name if field == "value" else f"{name}.{field}"
             drawn = _drawable(array)
-            if drawn is not None:
-                title = name if field == "value" else f"{name}.{field}"
-                panels.append(
-                    (title, field, type_, (series.time - start) * 1e-9, drawn, dots, array.ndim == 3)
-                )
+            if drawn is None:
+                large.append(f"{words} ({' × '.join(map(str, array.shape[1:]))})")
+                continue
+            made = list(_panels_of(words, field, type_, (series.time - start) * 1e-9, array, drawn, dots))
+            if len(series) >= FEW and np.isfinite(drawn).all() and (drawn == drawn[0]).all():
+                value = ", ".join(f"{v:.4g}" for v in np.atleast_1d(drawn[0]))
+                still.append((f"{made[0].words} = {value}", made))
+            else:
+                panels += made
+    if not panels:  # all that there is, then
+        panels, still = [panel for _, made in still for panel in made], []
     if not panels:
         raise DataError(
             "there is nothing to plot", path=result.graph, got=", ".join(shown) or "no outputs",
             expected=f"a stream with a field of at most {MOST_COMPONENTS} components",
             fix='collect a part of the stream: collect(stream.map(lambda v: v.part), "part")',
         )  # fmt: skip
+    figure = _laid_out(panels)
+    canvas.heading(figure, f"{result.graph}  ({result.engine}, {result.ticks} ticks)")
+    foot = [f"always the same: {words}" for words, _ in still]
+    foot += [f"more than {MOST_COMPONENTS} components, not drawn: {words}" for words in large]
+    if foot:
+        canvas.footnotes(figure, foot)
+    return canvas.save(figure, file)
+
+
+def _laid_out(panels: Sequence[_Panel]) -> Figure:
+    """The panels in columns of one time axis, which has its numbers at the foot of each."""
     columns = -(-len(panels) // PANELS_A_COLUMN)
     rows = -(-len(panels) // columns)
-    figure = _figure(8.5 if columns == 1 else 5.5 * columns, 1.75 * rows + 0.7)
+    figure = canvas.new_figure(8.5 if columns == 1 else 5.5 * columns, 1.9 * rows + 0.7)
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).T.ravel()
-    for axis, (title, field, type_, seconds, drawn, dots, is_matrix) in zip(axes, panels, strict=False):
-        _lines(axis, seconds, drawn, _components(field, drawn.shape[1]), dots)
-        axis.set_title(
-            title + (": square roots of the diagonal" if is_matrix else ""), loc="left", fontsize=9
-        )
-        axis.set_ylabel(_unit(type_))
+    for axis, panel in zip(axes, panels, strict=False):
+        _draw(axis, panel)
     for axis in axes[len(panels) :]:
         axis.remove()
     for column in range(columns):
-        axes[min((column + 1) * rows, len(panels)) - 1].set_xlabel("time since the start [s]")
-    figure.suptitle(
-        f"{result.graph}  ({result.engine}, {result.ticks} ticks)", x=0.01, ha="left", fontsize=11
-    )
-    return _save(figure, file)
-
-
-def plot_trajectory(truth: Series, estimate: Series, file: str | Path | None = None) -> Figure:
-    """The trajectory in space beside its error over time, with 3-sigma bands where there is a covariance.
-
-    Args:
-        truth, estimate: series with a field `position`; the estimate may have a `covariance`, as in
-            `plot_navigation`.
-    """
-    figure = _figure(11, 5.2)
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
-    _space(figure.add_subplot(grid[:, 0], projection="3d"), estimate, truth)
-    start = estimate.time[0]
-    for k, axis in enumerate(figure.add_subplot(grid[k, 1]) for k in range(3)):
-        _error(axis, estimate, truth, "position", k, start)
-        if k == 2:
-            axis.set_xlabel("time since the start [s]")
-    return _save(figure, file)
-
-
-def plot_navigation(
-    estimate: Series,
-    truth: Series | None = None,
-    file: str | Path | None = None,
-    *,
-    extra: Mapping[str, npt.ArrayLike] | None = None,
-) -> Figure:
-    """One page on a navigation filter: trajectory, errors, attitude and biases; only what exists is drawn.
-
-    Args:
-        estimate: a series with `position`, and any of `velocity`, `attitude` (quaternion w, x, y, z, body to
-            world), `gyro_bias`, `accelerometer_bias` and `covariance` (15 x 15: position, velocity, attitude,
-            gyro bias, accelerometer bias; or 9 x 9 or 6 x 6: the first of them).
-        truth: the same fields, at times of its own, or None.
-        file: ending in .png, .svg or .pdf.
-        extra: more panels, by title: an array with one value for each time of the estimate, such as
-            `{"tilt error [deg]": tilt, "heading error [deg]": heading}`.
-
-    Raises:
-        UnknownNameError: where the estimate has no position, or for an unknown file ending.
-        DataError: where an array of `extra` does not have one value a time.
-    """
-    _need(estimate, "position")
-    more = {title: np.asarray(array, dtype=float) for title, array in (extra or {}).items()}
-    for title, array in more.items():
-        if array.shape != (len(estimate),):
-            raise DataError(
-                "an extra panel needs one value for each time of the estimate", path=title,
-                expected=f"shape {(len(estimate),)}", got=f"shape {array.shape}",
-                fix="evaluate it at estimate.time",
-            )  # fmt: skip
-    fields = [f for f in STATES if _find(estimate, f) is not None]
-    rows = 2 + len(fields) + -(-len(more) // 3)
-    figure = _figure(12, 1.75 * rows + 0.6)
-    grid = figure.add_gridspec(rows, 3)
-    _space(figure.add_subplot(grid[:2, :2], projection="3d"), estimate, truth)
-    _from_above(figure.add_subplot(grid[:2, 2]), estimate, truth)
-    start = estimate.time[0]
-    for row, field in enumerate(fields, start=2):
-        for k in range(3):
-            axis = figure.add_subplot(grid[row, k])
-            if field == "attitude":
-                _angle(axis, estimate, truth, k, start)
-            elif truth is not None and _find(truth, field) is not None and field in ("position", "velocity"):
-                _error(axis, estimate, truth, field, k, start)
-            else:
-                _value(axis, estimate, truth, field, k, start)
-    for n, (title, array) in enumerate(more.items()):
-        axis = figure.add_subplot(grid[2 + len(fields) + n // 3, n % 3])
-        axis.plot(estimate.seconds, array, color=COLOURS[0], lw=1)
-        axis.set_title(title, loc="left", fontsize=9)
-    for axis in figure.axes[-3:]:
-        axis.set_xlabel("time since the start [s]")
-    return _save(figure, file)
-
-
-def _figure(width: float, height: float) -> Figure:
-    try:
-        from matplotlib.figure import Figure  # may be absent
-    except ImportError:
-        raise MissingDependencyError(
-            "plots need matplotlib", expected="the Python package matplotlib", got="it cannot be imported",
-            fix="pip install matplotlib",
-        ) from None  # fmt: skip
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _save(figure: Figure, file: str | Path | None) -> Figure:
-    for axis in figure.axes:
-        axis.tick_params(labelsize=8)
-        if axis.name != "3d":
-            axis.yaxis.label.set_fontsize(8)
-            axis.xaxis.label.set_fontsize(8)
-            axis.grid(True, color="#e3e8ee", lw=0.6)
-            axis.spines[["top", "right"]].set_visible(False)
-    if file is not None:
-        path = Path(file)
-        if path.suffix.lower() not in ENDINGS:
-            raise UnknownNameError("file ending", path.suffix, ENDINGS, path=str(path))
-        with writes(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as stream:
-            figure.savefig(stream, dpi=130, format=path.suffix[1:].lower())
+        lowest = axes[min((column + 1) * rows, len(panels)) - 1]
+        lowest.set_xlabel("time since the start [s]")
+        lowest.tick_params(labelbottom=True)
     return figure
+
+
+def _draw(axis: Axes, panel: _Panel) -> None:
+    marker = "." if panel.dots or len(panel.seconds) <= 60 else None
+    style: dict[str, Any] = {"ls": "none"} if panel.dots else {"lw": 1.0}
+    for k, (name, colour) in enumerate(zip(panel.names, panel.colours, strict=True)):
+        axis.plot(panel.seconds, panel.values[:, k], color=colour, marker=marker, ms=4, label=name, **style)
+    axis.set_ylabel(panel.unit)
+    above = canvas.legend(axis, panel.names) if len(panel.names) > 1 else 0
+    canvas.title(axis, panel.words, above=above)
+    canvas.nothing_here(axis, panel.values)
+    canvas.mark_broken(axis, panel.seconds, panel.broken)
 
 
 def _interval(series: Series) -> float:
@@ -201,190 +136,35 @@ def _interval(series: Series) -> float:
     return float(np.median(np.diff(series.time))) if len(series) > 1 else np.inf
 
 
+def _panels_of(
+    words: str, field: str, type_: ArrayType, seconds: np.ndarray, array: np.ndarray, drawn: np.ndarray,
+    dots: bool,
+) -> Iterator[_Panel]:  # fmt: skip
+    """One panel, or one a unit where a vector's components have several."""
+    n = drawn.shape[1]
+    if array.ndim == 3:
+        words += ": square roots of the diagonal"
+    broken = np.isnan(drawn).any(axis=1) if array.ndim == 3 else np.zeros(len(drawn), bool)
+    names = np.array(components(field, n))
+    units = [part.strip() for part in (type_.unit or "").split(",")]
+    if len(units) != n or len(set(units)) == 1:
+        units = [type_.unit or ""] * n
+    for unit in dict.fromkeys(units):
+        at = [k for k in range(n) if units[k] == unit]
+        own = words if len(at) == n else f"{words} {', '.join(names[at])}"
+        yield _Panel(
+            own, unit_words(unit, type_.frame), tuple(names[at]), tuple(canvas.COLOURS[k] for k in at),
+            seconds, drawn[:, at], broken, dots,
+        )  # fmt: skip
+
+
 def _drawable(array: np.ndarray) -> np.ndarray | None:
     """(n, components) to draw, or None for what is too large."""
     if array.ndim == 3 and array.shape[1] == array.shape[2]:
-        array = np.sqrt(np.maximum(np.diagonal(array, axis1=1, axis2=2), 0.0))
+        array = canvas.deviation(np.diagonal(array, axis1=1, axis2=2).astype(float))
     if array.ndim == 1:
         array = array[:, None]
     return array.astype(float) if array.ndim == 2 and 1 <= array.shape[1] <= MOST_COMPONENTS else None
-
-
-def _components(field: str, n: int) -> tuple[str, ...]:
-    if n == 4 and any(word in field for word in ("attitude", "quaternion", "orientation")):
-        return ("w", "x", "y", "z")
-    return ("x", "y", "z")[:n] if n in (2, 3) else tuple(map(str, range(n)))
-
-
-def _unit(type_: ArrayType) -> str:
-    return (
-        f"[{', '.join(part for part in (type_.unit, type_.frame) if part)}]"
-        if type_.unit or type_.frame
-        else ""
-    )
-
-
-def _lines(axis: Axes, seconds: np.ndarray, values: np.ndarray, names: Sequence[str], dots: bool) -> None:
-    marker = "." if dots or len(seconds) <= 60 else None
-    for k, name in enumerate(names):
-        style: dict[str, Any] = {"ls": "none"} if dots else {"lw": 1.0}
-        axis.plot(seconds, values[:, k], color=COLOURS[k], marker=marker, ms=4, label=name, **style)
-    if len(names) > 1:
-        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "borderaxespad": 0.0}
-        axis.legend(fontsize=7, ncols=len(names), frameon=False, **place)
-
-
-def _find(series: Series, field: str) -> tuple[np.ndarray, ArrayType] | None:
-    """The leaf called `field`, at the top of the signal or inside it."""
-    for (name, type_), array in zip(leaves_of(series.type), series.leaves.values(), strict=True):
-        if name == field or name.endswith("." + field):
-            return array, type_
-    return None
-
-
-def _need(series: Series, field: str) -> tuple[np.ndarray, ArrayType]:
-    found = _find(series, field)
-    if found is None:
-        raise UnknownNameError("field", field, series.leaves, path=series.name)
-    if not len(series):
-        raise DataError(
-            "there are no values to plot", path=series.name, expected="at least one value",
-            got="an empty series", fix="run over data that fire this stream",
-        )  # fmt: skip
-    return found
-
-
-def _sigma(estimate: Series, field: str, k: int) -> np.ndarray | None:
-    found = _find(estimate, "covariance")
-    place = STATES[field] + k
-    if found is None or found[0].shape[-1] not in SIZES or place >= found[0].shape[-1]:
-        return None
-    sigma: np.ndarray = np.sqrt(np.maximum(found[0][:, place, place], 0.0))
-    return sigma
-
-
-def _label(axis: Axes, words: str, type_: ArrayType, band: bool) -> None:
-    axis.set_title(words + (", with 3σ" if band else ""), loc="left", fontsize=9)
-    axis.set_ylabel(_unit(type_))
-
-
-def _error(axis: Axes, estimate: Series, truth: Series, field: str, k: int, start: int) -> None:
-    """Estimate less truth (interpolated, where there is some), in the band the filter claims."""
-    (value, type_), (right, _) = _need(estimate, field), _need(truth, field)
-    nan = float("nan")
-    reference = np.interp(estimate.time - start, truth.time - start, right[:, k], left=nan, right=nan)
-    seconds = (estimate.time - start) * 1e-9
-    sigma = _sigma(estimate, field, k)
-    if sigma is not None:
-        axis.fill_between(seconds, -3 * sigma, 3 * sigma, color=BAND, alpha=0.35, lw=0)
-    axis.axhline(0, color=TRUTH, lw=0.6)
-    axis.plot(seconds, value[:, k] - reference, color=COLOURS[k], lw=1.0)
-    _label(axis, f"{field} error {'xyz'[k]}", type_, sigma is not None)
-
-
-def _value(axis: Axes, estimate: Series, truth: Series | None, field: str, k: int, start: int) -> None:
-    """The estimate itself, in the band the filter claims, and the truth where it is known."""
-    value, type_ = _need(estimate, field)
-    seconds = (estimate.time - start) * 1e-9
-    sigma = _sigma(estimate, field, k)
-    if sigma is not None:
-        low, high = value[:, k] - 3 * sigma, value[:, k] + 3 * sigma
-        axis.fill_between(seconds, low, high, color=BAND, alpha=0.35, lw=0)
-    axis.plot(seconds, value[:, k], color=COLOURS[k], lw=1.0)
-    known = None if truth is None else _find(truth, field)
-    if truth is not None and known is not None:
-        axis.plot((truth.time - start) * 1e-9, known[0][:, k], color=TRUTH, lw=0.9, ls="--")
-    _label(axis, f"{field.replace('_', ' ')} {'xyz'[k]}", type_, sigma is not None)
-
-
-def _angles(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 3) roll, pitch and yaw in degrees, without jumps."""
-    w, x, y, z = quaternion.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
-
-
-def _angle_sigma(estimate: Series, k: int) -> np.ndarray | None:
-    """(n,) degrees: the deviation of roll, pitch or yaw, from that of the rotation vector in the body.
-
-    By the rates of the angles, d(roll, pitch, yaw) = E d(rotation vector), which has no bound at a pitch of
-    90 degrees; the band ends at half a turn.
-    """
-    found = _find(estimate, "covariance")
-    if found is None or found[0].shape[-1] not in SIZES or found[0].shape[-1] < 9:
-        return None
-    P, q = found[0][:, 6:9, 6:9], _need(estimate, "attitude")[0]
-    roll, pitch, _ = np.deg2rad(_angles(q)).T
-    s, c, level = np.sin(roll), np.cos(roll), np.maximum(np.abs(np.cos(pitch)), 1e-3)
-    one, none = np.ones_like(s), np.zeros_like(s)
-    rows = (
-        [one, s * np.sin(pitch) / level, c * np.sin(pitch) / level],
-        [none, c, -s],
-        [none, s / level, c / level],
-    )
-    row = np.stack(rows[k], axis=-1)
-    variance = np.einsum("ni,nij,nj->n", row, P, row)
-    return np.asarray(np.minimum(np.rad2deg(np.sqrt(np.maximum(variance, 0.0))), 60.0))
-
-
-def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, start: int) -> None:
-    angle = _angles(_need(estimate, "attitude")[0])[:, k]
-    sigma = _angle_sigma(estimate, k)
-    if sigma is not None:
-        seconds = (estimate.time - start) * 1e-9
-        axis.fill_between(seconds, angle - 3 * sigma, angle + 3 * sigma, color=BAND, alpha=0.35, lw=0)
-    axis.plot((estimate.time - start) * 1e-9, angle, color=COLOURS[k], lw=1.0)
-    known = None if truth is None else _find(truth, "attitude")
-    if truth is not None and known is not None:
-        right = _angles(known[0])[:, k]
-        begin = np.interp(0, truth.time - start, right)
-        right = right + 360 * np.round((angle[0] - begin) / 360)  # the same turn as the estimate
-        axis.plot((truth.time - start) * 1e-9, right, color=TRUTH, lw=0.9, ls="--")
-    axis.set_title(
-        ("roll", "pitch", "yaw")[k] + (", with 3σ" if sigma is not None else ""), loc="left", fontsize=9
-    )
-    axis.set_ylabel("[deg]")
-
-
-def _paths(estimate: Series, truth: Series | None) -> list[tuple[np.ndarray, dict[str, Any]]]:
-    paths = [(_need(estimate, "position")[0], {"color": COLOURS[0], "lw": 1.2, "label": "estimate"})]
-    if truth is not None:
-        look = {"color": TRUTH, "lw": 1.0, "ls": "--", "label": "truth"}
-        paths.append((_need(truth, "position")[0], look))
-    return paths
-
-
-def _space(axis: Any, estimate: Series, truth: Series | None) -> None:
-    """The trajectory in space, to one scale on all axes; a flat one keeps some height."""
-    paths = _paths(estimate, truth)
-    for path, look in paths:
-        axis.plot(*path.T, **look)
-    points = np.concatenate([path for path, _ in paths])
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    span = high - low
-    span = 1.08 * np.maximum(span, [0.3 * span.max() or 1.0] * 3)
-    middle = (low + high) / 2
-    axis.set(
-        **{f"{name}lim": (middle[k] - span[k] / 2, middle[k] + span[k] / 2) for k, name in enumerate("xyz")}
-    )
-    axis.set_box_aspect(span, zoom=0.88)
-    axis.locator_params(axis="z", nbins=3)
-    unit = _need(estimate, "position")[1].unit
-    for name in "xyz":
-        getattr(axis, f"set_{name}label")(f"{name} [{unit}]" if unit else name, fontsize=8)
-    axis.legend(loc="upper left", fontsize=8, frameon=False)
-
-
-def _from_above(axis: Axes, estimate: Series, truth: Series | None) -> None:
-    for path, look in _paths(estimate, truth):
-        axis.plot(path[:, 0], path[:, 1], **look)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_title("from above", loc="left", fontsize=9)
-    unit = _need(estimate, "position")[1].unit
-    axis.set_xlabel(f"x [{unit}]" if unit else "x")
-    axis.set_ylabel(f"y [{unit}]" if unit else "y")
 
 
 __all__ = ["plot_navigation", "plot_result", "plot_trajectory"]

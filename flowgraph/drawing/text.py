@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from flowgraph.errors import DeclarationError
 from flowgraph.language.clock import Condition, Counted, either
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.types import StructType, Type, flatten
@@ -170,23 +171,65 @@ def scope_of(graph: Graph, path: str) -> str:
     return max((s for s in graph.scopes if path.startswith(s + "/")), key=len, default="")
 
 
+def folded_scopes(graph: Graph, fold: int | None) -> list[str]:
+    """The nested graphs that are one box, or one line, when what is deeper than `fold` is not shown.
+
+    Raises:
+        DeclarationError: for a depth that is not a whole number from 0.
+    """
+    if fold is None:
+        return []
+    if not isinstance(fold, int) or fold < 0:
+        raise DeclarationError(
+            "fold is a depth of nesting", path=graph.name, expected="None, or a whole number from 0",
+            got=repr(fold), fix="write fold=0 for the outermost boxes only",
+        )  # fmt: skip
+    return [s for s in graph.scopes if scope_depth(graph, s) == fold]
+
+
+def scope_depth(graph: Graph, scope: str) -> int:
+    """How many nested graphs are around one."""
+    return sum(scope.startswith(other + "/") for other in graph.scopes)
+
+
 def name_in(scope: str, path: str) -> str:
     """A path as it reads inside a scope."""
     return path.removeprefix(scope + "/") if scope else path
 
 
-def draw_text(graph: Graph) -> str:
-    """The graph as plain text of about 100 columns: sources, blocks in firing order, registers, outputs."""
+def draw_text(graph: Graph, *, fold: int | None = None, width: int | None = None) -> str:
+    """The graph as plain text of about 100 columns: sources, blocks in firing order, registers, outputs.
+
+    Args:
+        fold: graphs nested deeper than this are one line: 0 folds all of them, None none.
+        width: the columns of a narrower page, on which long lines go on in the next; names are not cut.
+    """
     doc = doc_words(graph.doc)
     text = textwrap.wrap(f"{graph.name}: {doc}" if doc else graph.name, WIDTH, subsequent_indent="  ")
-    parts = [("sources", _sources(graph)), ("blocks, in firing order", _blocks(graph))]
+    parts = [("sources", _sources(graph)), ("blocks, in firing order", _blocks(graph, fold))]
     parts += [("registers", _registers(graph)), ("outputs", _outputs(graph))]
     parts = [(heading, lines) for heading, lines in parts if lines]
     for k, (heading, lines) in enumerate(parts):
         last = k == len(parts) - 1
         text += ["│", ("└─ " if last else "├─ ") + heading]
         text += [(("   " if last else "│  ") + line).rstrip() for line in lines]
+    if width is not None:
+        text = [part for line in text for part in _narrow(line, width)]
     return "\n".join(text) + "\n"
+
+
+def _narrow(line: str, width: int) -> list[str]:
+    """A line as several of at most `width` columns, if no word is longer; bars go on at their left."""
+    bars = re.match(r"[│ ]*", line)[0]  # type: ignore[index]
+    words = line[len(bars) :].split()
+    lines, now = [], bars
+    for word in words:
+        if len(now) > len(bars) and len(now) + 1 + len(word) > width:
+            lines.append(now)
+            now = f"{bars}    {word}"
+        else:
+            now = f"{now} {word}" if len(now) > len(bars) else bars + word
+    return [line] if len(line) <= width else [*lines, now]
 
 
 def _columns(rows: Sequence[tuple[str, ...]], most: int = 32) -> list[str]:
@@ -208,15 +251,20 @@ def _sources(graph: Graph) -> list[str]:
     return _columns(rows)
 
 
-def _blocks(graph: Graph) -> list[str]:
+def _blocks(graph: Graph, fold: int | None) -> list[str]:
     """A heading for each block and a row for each of its ends; all rows are aligned together."""
     readers = _readers(graph)
+    shut = folded_scopes(graph, fold)
+    seen: set[str] = set()
     lines: list[str] = []
     rows: list[tuple[str, ...]] = []
     places: list[int] = []
     opened: list[str] = []
     for number, (index, call) in enumerate(graph.calls, start=1):
         scope = scope_of(graph, call.path)
+        closed = next((s for s in shut if call.path.startswith(s + "/")), None)
+        if closed is not None:
+            scope = scope_of(graph, closed)
         chain = sorted((s for s in graph.scopes if f"{scope}/".startswith(s + "/")), key=len)
         while opened != chain[: len(opened)]:
             opened.pop()
@@ -226,7 +274,14 @@ def _blocks(graph: Graph) -> list[str]:
             lines.append("│  " * len(opened) + f"╭─ {name_in(parent, inner)}")
             opened.append(inner)
         bars = "│  " * len(opened)
-        lines.append(shorten(bars + _heading(graph, call, scope, number), WIDTH - 3))
+        if closed is not None:
+            if closed not in seen:
+                seen.add(closed)
+                count = sum(c.path.startswith(closed + "/") for _, c in graph.calls)
+                words = f"{count} block" + "s" * (count != 1)
+                lines.append(f"{bars}{number:>2} {name_in(scope, closed)}: {words}, folded")
+            continue
+        lines.append(bars + _heading(graph, call, scope, number))
         for port, argument in zip(call.block.ports, call.arguments, strict=True):
             if argument.wire is not None or argument.register is not None:
                 places.append(len(lines))
@@ -234,7 +289,7 @@ def _blocks(graph: Graph) -> list[str]:
                 lines.append("")
         for k, out in enumerate(call.outputs):
             to = ", ".join(name_in(scope, path) for path in readers.get(Wire(index, k), ["nothing"]))
-            end = f"{bars}     {out.name}", f"─▷ {shorten(to, 29)}"
+            end = f"{bars}     {out.name}", f"─▷ {to}"
             places.append(len(lines))
             rows.append((*end, shorten(type_words(out.type), 32), clock_words(graph, Wire(index, k))))
             lines.append("")

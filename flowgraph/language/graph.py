@@ -176,9 +176,10 @@ class Graph:
         """Draw the block diagram: to a file (.svg, .png, .pdf, .dot), or as SVG text without one."""
         return verb("Graph.draw")(self, file, **options)
 
-    def text(self) -> str:
-        """The diagram as plain text."""
-        return str(verb("Graph.text")(self))
+    def text(self, *, fold: int | None = None, width: int | None = None) -> str:
+        """The diagram as plain text; what is nested deeper than `fold` is one line, and lines of more than
+        `width` columns go on in the next."""
+        return str(verb("Graph.text")(self, fold=fold, width=width))
 
     def to_networkx(self) -> networkx.MultiDiGraph:
         """The graph as a `networkx.MultiDiGraph`: nodes by path, edges with type, clock and `feedback`."""

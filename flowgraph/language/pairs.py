@@ -188,10 +188,11 @@ def zip_latest_right(a: Stream[Any], b: Stream[Any], *, init: Any, name: str | N
 
 
 @block(name="match", output=_pair_type, fault=("overflow", "the queue is full"))
-def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ignore[no-untyped-def]
+def _match(state, a=None, b=None, *, tolerance, size, full, types, t, xp):  # type: ignore[no-untyped-def]
     """Present where an arriving value finds one of the other stream within `tolerance`; takes the nearest.
 
-    State: two queues of (time, value); what is passed over or grows too old is counted as expired.
+    State: two queues of (time, value); what is passed over or grows too old is counted as expired. A full
+    queue gives up its oldest value, which is an overflow where `full` is "error".
     """
     stamped = [tuple_type([ArrayType((), "int64"), kind]) for kind in types]
     state_a, state_b = state["a"], state["b"]
@@ -217,6 +218,9 @@ def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ig
     gone_b = xp.where(ready, xp.astype(pick_b, xp.int32) + 1, stale_b)
     taken = xp.astype(ready, xp.int32)
     over = (left["count"] - gone_a > size) | (right["count"] - gone_b > size)
+    over = over & xp.asarray(full == "error")
+    gone_a = xp.maximum(gone_a, left["count"] - np.int32(size))
+    gone_b = xp.maximum(gone_b, right["count"] - np.int32(size))
     new = {
         "a": drop_first(left, gone_a, xp),
         "b": drop_first(right, gone_b, xp),
@@ -228,7 +232,7 @@ def _match(state, a=None, b=None, *, tolerance, size, types, t, xp):  # type: ig
 
 
 @_match.init
-def _(a: Type, b: Type, *, tolerance: int, size: int, types: Any) -> Any:
+def _(a: Type, b: Type, *, tolerance: int, size: int, full: str, types: Any) -> Any:
     stamp = ArrayType((), "int64")
     left, right = (empty_queue(tuple_type([stamp, kind]), size + 1) for kind in types)
     none = np.int32(0)
@@ -237,6 +241,8 @@ def _(a: Type, b: Type, *, tolerance: int, size: int, types: Any) -> Any:
 
 _EMPTY_SLOT_AGE = 2**62  # ns: older than any tolerance, so an empty slot is never near
 _LONGEST_QUEUE = 2**24
+FULL = ("error", "drop_oldest")
+"""What a value does that finds the queue of a match full."""
 
 
 def _distances(queue: dict[str, Any], t: Any, xp: Any) -> tuple[Any, Any]:
@@ -258,20 +264,31 @@ def _stale(queue: dict[str, Any], t: Any, tolerance: int, xp: Any) -> Any:
 
 
 def match(
-    a: Stream[Any], b: Stream[Any], *, tolerance: str | int, size: int | None = None, name: str | None = None
-) -> Stream[Any]:
+    a: Stream[Any], b: Stream[Any], *, tolerance: str | int, size: int | None = None, full: str = "error",
+    name: str | None = None,
+) -> Stream[Any]:  # fmt: skip
     """Pairs of values whose time stamps agree within `tolerance`; each arriving value takes the nearest.
 
     A value expires once the other stream has passed it, which `run.stats` counts (`expired_a`, `expired_b`).
 
     Args:
         tolerance: a duration such as "5ms".
-        size: how many values of one stream may wait; more is an error at run time.
+        size: how many values of one stream may wait.
+        full: what one more does: "error", or "drop_oldest", where the oldest expires and is counted. A live
+            run raises the error once and goes on, with the oldest dropped from then on.
 
     Raises:
-        DeclarationError: without a size, or with a tolerance that is no duration.
+        DeclarationError: without a size, with a tolerance that is no duration, or another word for `full`.
     """
     need_streams(name or "match", a=a, b=b)
+    if full not in FULL:
+        raise DeclarationError(
+            "this is not what a full queue can do",
+            path=name or f"match({a.label}, {b.label})",
+            expected=" or ".join(map(repr, FULL)),
+            got=repr(full),
+            fix='write full="drop_oldest" where the other stream may fall silent',
+        )
     label = name or f"match({a.label}, {b.label})"
     if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= _LONGEST_QUEUE:
         raise DeclarationError(
@@ -291,5 +308,5 @@ def match(
             fix='write tolerance="5ms"',
         )
     return typing.cast(
-        "Stream[Any]", _match(a, b, tolerance=span, size=size, types=(a.type, b.type), name=name)
+        "Stream[Any]", _match(a, b, tolerance=span, size=size, full=full, types=(a.type, b.type), name=name)
     )

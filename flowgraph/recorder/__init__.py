@@ -13,5 +13,10 @@ A step reaches its operations through `xp`, the namespace it is handed: `symboli
 recorded, `namespaces` when it runs in NumPy. Random numbers are a function of their name, the time and the
 seed, so that they can be recorded like anything else and come out the same in every engine (`random`).
 
+Because a step says nothing but operations of that table, its derivative follows from it: each operation has
+a rule (`dual_rules`) by which an array that carries its change along (`dual`) passes it on. `derivatives`
+hands a function such arrays, over the namespace of numbers or over the symbolic one, and a Jacobian is
+recorded like the rest.
+
 Nothing here knows what a block or a graph is.
 """

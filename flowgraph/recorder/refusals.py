@@ -16,10 +16,10 @@ def caller() -> str:
     return place(frame.f_globals, frame.f_lineno)
 
 
-MACHINERY = tuple(
-    f"{__package__}.{name}"
-    for name in ("namespaces", "ops", "ranges", "refusals", "symbolic", "symbolic_namespace", "trace")
-)
+_MODULES = """namespaces ops ranges refusals symbolic symbolic_namespace trace
+tangents dual dual_rules dual_elements dual_moves dual_products derivatives"""
+
+MACHINERY = tuple(f"{__package__}.{name}" for name in _MODULES.split())
 """Modules whose frames are not the user's code."""
 
 

@@ -203,6 +203,8 @@ def _getitem(x: Symbolic, entries: list[Any]) -> Symbolic:
 
 def _operator(op: str, swap: bool = False) -> Callable[..., Any]:
     def method(self: Symbolic, other: Any) -> Any:
+        if not isinstance(other, Symbolic) and getattr(other, "__array_ufunc__", other) is None:
+            return NotImplemented  # as NumPy's arrays do: the other class says what the operator means
         pair = (other, self) if swap else (self, other)
         return self.trace.apply(op, *pair)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.registry import flight_settings
+from flowgraph.drawing import canvas
 from flowgraph.errors import UnknownNameError, plain
 from flowgraph.study.spec import text
 from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
@@ -192,13 +193,9 @@ def _pictures(
 
 
 def _png(draw: Draw) -> bytes:
-    # A second that only pictures need.
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     sink = io.BytesIO()
-    with rc_context({"text.parse_math": False}):  # a dollar in a name is a dollar
-        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    with canvas.plain_matplotlib({"text.parse_math": False}):  # a dollar in a name is a dollar
+        figure = canvas.new_figure(9.0, 4.5)
         draw(figure)
         figure.savefig(sink, format="png", dpi=110)
     return sink.getvalue()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from contextlib import suppress
 from pathlib import Path
 
-from flowgraph import DataError
+from flowgraph import DataError, MissingDependencyError
+from flowgraph.engines.registry import find_engine
 
 __all__ = ["engine_of", "recordings"]
 
@@ -34,8 +36,15 @@ def recordings(data: str | None, name: str, pattern: str) -> list[Path]:
     )
 
 
-def engine_of(engine: str) -> str:
-    """The engine to run: with "auto" xla where JAX is installed, else python."""
+def engine_of(engine: str, *, many: bool = False) -> str:
+    """The engine to run: with "auto" xla where JAX is installed, else python.
+
+    many: of many runs, where compiling counts for little, c before these where there is a compiler.
+    """
     if engine != "auto":
         return engine
+    if many:
+        with suppress(MissingDependencyError):
+            find_engine("c").need()
+            return "c"
     return "xla" if importlib.util.find_spec("jax") is not None else "python"

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.bench import (
+    derived_c,
     generated_c,
     imports,
     inertial,
@@ -38,6 +39,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "eskf-engines": (inertial.engines, {"duration": 0.5, "repeats": 1}),
     "kalman-c": (generated_c.kalman, {"ticks": 200, "repeats": 1}),
     "ukf-c": (unscented_c.rows, {"ticks": 100, "repeats": 1}),
+    "derived-c": (derived_c.rows, {"duration": 0.5, "repeats": 1}),
     "eskf-c": (generated_c.eskf, {"duration": 0.5, "repeats": 1}),
     "rbpf-c": (generated_c.rbpf, {"particles_": 50, "duration": 1.5, "repeats": 1}),
     "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),

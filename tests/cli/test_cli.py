@@ -475,6 +475,42 @@ def test_a_graph_is_shown_on_a_flight_that_fits(graph):
     assert done.stdout.startswith(graph)
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437", "ascii", "latin-1", "utf-8"])
+def test_a_graph_is_shown_in_the_characters_that_a_terminal_has(encoding):
+    done = subprocess.run(
+        [sys.executable, "-c", "from flowgraph.cli import app; app()", "show", "ins_eskf"],
+        env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=True,
+    )  # fmt: skip
+    shown = done.stdout.decode(encoding)
+    assert "predict" in shown
+    assert ("▷ imu" if encoding == "utf-8" else "> imu") in shown
+    assert "?" not in shown
+
+
+def test_fold_is_an_option_of_show():
+    assert "folded" in invoke("show", "rbpf_outdoor", "--fold", "0").stdout
+
+
+class _Breaks:
+    def __init__(self, *_: object, **__: object) -> None:
+        raise RuntimeError("no ink")
+
+
+@pytest.mark.parametrize("what", ["Graph.draw", "drawing.canvas.new_figure", "drawing.trajectory.plot_space"])
+def test_a_picture_that_fails_takes_no_results_with_it(what, tmp_path, monkeypatch):
+    monkeypatch.setattr(f"flowgraph.{what}", _Breaks)
+    out = tmp_path / "out"
+    done = invoke("run", "ekf", "--data", "sim", "--set", "duration=1", "--out", str(out), "--json")
+    assert done.exit_code == 0
+    report = json.loads(done.stdout)
+    said = [n for n in report["notes"] if n.startswith("skipped: the picture")]
+    assert len(said) == 1 + (what == "drawing.canvas.new_figure")
+    assert "RuntimeError: no ink" in said[0]
+    assert json.loads((out / "metrics.json").read_text())["notes"] == report["notes"]
+    assert {"estimate.tum", "metrics.json"} <= {f.name for f in out.iterdir()}
+    assert "note: skipped: the picture" in done.stderr
+
+
 def test_a_graph_that_no_example_fits_is_shown_as_it_stands():
     done = invoke("show", "imu_calibration")
     assert done.exit_code == 0, done.stderr

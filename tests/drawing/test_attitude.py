@@ -13,7 +13,8 @@ from flowgraph import DataError, Series, UnknownNameError
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.signals import Attitude, AttitudeBiasBelief
 from flowgraph.cli import app
-from flowgraph.drawing.attitude import _angle_sigmas, plot_orientation
+from flowgraph.drawing.angles import euler_angles, euler_variances
+from flowgraph.drawing.attitude import plot_comparison, plot_orientation
 
 
 def belief(n: int = 50) -> tuple[Series, Series]:
@@ -55,6 +56,26 @@ def test_angles_errors_and_biases_are_drawn_with_bands(tmp_path):
     np.testing.assert_allclose(lines(figure, "inclination error")[-1][~gap], 0.0, atol=1e-5)
 
 
+def test_filters_are_compared_over_the_truth(tmp_path):
+    estimate, truth = belief()
+    other = Series(estimate.time[::2], Attitude(attitude=estimate["attitude"][::2]))
+    figure = plot_comparison({"filter": estimate, "gyroscope": other}, truth, tmp_path / "c.svg")
+    assert [a.get_title(loc="left") for a in figure.axes] == ["roll", "pitch", "yaw"]
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["gyroscope", "truth", "filter"]
+    seen, right, ours = lines(figure, "yaw")
+    assert [len(y) for y in (seen, right, ours)] == [25, 50, 50]
+    assert np.isnan(right[20:25]).all()
+    both = np.isfinite(right) & np.isfinite(ours)
+    np.testing.assert_allclose((ours - right)[both], 2.0, atol=1e-6)
+    assert len(plot_comparison({"filter": estimate}).axes[0].lines) == 1
+    with pytest.raises(DataError, match="there is nothing to compare"):
+        plot_comparison({})
+    with pytest.raises(UnknownNameError, match="attitude"):
+        plot_comparison({"bias": Series(estimate.time, estimate["gyro_bias"])})
+
+
 def test_only_what_exists_is_drawn():
     estimate, _ = belief()
     alone = Series(estimate.time, Attitude(attitude=estimate["attitude"]))
@@ -68,14 +89,12 @@ def test_only_what_exists_is_drawn():
 
 def test_the_band_of_an_angle_is_what_small_turns_make_of_it():
     """Sampled: roll, pitch and yaw of q * Exp(e) with e of the covariance."""
-    from flowgraph.drawing.plot import _angles
-
     rng = np.random.default_rng(0)
     q = from_rotation_vector(np.array([[0.4, -0.5, 1.0]]), xp=np)
     P = np.array([[[4e-4, 1e-4, 0.0], [1e-4, 2e-4, 0.0], [0.0, 0.0, 9e-4]]])
     errors = rng.multivariate_normal(np.zeros(3), P[0], size=20000)
-    angles = _angles(multiply(np.tile(q, (20000, 1)), from_rotation_vector(errors, xp=np), xp=np))
-    np.testing.assert_allclose(_angle_sigmas(q, P)[0], angles.std(axis=0), rtol=0.03)
+    angles = euler_angles(multiply(np.tile(q, (20000, 1)), from_rotation_vector(errors, xp=np), xp=np))
+    np.testing.assert_allclose(np.sqrt(euler_variances(q, P)[0]), angles.std(axis=0), rtol=0.03)
 
 
 def test_the_command_draws_them(tmp_path: Path):

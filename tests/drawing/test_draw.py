@@ -263,6 +263,39 @@ def test_without_any_layout_engine_the_error_says_what_to_install(monkeypatch):
     assert "pip install pygraphviz" in str(caught.value)
 
 
+BROKEN = "#!/bin/sh\necho 'Format: \"svg\" not recognized.' >&2\nexit 1\n"
+
+
+@pytest.mark.parametrize("script", [BROKEN, "#!/bin/sh\nkill -9 $$\n", "no program at all"])
+def test_a_dot_program_that_fails_is_replaced_or_named(script, tmp_path, monkeypatch):
+    dot = tmp_path / "dot"
+    dot.write_text(script)
+    dot.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    pytest.importorskip("pygraphviz")
+    assert str(draw(built())).startswith("<svg")
+    monkeypatch.setitem(sys.modules, "pygraphviz", None)
+    with pytest.raises(MissingDependencyError, match="nothing here can lay out") as caught:
+        draw(built())
+    assert "a dot program that fails" in str(caught.value)
+    if script == BROKEN:
+        assert "not recognized" in str(caught.value)
+
+
+def test_a_chain_too_long_for_a_png_is_refused_and_an_svg_is_not(tmp_path):
+    @graph
+    def chain(x: Stream[Scalar]):
+        for k in range(150):
+            x = x.map(lambda v: v + 1, name=f"a_step_whose_name_is_long_{k}")
+        return x
+
+    built = chain.build(x=periodic("5ms"))
+    with pytest.raises(DeclarationError, match="too large for a PNG"):
+        draw(built, tmp_path / "chain.png")
+    assert not (tmp_path / "chain.png").exists()
+    draw(built, tmp_path / "chain.svg")
+
+
 def test_an_unknown_ending_lists_the_valid_ones(tmp_path):
     with pytest.raises(FlowgraphError) as caught:
         draw(built(), tmp_path / "diagram.jpeg")

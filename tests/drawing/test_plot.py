@@ -12,6 +12,7 @@ from flowgraph import Array, DataError, Series, Signal, Stream, UnknownNameError
 from flowgraph.data.result import Result
 from flowgraph.drawing.plot import plot_navigation, plot_result, plot_trajectory
 from flowgraph.types import ArrayType, Scalar, StructType
+from tests.support import isolated
 
 SECOND = 1_000_000_000
 
@@ -41,14 +42,14 @@ def result_of(**series: Series) -> Result:
 
 def track(n: int = 101, first: int = 3 * SECOND, step: int = SECOND // 100) -> Series:
     time = first + np.arange(n) * step
-    spread = np.broadcast_to(np.diag([4.0, 9.0]), (n, 2, 2))
+    spread = np.diag([4.0, 9.0]) * (1.0 + 0.01 * np.arange(n))[:, None, None]
     return Series(time, Track(np.arange(3.0 * n).reshape(n, 3), spread, np.zeros((n, 15, 15))))
 
 
 def nav(n: int = 50) -> Series:
     seconds = np.arange(n) * 0.1
     position = np.stack([np.cos(seconds), np.sin(seconds), 0 * seconds], axis=-1)
-    covariance = np.broadcast_to(np.diag(np.arange(1.0, 16.0) ** 2), (n, 15, 15))
+    covariance = np.tile(np.diag(np.arange(1.0, 16.0) ** 2), (n, 1, 1))
     half = 0.5 * seconds
     turn = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     values = Nav(position + 0.25, position, turn, np.full((n, 3), 0.01), covariance)
@@ -117,6 +118,133 @@ def test_many_fields_go_into_columns():
     assert len({axis.get_subplotspec().colspan.start for axis in panels(figure)}) == 2
 
 
+@pytest.mark.parametrize("count", [9, 11, 17])
+def test_each_column_has_the_numbers_of_its_time_axis(count):
+    many = {f"s{k}": Series(np.arange(50) * SECOND, np.linspace(0, 1, 50)) for k in range(count)}
+    figure = plot_result(result_of(**many))
+    figure.draw_without_rendering()
+    columns: dict[int, Any] = {}
+    for axis in panels(figure):
+        place = axis.get_subplotspec()
+        if place.rowspan.start >= columns.get(place.colspan.start, (-1, None))[0]:
+            columns[place.colspan.start] = (place.rowspan.start, axis)
+    assert len(columns) == -(-count // 8)
+    for _, lowest in columns.values():
+        assert lowest.get_xlabel() == "time since the start [s]"
+        assert any(t.get_visible() and t.get_text() for t in lowest.get_xticklabels())
+
+
+def feet(figure) -> str:
+    return figure.get_supxlabel()
+
+
+def test_what_is_not_drawn_is_said_at_the_foot():
+    still = Series(np.arange(101) * SECOND, np.tile([1.0, 2.5], (101, 1)))
+    figure = plot_result(result_of(track=track(), still=still))
+    assert titles(figure) == ["track.position", "track.covariance: square roots of the diagonal"]
+    assert "always the same: still = 1, 2.5" in feet(figure)
+    assert "not drawn: track.memory (15 × 15)" in feet(figure)
+    assert titles(plot_result(result_of(still=still))) == ["still"]  # all that there is
+
+
+def test_components_of_several_units_have_a_panel_each():
+    class Polar(Signal):
+        seen: Array = real(3, unit="m, rad, rad")
+
+    time = np.arange(30) * SECOND
+    polar = Series(time, Polar(np.stack([1e3 + time * 1e-9, time * 1e-11, time * 1e-12], axis=1)))
+    figure = plot_result(result_of(polar=polar))
+    assert titles(figure) == ["polar.seen x", "polar.seen y, z"]
+    assert [axis.get_ylabel() for axis in panels(figure)] == ["[m]", "[rad]"]
+
+
+@pytest.mark.parametrize("value", [-4.0, np.nan])
+def test_a_variance_that_is_none_is_a_gap_and_a_mark(value):
+    time = np.arange(100) * SECOND
+    P = np.tile(np.diag([4.0, 1.0]), (100, 1, 1)) * (1 + 0.001 * np.arange(100))[:, None, None]
+    P[50:, 0, 0] = value
+    figure = plot_result(result_of(b=Series(time, P)))
+    (axis,) = panels(figure)
+    assert np.isnan(axis.lines[0].get_ydata()[50:]).all()
+    assert np.isfinite(axis.lines[0].get_ydata()[:50]).all()
+    assert [t.get_text() for t in axis.texts] == ["no variance at 50 of 100 times"]
+    assert len(axis.lines[-1].get_xdata()) == 50
+
+
+def test_a_broken_covariance_draws_no_band_of_certainty():
+    whole = nav()
+    P = np.array(whole["covariance"])
+    P[30:, 0, 0] = -1.0
+    fields = [P if name == "covariance" else array for name, array in whole.leaves.items()]
+    estimate = Series(whole.time, Nav(*fields), name="belief")
+    axis = panel(plot_navigation(estimate, truth()), "position error x, with 3σ")
+    reach = np.concatenate([path.vertices for path in axis.collections[0].get_paths()])
+    assert reach[:, 0].max() < 3.0  # the band ends where the variance does
+    assert any("no variance at 20 of 50 times" in t.get_text() for t in axis.texts)
+
+
+def test_a_stream_without_a_number_says_so():
+    blank = Series(np.arange(60) * SECOND, np.full((60, 3), np.nan))
+    figure = plot_result(result_of(track=track(), blank=blank))
+    assert [t.get_text() for t in panel(figure, "blank").texts] == ["none of 60 values is finite"]
+
+
+def test_an_error_of_the_start_does_not_set_the_scale():
+    n = 1000
+    seconds = np.arange(n) * 0.01
+    off = np.where(seconds < 0.5, 0.5, 0.015)[:, None] * np.ones(3)
+    q = np.tile([1.0, 0, 0, 0], (n, 1))
+    estimate = Series.from_seconds(seconds, Truth(off, q), name="estimate")
+    figure = plot_navigation(estimate, Series.from_seconds(seconds, Truth(0 * off, q), name="truth"))
+    axis = panel(figure, "position error x")
+    assert axis.get_ylim() == pytest.approx((-0.15 * 0.015, 1.15 * 0.015))
+    assert [t.get_text() for t in axis.texts] == ["the start reaches 0 to 0.5"]
+
+
+def test_no_text_lies_on_another():
+    """Titles, legends, numbers and labels of a figure with long names and many components."""
+    long = "a_stream_whose_name_is_as_long_as_such_names_become_in_a_graph_of_several_levels_of_nesting"
+    many = {f"{long}_{k}": track() for k in range(5)}
+    figure = plot_result(result_of(**many, wide=Series(np.arange(50), np.random.rand(50, 6))))
+    figure.draw_without_rendering()
+    for axis in panels(figure):
+        words = [axis._left_title, axis.yaxis.label]
+        words += axis.get_legend().get_texts() if axis.get_legend() else []
+        boxes = [w.get_window_extent() for w in words if w.get_text()]
+        for k, box in enumerate(boxes):
+            assert not any(box.overlaps(other) for other in boxes[k + 1 :]), axis.get_title(loc="left")
+            assert box.x0 >= 0
+            assert box.x1 <= figure.bbox.x1
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        "import os; os.environ['MPLBACKEND'] = 'module://a_backend.of_another_environment'",
+        "import matplotlib; matplotlib.rcParams['text.usetex'] = True",
+        "import matplotlib; matplotlib.use('svg'); matplotlib.rcParams['axes.titlelocation'] = 'right'",
+    ],
+)
+def test_a_picture_is_the_same_whatever_its_session_has_set(before, tmp_path):
+    isolated(
+        f"{before}\n"
+        "import numpy as np, os, sys\n"
+        "kept = os.environ.get('MPLBACKEND')\n"
+        "from flowgraph import Series\n"
+        "from flowgraph.data.result import Result\n"
+        "s = {'s': Series(np.arange(50), np.linspace(0, 1, 50))}\n"
+        f"Result('toy', 'python', s, {{}}, {{}}, 50, 0.0).plot({str(tmp_path / 'a.png')!r})\n"
+        "import matplotlib\n"
+        "assert os.environ.get('MPLBACKEND') == kept\n"
+        "assert matplotlib.rcParams['text.usetex'] == ('usetex' in sys.argv)\n".replace(
+            "('usetex' in sys.argv)", str("usetex" in before)
+        )
+    )
+    plot_result(result_of(s=Series(np.arange(50), np.linspace(0, 1, 50))), tmp_path / "b.png")
+    sizes = [(tmp_path / f"{name}.png").read_bytes()[16:24] for name in "ab"]
+    assert sizes[0] == sizes[1]
+
+
 def test_a_run_draws_itself_without_pyplot(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)  # importing it now fails
 
@@ -174,6 +302,7 @@ def test_the_navigation_page_shows_what_there_is(tmp_path):
         *(f"position error {k}, with 3σ" for k in "xyz"),
         *(f"velocity {k}, with 3σ" for k in "xyz"),  # the truth has none
         *(f"{angle}, with 3σ" for angle in ("roll", "pitch", "yaw")),
+        *(f"attitude error {k}, with 3σ" for k in "xyz"),
         *(f"gyro bias {k}, with 3σ" for k in "xyz"),
         "tilt error [deg]",
     ]  # fmt: skip

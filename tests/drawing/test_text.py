@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flowgraph import (
+    DeclarationError,
     Stream,
     aperiodic,
     every,
@@ -103,6 +104,35 @@ def test_a_small_graph_as_a_whole():
            ● output  ◁─ add  real  at a
         """
     )
+
+
+def test_fold_makes_one_line_of_a_nested_graph():
+    built = tracker.build(imu=periodic("5ms"), fix=aperiodic(max_rate=10))
+    blocks = built.text(fold=0).split("├─ registers")[0]
+    assert "core: 2 blocks, folded" in blocks
+    assert "predict" not in blocks
+    assert built.text(fold=1) == built.text()
+    with pytest.raises(DeclarationError, match="fold is a depth of nesting"):
+        built.text(fold=-1)
+
+
+@pytest.mark.parametrize("width", [30, 40, 72])
+def test_on_a_narrow_page_lines_go_on_and_no_name_is_cut(width):
+    built = tracker.build(imu=periodic("5ms"), fix=aperiodic(max_rate=10))
+    drawn = built.text(width=width)
+    assert max(map(len, drawn.splitlines())) <= width
+    assert drawn.replace("│", " ").split() == built.text().replace("│", " ").split()
+
+
+def test_a_long_name_is_whole():
+    @graph
+    def long(x: Stream[Scalar]):
+        name = "a_name_of_more_than_a_hundred_characters_" * 3
+        return {"first_output_that_is_long": x.map(lambda v: v, name=name), "x": x}
+
+    text = long.build(x=periodic("5ms")).text()
+    assert text.count("a_name_of_more_than_a_hundred_characters_" * 3) == 2
+    assert text.replace("map(…)", "").count("…") == 0
 
 
 def test_joins_say_their_bounds_and_what_is_present_when():

@@ -15,6 +15,7 @@ from flowgraph import (
     ClockError,
     DataError,
     DeclarationError,
+    FifoOverflowError,
     LoweringError,
     Run,
     Scalar,
@@ -592,6 +593,89 @@ def test_a_failed_push_leaves_no_trace_and_may_be_repeated():
             run.push(time, **values)
     with pytest.raises(TypeMismatchError):
         run.push(30, a=True)
+
+
+@graph
+def echoed(imu: Stream[Scalar]):
+    return imu.map(lambda x: x)
+
+
+@pytest.mark.parametrize("timing", [periodic("5ms", jitter="1ms"), periodic("5ms"), periodic("5ms", phase=0)])
+def test_a_live_run_goes_on_after_lost_packets_and_counts_them(timing):
+    run = Run(echoed.build(imu=timing))
+    came = [k for k in range(100) if k not in (10, 20, 21, 22)]
+    for k in came:
+        run.push(5 * MS * k, imu=float(k))
+    assert run.lost == {"imu": 4}
+    assert run.result().output.value.tolist() == came
+
+
+def test_a_clock_that_jumps_is_refused_once_and_one_without_its_phase_is_refused():
+    run = Run(echoed.build(imu=periodic("5ms")))
+    for k in range(5):
+        run.push(5 * MS * k, imu=0.0)
+    with pytest.raises(ClockError, match="do not keep the declared period"):
+        run.push(27 * MS, imu=1.0)
+    run.push(32 * MS, imu=2.0)
+    assert run.lost == {"imu": 0}
+    phased = Run(echoed.build(imu=periodic("5ms", phase=0)))
+    phased.push(0, imu=0.0)
+    for time in (7, 12, 17):
+        with pytest.raises(ClockError):
+            phased.push(time * MS, imu=0.0)
+    phased.push(20 * MS, imu=0.0)
+
+
+@pytest.mark.parametrize("time", [2**63, -(2**63), 10**400, -(10**400)])
+def test_a_time_beyond_64_bits_is_our_error(time):
+    with pytest.raises(DataError, match="does not fit 64 bits"):
+        Run(echoed.build()).push(time, imu=1.0)
+
+
+def test_what_is_not_finite_is_refused_absent_or_kept():
+    with pytest.raises(UnknownNameError, match="no rule for not_finite is called 'drop'"):
+        Run(echoed.build(), not_finite="drop")
+    absent = Run(echoed.build(), not_finite="absent")
+    for time, value in enumerate([1.0, np.nan, np.inf, 2.0]):
+        absent.push(time, imu=value)
+    assert absent.absent == {"imu": 2}
+    assert absent.result().output.value.tolist() == [1.0, 2.0]
+    kept = Run(echoed.build(), not_finite="keep")
+    kept.push(0, imu=np.nan)
+    assert np.isnan(kept.result().output.value).all()
+
+
+@graph
+def matched(imu: Stream[Scalar], cam: Stream[Scalar], *, full):
+    return {"imu": imu, "pair": match(imu, cam, tolerance="5ms", size=4, full=full, name="m")}
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_live_run_goes_on_when_a_match_is_full(back):
+    """The error is raised once, in a tick that has happened; what waits is the latest, and pairs again."""
+    run, raised = Run(matched.build(full="error")), []
+    for k in range(60):
+        try:
+            run.push(5 * MS * k, imu=float(k), **({"cam": 1.0} if k < 10 or (back and k > 50) else {}))
+        except FifoOverflowError as error:
+            raised.append(error.path)
+    assert raised == ["m"]
+    assert len(run.result().imu) == 60
+    assert len(run.result().pair) == 10 + 9 * back
+    assert run.stats["m.expired_a"] == 41 + (0 if back else 5)
+
+
+@pytest.mark.parametrize("engine", ["python", "reference", "c"])
+def test_a_match_may_drop_the_oldest_instead(engine):
+    time = np.arange(60) * 5 * MS
+    inputs = {"imu": Series(time, np.arange(60.0)), "cam": Series(time[:10], np.ones(10))}
+    found = simulate(matched.build(full="drop_oldest"), inputs, engine=engine)
+    assert len(found.pair) == 10
+    assert found.stats["m.expired_a"] == 46
+    with pytest.raises(FifoOverflowError):
+        simulate(matched.build(full="error"), inputs, engine=engine)
+    with pytest.raises(DeclarationError, match="not what a full queue can do"):
+        matched.build(full="drop")
 
 
 def test_iterables_are_read_one_event_ahead():

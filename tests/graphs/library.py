@@ -21,11 +21,13 @@ _FEW = "particles=60"
 
 OWN = {
     "orientation_complementary": ("sim:thesis", ["sensors=gyro,coordinate_acceleration,thrust"]),
+    "attitude_mekf": ("sim:thesis", ["sensors=body_rate,magnetic_attitude"]),
     "outdoor_eskf": ("sim:thesis", [_THESIS]),
     "rbpf_outdoor": ("sim:thesis", [_THESIS, _FEW]),
     "rbpf_indoor": ("sim", [_FEW]),
     "marg": ("sim:thesis", ["sensors=imu,magnetometer"]),
     "particle": ("sim:plane", [_FEW]),
+    "tracker": ("sim:plane", []),
     "ins_ekf_pose": ("course", []),
     "ins_ukf_pose": ("course", []),
     "ins_ukf_velocity": ("course", []),

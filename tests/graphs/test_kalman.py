@@ -29,13 +29,14 @@ def a_case(seconds: float = 3.0, **settings: Any) -> Case:
 def test_it_is_the_filter_and_smoother_of_filterpy(driven):
     """filterpy's smoother knows no control, so there is one to compare with where the control is zero."""
     peers = pytest.importorskip("filterpy.kalman")
-    case = a_case()
-    reading, model = readings(thesis(1, 3.0)), point_model(THESIS)
+    flight = thesis(1, 3.0, imu_oversample=1.0)  # readings of an instant: the mean of two drives a step
+    case = kalman.case(flight)
+    reading, model = readings(flight), point_model(THESIS)
     control = reading["acceleration"] * float(driven)
     values = PointReading(acceleration=control, position=reading["position"])
     result = simulate(case.graph, {"reading": arrays(reading.time, values, not_finite="keep")})
 
-    start = start_point(thesis(1, 3.0).streams["vicon"]["position"][0])
+    start = start_point(flight.streams["vicon"]["position"][0])
     peer = peers.KalmanFilter(dim_x=6, dim_z=3, dim_u=3)
     peer.x, peer.P, peer.H, peer.R = start.mean, start.covariance, np.eye(3, 6), np.eye(3) * 0.01
     dt = np.r_[0.0, np.diff(reading.time) * 1e-9]

@@ -246,6 +246,7 @@ def test_the_noise_of_a_held_control_can_be_kept(name):
     assert wide["covariance"][at, 0, 0] > 10.0 * narrow["covariance"][at, 0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose", "async_kalman"])
 def test_engines_agree_over_a_gap_and_a_shut_gate(name):
     made = outliers(without(flight(), 2.0, 2.5), slice(14, 22), 20.0)
@@ -281,6 +282,7 @@ def spiked(base: Flight, row: int, field: str, by: float) -> Flight:
     return with_stream(base, "imu", changed(base.streams["imu"], **{field: values}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [
     pytest.param(lambda: spiked(flight(16.0), 500, "specific_force", 2000.0), id="a spike of the force"),
     pytest.param(lambda: spiked(flight(16.0), 500, "gyro", 200.0), id="a spike of the rate"),
@@ -333,6 +335,7 @@ def of_positions(base: Flight) -> Flight:
     return replace(base, streams={"imu": base.streams["imu"], "leica": leica})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 150.0, -100.0])
 def test_a_heading_is_found_of_which_nothing_is_known(degrees):
     base = of_positions(turned(flight(20.0, 3), np.radians(degrees)))

@@ -42,6 +42,7 @@ def agrees(name: str, passes: tuple[str, ...], engine: str = "reference") -> Non
         compare(series, found[output])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIBRARY)
 def test_optimised_it_gives_the_same(name):
     agrees(name, DEFAULT)
@@ -75,6 +76,7 @@ def programs(name: str) -> list[Any]:
     return [specialise(pipeline, key) for key in (*keys, None)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIBRARY)
 def test_the_list_stays_in_single_assignment_form(name):
     for program in programs(name):

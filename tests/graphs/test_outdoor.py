@@ -112,6 +112,7 @@ def test_a_jacobian_is_the_derivative(observe, space):
         np.testing.assert_allclose(H[:, k], slope / (2.0 * step), atol=1e-6 * max(1.0, np.abs(h).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", [rbpf_outdoor, outdoor_eskf])
 def test_the_engines_agree(graph):
     pytest.importorskip("jax")

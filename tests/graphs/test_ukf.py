@@ -26,6 +26,7 @@ def a_case(seconds: float = 3.0, **settings: Any) -> Case:
     return ukf.case(thesis(1, seconds, vicon_phase=0.0123), **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", ["markley", "kraft"])
 def test_the_engines_agree(mean):
     pytest.importorskip("jax")
@@ -45,6 +46,7 @@ FLIGHTS: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FLIGHTS)
 def test_it_is_as_good_as_the_extended_filter(family):
     """Position and attitude within 2 %, the NEES within 5 %; over 50 smooth flights -0.2, 0.0 and 0.1 %."""
@@ -64,6 +66,7 @@ def test_it_is_as_good_as_the_extended_filter(family):
     assert (total["ukf"] < np.array([1.02, 1.02, 1.05]) * total["ekf"]).all(), total
 
 
+@pytest.mark.slow
 def test_single_precision_follows_double():
     """At alpha = 1, within 1 mm and 0.02 degrees over a flight of 10 s; alpha = 0.01 is refused there."""
     case = ukf.case(thesis(1, 10.0))
@@ -127,6 +130,7 @@ def consistent_ticks(base: int, factor: float) -> float:
     return inside(found, chi_square_band(9, runs=RUNS))
 
 
+@pytest.mark.slow
 def test_the_nees_of_50_runs_lies_in_its_band():
     pytest.importorskip("jax")
     assert consistent_ticks(0, 1.0) >= 0.8

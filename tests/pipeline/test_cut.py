@@ -202,6 +202,7 @@ def test_inputs_of_one_clock_come_together(tmp_path):
 # -- one graph from the tags to the belief -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pnp_before_the_filter_in_one_graph():
     """Tags and IMU in, belief out: PnP stays on the host, the filter runs in XLA and in C."""
     made = load_flight("course", seed=1, settings={"duration": "0.4"})

@@ -299,6 +299,7 @@ JUNK = st.sampled_from(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_any_change_of_a_description_is_refused_in_order_or_harmless(data):

@@ -34,6 +34,7 @@ PERFECT: dict[str, Any] = {
 NOISES = [Fit("position_noise", 1e-3, 0.1, 0.05), Fit("attitude_noise", 1e-3, 0.1, 0.002)]
 
 
+@pytest.mark.slow
 def test_likelihood_finds_the_true_noise_of_the_measurement():
     found = tune(
         "ekf", NOISES, [Recording("sim", 0), Recording("sim", 1)], [Recording("sim", 2)], most=60,
@@ -79,6 +80,7 @@ def test_error_against_the_truth_gets_smaller_on_what_is_held_out():
     assert judged.own == pytest.approx(math.log(judged.metrics["position_rmse_m"][2]))
 
 
+@pytest.mark.slow
 def test_each_recording_is_held_out_once_and_judged_by_the_search_that_did_without_it():
     fit, flights = [Fit("position_noise", 1e-3, 1.0, 0.5)], [Recording("sim", k) for k in range(3)]
     how: Any = {"measure": "error", "settings": {**PERFECT, "attitude_noise": 0.01}, "most": 12}
@@ -130,6 +132,7 @@ def test_surprise_is_the_negative_logarithm_of_the_density():
     assert surprise(result) == pytest.approx(np.sum(wanted) / (6 * len(wanted)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_vectorised_evaluation_is_that_of_one_at_a_time():
     pytest.importorskip("jax")
     how: Any = {"settings": PERFECT, "most": 1}

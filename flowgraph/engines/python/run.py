@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from functools import partial, wraps
 from threading import Lock, get_ident
 from time import perf_counter
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from flowgraph.data.inputs import Inputs, check_event, prepare
+from flowgraph.data.inputs import NOT_FINITE, Inputs, check_stamp, check_value, periods_lost, prepare, rule_of
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
 from flowgraph.data.tape import batches, merged, need_near, stack
@@ -23,7 +23,7 @@ from flowgraph.engines.options import Meter
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
-from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.errors import ClockError, DataError, FifoOverflowError, UnknownNameError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
@@ -51,6 +51,8 @@ class Run:
         init: other initial values, by register path.
         state: a `run.state` from which to go on; give it the inputs that come after.
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
+        not_finite: what a pushed event with a NaN or an infinity is: an error ("raise"), no event ("absent",
+            counted in `absent`), or data ("keep").
     """
 
     engine = "python"
@@ -63,6 +65,7 @@ class Run:
         init: Mapping[str, Any] | None = None,
         state: Mapping[str, Any] | None = None,
         seed: int = 0,
+        not_finite: str = "raise",
     ) -> None:
         self.graph = graph
         self.ticks = 0
@@ -73,9 +76,16 @@ class Run:
         self._stopped: int | None = None
         self._busy, self._thread = Lock(), 0
         self._first: int | None = None
+        self._heard = dict(self._last)  # the last event of each source, be it one that was refused
+        self._lost = dict.fromkeys(graph.sources, 0)
+        self._absent = dict.fromkeys(graph.sources, 0)
+        self._not_finite = rule_of("not_finite", not_finite, NOT_FINITE)
+        self._full: dict[int, FifoOverflowError] = {}  # by call
+        self._told: set[int] = set()  # the calls whose overflow was raised
         check_start(init, state, path=graph.name)
         if state is not None:
             self.state = state
+            self._heard = dict(self._last)
         self._recorded = True
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
@@ -116,7 +126,16 @@ class Run:
 
     @_alone
     def push(self, time: int, /, **values: Any) -> None:
-        """One tick at `time` (int ns) in which the named sources have these values."""
+        """One tick at `time` (int ns) in which the named sources have these values.
+
+        Whole periods without an event of a periodic source are packets that were lost, which `lost` counts.
+        An event that is refused leaves no trace; the next may be pushed.
+
+        Raises:
+            DataError, ClockError, TypeMismatchError: for an event that is refused.
+            FifoOverflowError: once for each join whose queue is full. This tick has happened, and the run
+                goes on; the join gives up its oldest value, counted, whenever it is full again.
+        """
         if self._pushed is None:
             raise DataError(
                 "this run reads recorded inputs",
@@ -134,11 +153,17 @@ class Run:
                 fix="call push(time, name=value)",
             )
         key = 0
+        lost: dict[str, int] = {}
+        absent: list[str] = []
         checked: list[tuple[deque[Any], Any]] = []
         for k, (name, node) in enumerate(self.graph.sources.items()):
             if name in values:
-                before, timing = self._last[name], node.clock.timing
-                time, value = check_event(name, time, values.pop(name), node.type, timing, before)
+                time = check_stamp(name, time)
+                value = check_value(name, time, values.pop(name), node.type, self._not_finite)
+                lost[name] = self._periods_lost(name, time)
+                if value is None:
+                    absent.append(name)
+                    continue
                 checked.append((self._pushed[k], value))
                 key |= 1 << k
         if values:
@@ -156,12 +181,22 @@ class Run:
         for queue, value in checked:
             queue.append(value)
         try:
-            self._advance([(time, key)])
+            if checked:
+                self._advance([(time, key)])
         except BaseException:
             for queue, _ in checked:
                 queue.clear()
             self._stopped = None  # this tick did not happen; the next may be pushed
             raise
+        for name, periods in lost.items():
+            self._lost[name] += periods
+            self._heard[name] = time
+        for name in absent:
+            self._absent[name] += 1
+        for index, error in self._full.items():
+            if index not in self._told:
+                self._told.add(index)
+                raise error
 
     @_alone
     def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
@@ -252,11 +287,26 @@ class Run:
                         )
             trace = trace.tb_next
 
-    def _overflow(self, index: int, time: int) -> NoReturn:
+    def _overflow(self, index: int, time: int) -> None:
+        """Stop at a full queue, or, where events are live, remember it and go on with what is in it."""
+        if index in self._full:
+            return
         call = self.graph.nodes[index]
         assert isinstance(call, CallNode)
         message = call.block.fault[1] if call.block.fault else "a queue is full"
-        raise overflow_error(message, call.path, call.settings.get("size"), time)
+        error = overflow_error(message, call.path, call.settings.get("size"), time)
+        if self._pushed is None or "full" not in call.settings:
+            raise error
+        self._full[index] = error
+
+    def _periods_lost(self, name: str, time: int) -> int:
+        timing = self.graph.sources[name].clock.timing
+        try:
+            return periods_lost(name, time, timing, self._heard[name])
+        except ClockError:
+            if timing.phase is None and time > self._heard[name]:
+                self._heard[name] = time  # the clock may have jumped, and the next event keeps its period
+            raise
 
     @property
     def state(self) -> dict[str, Any]:
@@ -275,6 +325,16 @@ class Run:
     def seed(self) -> int:
         """The seed of the random numbers."""
         return int(self._key[0]) | int(self._key[1]) << 32
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """By source, how many pushed events of a periodic one did not come: whole periods without any."""
+        return dict(self._lost)
+
+    @property
+    def absent(self) -> dict[str, int]:
+        """By source, how many pushed events were not finite and so no events (`not_finite="absent"`)."""
+        return dict(self._absent)
 
     @property
     def stats(self) -> dict[str, int]:

@@ -7,7 +7,7 @@ import pytest
 
 from flowgraph import load_flight
 from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
-from flowgraph.blocks.flights.worlds import SENSORS, TRIP
+from flowgraph.blocks.flights.worlds import OF_STEPS, SENSORS, TRIP
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.sensors import as_position
@@ -115,7 +115,8 @@ def test_every_sensor_has_a_stream_and_settings():
     assert {f"{n}.{k}" for n, parts in SENSORS.items() for k in parts} <= set(SETTINGS)
     assert set(DEFAULTS) <= set(SETTINGS)
     for name, parts in SENSORS.items():
-        assert flight.info["noise"][name] == dict(parts)
+        own = {key.partition(".")[2]: value for key, value in OF_STEPS.items() if key.startswith(f"{name}.")}
+        assert flight.info["noise"][name] == {**parts, **own}
         assert flight.info[f"{name}_period_ns"] == round(1e9 / parts["rate"])
 
 
@@ -123,8 +124,8 @@ def test_streams_do_not_disturb_each_other():
     alone = load("thesis", seed=3, settings={"sensors": "vicon"})
     among = load("thesis", seed=3, settings={"sensors": "gps,vicon,imu", "gps.noise": 5, "imu.rate": 100})
     assert (alone.streams["vicon"].attitude == among.streams["vicon"].attitude).all()
-    apart = load("thesis", seed=3, settings={"sensors": "gyro,accelerometer"})
-    together = load("thesis", seed=3)
+    together = load("thesis", seed=3, settings={"imu.oversample": 1})
+    apart = load("thesis", seed=3, settings={"sensors": "gyro,accelerometer", "gyro.turn": 0})
     assert (apart.streams["gyro"].rate == together.streams["imu"].gyro).all()
     assert (apart.streams["accelerometer"].force == together.streams["imu"].specific_force).all()
 
@@ -132,6 +133,7 @@ def test_streams_do_not_disturb_each_other():
 def test_truth_has_the_biases_of_the_readings():
     quiet = {"gyro.noise": 0.0, "accelerometer.noise": 0.0}
     wrong = {"gyro.bias": 0.1, "gyro.walk": 0.01, "accelerometer.bias": 0.2, "imu.phase": 0.01}
+    wrong["imu.oversample"] = 1
     given: dict[str, str | float] = {"imu.rate": "50", "sensors": "imu,thrust", **quiet, **wrong}
     flight = load("thesis", seed=4, settings=given)
     imu, truth = flight.streams["imu"], flight.truth
@@ -202,6 +204,9 @@ def test_an_oversampled_gyroscope_reads_the_turn_since_its_last_reading():
     assert flight.truth is not None
     q = flight.truth["attitude"]
     turn = g.to_rotation_vector(g.multiply(g.conjugate(q[:-1], xp=np), q[1:], xp=np), xp=np)
+    read = load("thesis", seed=1, settings={**quiet, "sensors": "gyro"}).streams["gyro"].rate
+    np.testing.assert_allclose(read[1:], turn * 200.0, atol=1e-9)
+    np.testing.assert_array_equal(read[0], 0.0)  # before the world begins, it stands still
     apart = {n: np.abs(load("thesis", seed=1, settings={**quiet, "imu.oversample": n}).streams["imu"].gyro[1:]
                        - turn * 200.0).max() for n in (1, 20)}  # fmt: skip
     assert apart[20] < 0.02 < 1.0 < apart[1]
@@ -209,6 +214,21 @@ def test_an_oversampled_gyroscope_reads_the_turn_since_its_last_reading():
     np.testing.assert_allclose(one, many, atol=1e-12)
     with pytest.raises(DeclarationError, match="'imu.oversample' is not usable"):
         load("hover", settings={"imu.oversample": 1.5})
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "body_rate"])
+def test_a_rate_may_be_that_of_the_turn_since_the_last_reading(sensor):
+    """Whatever the rate of the sensor, and also where it is late and oversamples: q' = q Exp(w T)."""
+    settings = {"sensors": sensor, "duration": 3.0, f"{sensor}.noise": 0.0, f"{sensor}.rate": 40.0}
+    flight = load("thesis", seed=2, settings={**settings, f"{sensor}.latency": 0.03})
+    world, stamp = flight.info["world"], flight.info["stamps"][sensor][1:] / 1e9
+    before, now = (world.at(t).attitude for t in (stamp - 0.025, stamp))
+    ahead = g.multiply(before, g.from_rotation_vector(flight.streams[sensor].rate[1:] * 0.025, xp=np), xp=np)
+    np.testing.assert_allclose(np.abs((ahead * now).sum(-1)), 1.0, atol=1e-12)
+    instant = load("thesis", seed=2, settings={**settings, f"{sensor}.turn": 0}).streams[sensor]
+    np.testing.assert_array_equal(instant.rate, world.at(instant.time / 1e9).rate)
+    with pytest.raises(DeclarationError, match=f"'{sensor}.turn' is not usable"):
+        load("thesis", settings={"sensors": sensor, f"{sensor}.turn": 2})
 
 
 def test_motion_capture_and_optical_flow_have_biases():

@@ -72,6 +72,7 @@ def check_replay(result: Any, rows: dict[str, list[list[float]]], *, atol: float
         assert (np.abs(table[:, 1:] - flat) <= bound).all(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["async_kalman", "rbpf_indoor", "ins_eskf"])
 def test_a_process_of_its_own_prints_what_python_computes(name, tmp_path):
     """Strict flags; and the address and undefined-behaviour sanitizers find nothing."""
@@ -102,6 +103,7 @@ def test_no_heap_no_library_but_math(tmp_path):
     assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|printf)\b", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rbpf_indoor", "ins_eskf", "ins_particle"])
 def test_single_precision_computes_nothing_in_double(name):
     """A double among floats makes a compiler convert to and fro, and give a loop up."""
