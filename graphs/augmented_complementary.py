@@ -28,12 +28,8 @@ from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_rec
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
-<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, with_imu
-=======
-from flowgraph.blocks.scoring.tuning import imu_noise_of, reading_of
->>>>>>> main
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of, with_imu
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
 
@@ -57,13 +53,8 @@ def augmented_complementary(
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
-<<<<<<< HEAD
     control = latest(imu, init=Imu.at_rest(-gravity[2]), name="control")
-    prior = dead_reckon(previous, control, gravity=gravity, at=imu | vicon)
-=======
-    control = latest(imu, init=Imu.at_rest(), name="control")
     prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
->>>>>>> main
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
     corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")

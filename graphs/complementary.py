@@ -27,13 +27,9 @@ from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spre
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
-<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
-=======
-from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
 from flowgraph.blocks.scoring.tuning import reading_of
->>>>>>> main
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
 

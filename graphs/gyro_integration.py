@@ -17,12 +17,8 @@ from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.complementary import turn_by_gyro
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
-<<<<<<< HEAD
 from flowgraph.blocks.scoring.start import Started
-from flowgraph.blocks.scoring.tuning import with_imu
-=======
-from flowgraph.blocks.scoring.tuning import reading_of
->>>>>>> main
+from flowgraph.blocks.scoring.tuning import reading_of, with_imu
 from flowgraph.blocks.signals import Attitude, Gyro, Imu
 
 
@@ -49,8 +45,7 @@ def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored
     """
     attitude, inputs = _start(on, started, still)
     score = scored.score(on, orientation_errors, estimate="attitude", innovations=False)
-<<<<<<< HEAD
-    return on.case(score, inputs=inputs, start=Attitude(attitude=attitude))
+    return on.case(score, inputs=inputs, start=Attitude(attitude=attitude), reading=reading_of(on.flight))
 
 
 def _start(on: OnFlight, started: Started, still: float | None) -> tuple[np.ndarray, dict[str, Series]]:
@@ -60,6 +55,3 @@ def _start(on: OnFlight, started: Started, still: float | None) -> tuple[np.ndar
         return pose.attitude, pose.inputs
     begin, pose = started.orientation(on, on.inputs["imu"], still, deviates=False)
     return begin.attitude, pose.inputs
-=======
-    return on.case(score, start=Attitude(attitude=begin.attitude), reading=reading_of(on.flight))
->>>>>>> main

@@ -12,23 +12,10 @@ from __future__ import annotations
 
 from typing import Any
 
-<<<<<<< HEAD
-from flowgraph import Case, Stream, collect, delay, graph, latest
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.euler_ins import (
-    euler_angles,
-    navigation_belief,
-    predict_extended,
-    update_pose_angles,
-)
-from flowgraph.blocks.models.pose import between_imu
-=======
 from flowgraph import Case, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.models.euler_ins import predict_extended, update_pose_angles
->>>>>>> main
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
 from flowgraph.blocks.scoring.tuning import with_imu
@@ -46,9 +33,9 @@ def ins_ekf_pose(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
-    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -59,38 +46,16 @@ def ins_ekf_pose(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
-<<<<<<< HEAD
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
-    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
-    prior = predict_extended(
-        belief, between_imu(last, control), order=order, noise=noise, gravity=gravity, name="predict"
-    )
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update_pose_angles(
-        prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
-    )
-    if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
-    belief.feed(posterior)
-    last.feed(control)
-    collect(innovation, "innovation")
-    return {
-        "belief": navigation_belief(posterior, order=order),
-        "angles": euler_angles(posterior, order=order),
-    }
-=======
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=lambda belief, drive: predict_extended(
-            belief, drive, order=order, noise=noise, name="predict"
+            belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
         ),
     )  # fmt: skip
->>>>>>> main
 
 
 @on_flight(ins_ekf_pose, "imu", told=with_imu)
@@ -105,9 +70,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-<<<<<<< HEAD
-    poses = poses_of(on.name, on.flight, tags=filter.tags)
-    return on_measured_pose(on, filter, poses, **filter.gating())
-=======
     return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags))
->>>>>>> main

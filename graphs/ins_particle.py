@@ -64,16 +64,10 @@ def ins_particle(
     control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
     prior = propagate_states(
         cloud,
-<<<<<<< HEAD
-        between_imu(last, control),
-        order=order,
-        noise=noise,
-        gravity=gravity,
-=======
         driving(last, control, reading),
         order=order,
         noise=noise,
->>>>>>> main
+        gravity=gravity,
         draws=f"{draws}.process",
         name="predict",
     )

@@ -15,31 +15,14 @@ from typing import Any
 
 import numpy as np
 
-<<<<<<< HEAD
-from flowgraph import Case, Stream, collect, delay, graph, latest
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.euler_ins import (
-    STATE,
-    euler_angles,
-    increment_variances,
-    navigation_belief,
-    update_pose_angles,
-)
-from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.models.unscented_ins import carried, far_points
-from flowgraph.blocks.scoring.cases import OnFlight, on_flight
-from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
-from flowgraph.blocks.scoring.tuning import with_imu
-=======
 from flowgraph import Case, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.models.euler_ins import STATE, increment_variances, update_pose_angles
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, FarPoints, on_measured_pose
->>>>>>> main
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -59,10 +42,10 @@ def ins_ukf_pose(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
-    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     points: SigmaPoints = FAR,
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -73,35 +56,22 @@ def ins_ukf_pose(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
-<<<<<<< HEAD
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
-    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | pose, name="control")
-    prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order, gravity),
-        noise=np.diag(increment_variances(noise)), space=STATE, points=far_points(12), name="predict",
-=======
     predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points, name="predict",
     )  # fmt: skip
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=predict,
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
         ),
->>>>>>> main
     )  # fmt: skip
 
 
-<<<<<<< HEAD
 @on_flight(ins_ukf_pose, "imu", told=with_imu)
-def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
-=======
-@on_flight(ins_ukf_pose, "imu")
 def for_flight(on: OnFlight, *, filter: EulerFilter, sigma: FarPoints) -> Case:
->>>>>>> main
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 
     Args:
@@ -113,8 +83,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter, sigma: FarPoints) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-<<<<<<< HEAD
-    return on_measured_pose(on, filter, poses, **filter.gating())
-=======
     return on_measured_pose(on, filter, poses, points=sigma.points(12))
->>>>>>> main

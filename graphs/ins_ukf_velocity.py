@@ -17,27 +17,11 @@ from typing import Annotated
 
 import numpy as np
 
-<<<<<<< HEAD
-from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
+from flowgraph import Case, DataError, Stream, graph
 from flowgraph.blocks.geometry.rotations import level
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.euler_ins import (
-    STATE,
-    euler_angles,
-    increment_variances,
-    navigation_belief,
-    start_gaussian,
-    with_heading,
-)
-from flowgraph.blocks.models.pose import between_imu
-=======
-from flowgraph import Case, DataError, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
-from flowgraph.blocks.metrics.errors import interpolate_pose
-from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian
->>>>>>> main
+from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian, with_heading
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerKalman, FarPoints
@@ -68,12 +52,9 @@ def ins_ukf_velocity(
     rate_noise: float,
     rate: str = "gyro",
     order: str = "zyx",
-<<<<<<< HEAD
-    gravity: tuple[float, float, float] = GRAVITY,
-=======
     points: tuple[SigmaPoints, SigmaPoints] = FAR,
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
->>>>>>> main
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
@@ -83,21 +64,13 @@ def ins_ukf_velocity(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
-<<<<<<< HEAD
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
-    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | motion, name="control")
-    prior = predict_unscented(
-        belief, between_imu(last, control), move=carried(order, gravity),
-        noise=np.diag(increment_variances(noise)), space=STATE, points=far_points(12), name="predict",
-=======
     predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points[0], name="predict",
->>>>>>> main
     )  # fmt: skip
     return euler_loop(
         imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=predict,
         update=lambda prior, control: update_camera_velocity(
             prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
@@ -113,15 +86,9 @@ def for_flight(
     rate: Annotated[str, named("source of the rate", RATES)] = "gyro",
     velocity_noise: Positive = 0.1,
     rate_noise: Positive | None = None,
-<<<<<<< HEAD
-    gated: Gated,
-    control: HeldControl,
-    scored: Scored,
-    started: Started,
-=======
     filter: EulerKalman = _REPORTS,
     sigma: FarPoints,
->>>>>>> main
+    started: Started,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
@@ -149,37 +116,20 @@ def for_flight(
             got="none" if truth is None else ", ".join(truth.leaves),
             fix="write --set start=unknown_yaw, or build the graph with a start of your own",
         )
-<<<<<<< HEAD
-    turn = begin.attitude
-    if not begin.tilted and not on.weightless:
-        force = on.first_up("imu", imu["specific_force"][imu.time >= begin.time])
-        turn = np.asarray(level(turn, force, xp=np))
-    tilt = 0.01 if begin.tilted else 0.1
-    first = start_gaussian(begin.position, turn, order=order, deviations=(0.01, tilt, 0.3, 0.02, 0.05))
-    return on.case(
-        euler_score(on, scored, order),
-        inputs=begin.inputs,
-        start=with_heading(first, begin.heading),
-        noise=factors.imu_noise(on),
-=======
-    first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
-    position, attitude = interpolate_pose(on.flight.truth, first)
+    turn, tilt = begin.attitude, 0.01
+    if not begin.tilted:
+        tilt = 0.1
+        if not on.weightless:
+            force = on.first_up("imu", imu["specific_force"][imu.time >= begin.time])
+            turn = np.asarray(level(turn, force, xp=np))
+    first = start_gaussian(begin.position, turn, order=filter.order, deviations=(0.01, tilt, 0.3, 0.02, 0.05))
     return filter.case(
         on,
-        start_gaussian(
-            position[0], attitude[0], order=filter.order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)
-        ),
->>>>>>> main
+        with_heading(first, begin.heading),
+        inputs=begin.inputs,
         mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
-<<<<<<< HEAD
-        order=order,
-        gravity=on.gravity,
-        held=control.held(on, begin.inputs["imu"]),
-        **gated.gating(),
-=======
         points=(sigma.points(12), sigma.points(6)),
->>>>>>> main
     )
