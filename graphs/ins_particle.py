@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, Stream, delay, graph, latest, merge
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.particle_ins import (
@@ -30,6 +30,7 @@ from flowgraph.blocks.models.spread import spread_states
 from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.tag_pose import poses_of
 
@@ -45,6 +46,7 @@ def ins_particle(
     noise: ImuNoise,
     R: Any,
     order: str = "zxy",
+    gravity: tuple[float, float, float] = GRAVITY,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     reading: str = "instant",
@@ -61,13 +63,14 @@ def ins_particle(
     `effective_sample_size` and `ancestors` at every pose.
     """
     cloud = delay(start, name="cloud")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | pose, name="control")
     prior = propagate_states(
         cloud,
         driving(last, control, reading),
         order=order,
         noise=noise,
+        gravity=gravity,
         draws=f"{draws}.process",
         name="predict",
     )
@@ -94,7 +97,7 @@ def ins_particle(
     }
 
 
-@on_flight(ins_particle, "imu", measured=None)
+@on_flight(ins_particle, "imu", told=with_imu, measured=None)
 def for_flight(
     on: OnFlight,
     *,

@@ -11,13 +11,14 @@ S. Russell, "Rao-Blackwellised particle filtering for dynamic Bayesian networks"
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, Series, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, delay, graph, latest, merge
 from flowgraph.blocks.geometry.rotations import level, to_matrix
-from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds
 from flowgraph.blocks.inertial.calibration import subtract_rest_bias
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import Held, stay
@@ -38,8 +39,12 @@ from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_mot
 from flowgraph.blocks.particles.resampling import draw_ancestors, take_ancestors
 from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, PoseAided, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.start import StartPose, turned
+from flowgraph.blocks.scoring.tuning import given, with_imu
 from flowgraph.blocks.signals import Cloud, Imu, Pose
+
+LEVEL = 0.1
+"""rad: a body that is tilted by less at the start stands level."""
 
 
 @graph
@@ -137,7 +142,7 @@ def rbpf_indoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_indoor, "imu", "vicon", measured=None)
+@on_flight(rbpf_indoor, "imu", "vicon", told=with_imu, measured=None)
 def for_flight(
     on: OnFlight,
     *,
@@ -149,46 +154,75 @@ def for_flight(
 ) -> Case:
     """Start and tune the filter for a flight with an IMU and a motion capture.
 
-    The start is the first measured position, and zero velocity. With an unknown yaw, roll and pitch are zero
-    and the yaw is uniform over the circle (a body that starts tilted needs unknown_yaw=False); else the
-    attitude is the mean that was measured at rest, or the first one, levelled with the specific force.
+    The start is the first measured position, and zero velocity. With an unknown yaw, which is what is taken
+    if nothing is said, the yaw is uniform over the circle, and roll and pitch are zero, or those of the first
+    pose where it is tilted; else the attitude is the mean that was measured at rest, or the first one,
+    levelled with the specific force.
 
     Args:
-        flight: with the streams `imu` and `vicon` (Pose).
-        unknown_yaw: whether nothing is known of the heading at first.
+        flight: with the streams `imu` and `vicon` (Pose). In place of `imu` it may have the thesis's unit:
+            `gyro` and `coordinate_acceleration`, with the same times.
+        unknown_yaw: True is start=unknown_yaw and False start=file, where `start` is left out.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. For real units as in
             `ins_eskf`: a data sheet knows nothing of vibration. The simulated one gets 3 and 2: what
             calibration leaves of a bias is no white noise, and particles need room to move after the first
             pose has left a few of them.
-        still: seconds at the start in which the body does not move; the flight's own, or 1 for `sim`, else 0.
+        still: seconds at the start in which the body does not move; told by the flight or its readings if
+            left out.
 
     Raises:
         DataError: where the flight lacks a stream.
         DeclarationError: for a setting that is out of range.
         UnknownNameError: for a scheme that is not there.
     """
-    imu, vicon = on.inputs.values()
+    imu, vicon = on.inputs["imu"], on.inputs["vicon"]
     info, simulated = on.flight.info, "position_noise" in on.flight.info
-    still = given(still, info.get("still", 1.0 if simulated else 0.0))
-    attitude = None if unknown_yaw else _first_attitude(on, imu, vicon, still)
+    still = given(still, info.get("still"))
+    still = rest_seconds(imu) if still is None else float(still)
+    begin = filter.pose(
+        on,
+        on.inputs,
+        position=vicon,
+        attitude=vicon,
+        usual="unknown_yaw" if unknown_yaw else "file",
+        rests=still,
+    )
+    still = max(still - (begin.time - int(imu.time[0])) * 1e-9, 0.0)
+    attitude, spread = begin.attitude, StartSpread()
+    if begin.unknown and to_matrix(attitude, xp=np)[2, 2] > math.cos(LEVEL):
+        attitude = None
+    elif begin.unknown:
+        spread = StartSpread(tilt=filter.measured(on)["attitude_noise"], heading=math.inf)
+    elif not begin.told:
+        attitude = _levelled(on, begin, still)
+        if filter.start_heading is not None:
+            attitude = turned(attitude, filter.start_heading)
     up = np.array([0.0, 0.0, 1.0]) if attitude is None else to_matrix(attitude, xp=np)[2]
-    place, spread = vicon["position"][0], StartSpread()
+    start = start_cloud(
+        cloud.particles, seed=cloud.seed, position=begin.position, attitude=attitude, spread=spread
+    )
     return on.case(
         filter.score(on, pose_errors, estimate="pose"),
-        start=start_cloud(cloud.particles, seed=cloud.seed, position=place, attitude=attitude, spread=spread),
+        inputs=begin.inputs,
+        start=start,
         noise=filter.imu_noise(on, (3.0, 2.0) if simulated else (15.0, 20.0)),
         **filter.measured(on),
         lever=info.get("vicon_lever", (0.0, 0.0, 0.0)),
+        gravity=on.gravity,
         still=still,
         up=tuple(up.tolist()),
-        held=control.held(on, imu),
+        held=control.held(on, begin.inputs["imu"], begin.inputs),
         **cloud.resampling(),
     )
 
 
-def _first_attitude(on: OnFlight, imu: Series, vicon: Series, still: float) -> np.ndarray:
+def _levelled(on: OnFlight, begin: StartPose, still: float) -> np.ndarray:
     """The mean attitude (4) measured at rest; without a rest the first one, levelled with the force."""
+    imu, vicon = begin.inputs["imu"], begin.inputs["vicon"]
     if still <= 0.0:
-        return np.asarray(level(vicon["attitude"][0], on.first_up("imu", imu["specific_force"]), xp=np))
+        if on.weightless:
+            return begin.attitude
+        return np.asarray(level(begin.attitude, on.first_up("imu", imu["specific_force"]), xp=np))
     seen = vicon["attitude"][vicon.time - vicon.time[0] <= round(still * 1e9)]
-    return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), seen[0], xp=np))
+    seen = seen[np.isfinite(seen).all(axis=-1)]
+    return np.asarray(dominant_eigenvector(seen.T @ seen / len(seen), begin.attitude, xp=np))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry.manifold import angle
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import (
     STATE,
@@ -45,7 +45,15 @@ __all__ = [
 
 @block
 def propagate_states(
-    cloud: StateCloud, imu: Imu, *, order: str, noise: ImuNoise, dt: float, draw: Any, xp: Any
+    cloud: StateCloud,
+    imu: Imu,
+    *,
+    order: str,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float] = GRAVITY,
+    dt: float,
+    draw: Any,
+    xp: Any,
 ) -> StateCloud:
     """Move each particle over `dt` seconds with one IMU reading and noises of its own.
 
@@ -56,12 +64,13 @@ def propagate_states(
         imu: the reading that holds over the step.
         order: "zxy" or "zyx".
         noise: continuous densities of what is drawn.
+        gravity: in the world, m/s^2.
     """
     x = cloud.state
     drawn = xp.asarray(draw.normal("process", (12, x.shape[0])), dtype=x.dtype).mT
     shake = drawn * xp.sqrt(xp.asarray(increment_variances(noise), dtype=x.dtype) * dt)
     turn, push = increments(x, imu, dt)
-    after = move(x, turn + shake[:, 0:3], push + shake[:, 3:6], dt, order=order, xp=xp)
+    after = move(x, turn + shake[:, 0:3], push + shake[:, 3:6], dt, order=order, gravity=gravity, xp=xp)
     biases = xp.concat([xp.zeros((x.shape[0], 9), dtype=x.dtype), shake[:, 6:12]], axis=-1)
     return cloud.replace(state=STATE.plus(after, biases, xp))
 

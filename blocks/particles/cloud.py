@@ -159,16 +159,19 @@ def start_cloud(
         attitude: (4,) unit quaternion, body to world, about which the particles are drawn with the spread's
             tilt and heading. Left out: roll and pitch zero, and the yaw uniform over the circle, one drawn in
             each of as many equal arcs.
-        spread: standard deviations.
+        spread: standard deviations. A heading of infinity is uniform over the circle in the same way.
     """
     draw = NumpyDraw("start_cloud", seed_words(seed), 0)
     n = particles
     if attitude is None:
-        half = math.pi * (np.arange(n) + draw.uniform("yaw", (n,))) / n
-        q = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)])
+        q = _about_the_vertical(n, draw)
     else:
         sigma = np.array([[spread.tilt], [spread.tilt], [spread.heading]])  # about world axes: on the left
+        even = math.isinf(spread.heading)
+        sigma[2] = 0.0 if even else sigma[2]
         turn = lanes.exponential(sigma * draw.normal("attitude", (3, n)), xp=np)
+        if even:
+            turn = lanes.multiply(_about_the_vertical(n, draw), turn, xp=np)
         q = lanes.multiply(turn, np.repeat(np.asarray(attitude, dtype=float)[:, None], n, axis=1), xp=np)
     covariance = lambda deviation: np.repeat(np.eye(3)[:, :, None] * deviation**2, n, axis=2)
     return Cloud(
@@ -180,3 +183,9 @@ def start_cloud(
         cross_covariance=np.zeros((3, 3, n)),
         position_covariance=covariance(spread.position),
     )
+
+
+def _about_the_vertical(n: int, draw: NumpyDraw) -> np.ndarray:
+    """Turns (4, n), one drawn in each of n equal arcs of the circle."""
+    half = math.pi * (np.arange(n) + draw.uniform("yaw", (n,))) / n
+    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)])
