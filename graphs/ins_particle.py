@@ -14,15 +14,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import PATIENCE
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.particle_ins import (
+    average_kernels,
     average_state,
+    correct_states,
     propagate_states,
     resample_states,
     start_states,
-    weigh_states,
 )
 from flowgraph.blocks.models.pose import between_imu
 from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
@@ -31,7 +33,7 @@ from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.tag_pose import poses_of
 
-_ROOM = EulerPose(gyro_factor=3.0, accelerometer_factor=3.0)
+_ROOM = EulerPose()
 
 
 @graph
@@ -45,7 +47,10 @@ def ins_particle(
     order: str = "zxy",
     factor: float = 1.0,
     resample_below: float = 0.5,
-    spread: float = 0.1,
+    spread: float = 0.0,
+    bandwidth: float | None = None,
+    gate: float | None = None,
+    patience: int = PATIENCE,
     scheme: str = "systematic",
     draws: str = "ins_particle",
 ):
@@ -60,9 +65,20 @@ def ins_particle(
     prior = propagate_states(
         cloud, between_imu(last, control), order=order, noise=noise, draws=f"{draws}.process", name="predict"
     )
-    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
+    kernels, innovation = correct_states(
+        prior,
+        pose,
+        order=order,
+        R=R,
+        factor=factor,
+        bandwidth=bandwidth,
+        gate=gate,
+        patience=patience,
+        at=pose,
+        name="update",
+    )
     fresh, size, ancestors = resample_states(
-        weighed,
+        kernels,
         below=resample_below,
         spread=spread,
         scheme=scheme,
@@ -71,7 +87,8 @@ def ins_particle(
     )
     cloud.feed(merge(fresh, prior, tie="left", name="next"))
     last.feed(control)
-    mean = average_state(merge(weighed, prior, tie="left", name="now"))
+    mean = merge(average_kernels(kernels), average_state(prior), tie="left", name="now")
+    collect(innovation, "innovation")
     return {
         "belief": navigation_belief(mean, order=order),
         "angles": euler_angles(mean, order=order),
@@ -86,8 +103,8 @@ def for_flight(
     *,
     cloud: Particles,
     filter: EulerPose = _ROOM,
-    inflate: Positive = 2.0,
-    spread: NotNegative = 0.1,
+    inflate: Positive = 1.0,
+    spread: NotNegative = 0.0,
 ) -> Case:
     """Start the particles around the first measured pose of a flight, at rest and without biases.
 

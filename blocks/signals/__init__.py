@@ -53,6 +53,7 @@ from flowgraph.blocks.signals.particles import (
     PlaneBelief,
     PlaneCloud,
     StateCloud,
+    StateKernels,
     Weights,
 )
 from flowgraph.blocks.signals.sensors import (
@@ -121,6 +122,7 @@ __all__ = [
     "LogLikelihood",
     "Ancestors",
     "StateCloud",
+    "StateKernels",
     "OutdoorCloud",
     "PlaneCloud",
     "PlaneBelief",

@@ -13,6 +13,7 @@ __all__ = [
     "LogLikelihood",
     "Ancestors",
     "StateCloud",
+    "StateKernels",
     "OutdoorCloud",
     "PlaneCloud",
     "PlaneBelief",
@@ -63,6 +64,14 @@ class StateCloud(Signal):
 
     log_weight: Array = real("particles")
     state: Array = real("particles", 15)
+
+
+class StateKernels(Signal):
+    """Weighted Gaussians over the states of a `StateCloud`: their means, and the covariance that all have."""
+
+    log_weight: Array = real("particles")
+    state: Array = real("particles", 15)
+    covariance: Array = real(15, 15)
 
 
 class OutdoorCloud(Signal):
