@@ -3,11 +3,11 @@
     x = (p, e, v, b_g, b_a)      each particle is one
 
 The same process and observation model as `ins_ukf_pose`, without a Gaussian: every tick moves the particles
-with the IMU and noises drawn for each; a tick with a pose weighs them, and resamples when few carry the
-weight.
+with the IMU and noises drawn for each; a tick with a pose corrects kernels about them, weighs these, and
+draws new particles of them. A cloud that has lost track grows until the pose is plausible.
 
 Source: the course's particle filter on AprilTags; equations: `blocks/models/euler_ins.py`,
-`blocks/particles/states.py`.
+`blocks/models/particle_ins.py` and `blocks/particles/guided.py`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ from flowgraph.blocks.models.particle_ins import (
     start_states,
 )
 from flowgraph.blocks.models.pose import between_imu
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, on_flight
+from flowgraph.blocks.particles.lost import depletion
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, on_flight
 from flowgraph.blocks.scoring.euler import EulerPose, on_measured_pose
-from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.settings import NotNegative, Positive, Share
 from flowgraph.blocks.signals import Imu, PoseMeasurement, StateCloud
 from flowgraph.graphs.tag_pose import poses_of
-
-_ROOM = EulerPose()
 
 
 @graph
@@ -57,7 +56,7 @@ def ins_particle(
     """Particle filter of 15 states with Euler angles: IMU control, camera pose.
 
     Collected: `belief` (the particles' mean and covariance, before resampling) and `angles` at every tick;
-    `effective_sample_size` and `ancestors` at every pose.
+    `innovation` of the cloud, `effective_sample_size`, `depleted` and `ancestors` at every pose.
     """
     cloud = delay(start, name="cloud")
     last = delay(Imu.at_rest(), name="last_control")
@@ -89,6 +88,7 @@ def ins_particle(
     last.feed(control)
     mean = merge(average_kernels(kernels), average_state(prior), tie="left", name="now")
     collect(innovation, "innovation")
+    collect(depletion(size, numbers=15), "depleted")
     return {
         "belief": navigation_belief(mean, order=order),
         "angles": euler_angles(mean, order=order),
@@ -102,18 +102,23 @@ def for_flight(
     on: OnFlight,
     *,
     cloud: Particles,
-    filter: EulerPose = _ROOM,
-    inflate: Positive = 1.0,
+    filter: EulerPose,
+    gated: Gated,
+    inflate: Positive = 1.2,
     spread: NotNegative = 0.0,
+    bandwidth: Share | None = None,
 ) -> Case:
     """Start the particles around the first measured pose of a flight, at rest and without biases.
 
     Args:
         flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and `vicon`.
         particles: how many; the course asks for 5,000.
-        gyro_factor, accelerometer_factor: on the densities of the flight's IMU: particles need room.
-        inflate: on all standard deviations of the measured pose.
-        spread: by what part of the cloud's deviations the copies are shaken apart.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
+        inflate: on all standard deviations of the measured pose: a few particles are less sure than many.
+        spread: by what part of the sample's range, over particles^(1/15), copies are shaken apart; 0.2 is
+            Gordon's.
+        bandwidth: of the kernels in deviations of the cloud; Silverman's if left out, and 0 draws the
+            particles without a look at the pose.
 
     Raises:
         DataError: where the flight lacks a stream.
@@ -127,5 +132,7 @@ def for_flight(
         start=lambda first: start_states(cloud.particles, first, seed=cloud.seed),
         factor=inflate**2,
         spread=spread,
+        bandwidth=bandwidth,
+        **gated.gating(),
         **cloud.resampling(),
     )

@@ -32,9 +32,18 @@ from flowgraph.blocks.models.euler_ins import (
     move,
     pose_noise,
 )
-from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of, verdict
+from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.lost import verdict
 from flowgraph.blocks.particles.resampling import ancestor_index, roughening
-from flowgraph.blocks.signals import Ancestors, Gaussian, Imu, KalmanInnovation, PoseMeasurement, StateCloud, StateKernels
+from flowgraph.blocks.signals import (
+    Ancestors,
+    Gaussian,
+    Imu,
+    KalmanInnovation,
+    PoseMeasurement,
+    StateCloud,
+    StateKernels,
+)
 
 __all__ = [
     "average_kernels",
@@ -89,7 +98,7 @@ def correct_states(
 ) -> tuple[Any, tuple[StateKernels, KalmanInnovation]]:
     """Correct kernels about the particles with a measured pose, and weigh them: `particles.guided`.
 
-    z = (p, e) + noise, which is linear in the state. A cloud that has lost track (`guided.verdict`) first has
+    z = (p, e) + noise, which is linear in the state. A cloud that has lost track (`lost.verdict`) first has
     its variances of position, angles and velocity made larger, so that the pose becomes plausible; biases
     keep what they know. A pose that the gate refuses, or of which nothing can be made, leaves the particles
     as they are, kernels without width. Fires with the pose.
@@ -101,7 +110,7 @@ def correct_states(
         R, factor: as in `euler_ins.update_pose_angles`.
         bandwidth: of the kernels in deviations of the cloud, 0 to 1; 0 is the bootstrap filter, and
             Silverman's if left out.
-        gate, patience: as in `guided.verdict`.
+        gate, patience: as in `lost.verdict`.
 
     Returns:
         The kernels, and the innovation of the whole cloud.
@@ -208,7 +217,9 @@ def average_kernels(kernels: StateKernels, *, xp: Any) -> Gaussian:
 
 def _average(log_weight: Array, x: Array, xp: Any) -> Gaussian:
     mean = _mean(log_weight, x, xp)
-    return Gaussian(mean=mean, covariance=spread_of(x, xp.exp(log_weight), mean, space=STATE, xp=xp).covariance)
+    return Gaussian(
+        mean=mean, covariance=spread_of(x, xp.exp(log_weight), mean, space=STATE, xp=xp).covariance
+    )
 
 
 def _mean(log_weight: Array, x: Array, xp: Any) -> Array:

@@ -25,24 +25,12 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import accepts, masked
 from flowgraph.blocks.particles.cloud import log_sum_exp
-from flowgraph.blocks.signals import KalmanInnovation
+from flowgraph.blocks.particles.lost import FARTHEST
 
-__all__ = ["BELIEVED", "FARTHEST", "Kernels", "Spread", "corrected", "drawn", "silverman", "spread_of", "verdict"]
-
-BELIEVED = 1.0 - 1e-6
-"""The probability with which a measurement is as near as an honest cloud expects; beyond, a cloud is lost."""
-
-FARTHEST = 1e14
-"""The nis of a measurement of which nothing can be made: it would leave no digit of the covariance."""
-
-_GROWN = 16.0
-"""By how much, at least, the variances of a lost cloud grow at a measurement."""
+__all__ = ["Kernels", "Spread", "corrected", "drawn", "silverman", "spread_of"]
 
 
 class Spread(NamedTuple):
@@ -72,41 +60,6 @@ def spread_of(x: Array, weight: Array, mean: Array, *, space: StateSpace, xp: An
     apart = space.minus(x, mean[None, :], xp)
     V = (apart * weight[:, None]).mT @ apart
     return Spread(apart, 0.5 * (V + V.mT))
-
-
-def verdict(
-    refused: Array, residual: Array, S: Array, present: Array, *, gate: float | None, patience: int, xp: Any
-) -> tuple[Array, KalmanInnovation, Array]:
-    """Whether a cloud, taken for the Gaussian of its mean and covariance, believes a measurement.
-
-    Without a gate it does, but one that is too far off to be expected shows that the cloud has lost track.
-    With one, the first `patience` refusals in a row are taken for outliers; the next one is believed, and the
-    cloud has lost track. A cloud that has must grow before it is corrected.
-
-    Args:
-        refused: how many measurements were refused in a row.
-        residual: measured minus predicted by the cloud's mean (m), 0 where an entry is missing.
-        S: the covariance of it (m, m).
-        present: (m) which entries there are.
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest nis.
-        patience: how many refusals in a row are taken for outliers.
-
-    Returns:
-        Refusals in a row; the innovation; and the factor by which the variances must grow: 1, or where track
-        was lost the nis over its mean, at least 16.
-    """
-    nis = xp.sum(residual * xp.linalg.solve(S, residual[:, None])[:, 0])
-    parts = xp.sum(xp.astype(present, S.dtype))
-    usable = nis < FARTHEST
-    near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable
-    more = refused + 1.0
-    late = usable if gate is None else usable & (more > float(patience))
-    lost = late & ~near
-    accepted = near | lost
-    ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
-    grow = xp.where(lost, xp.maximum(ratio, 0.0 * ratio + _GROWN), 1.0)
-    innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
-    return xp.where(accepted, 0.0, more), innovation, grow
 
 
 def corrected(

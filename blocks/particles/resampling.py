@@ -26,7 +26,15 @@ from flowgraph import Array, Scalar, block
 from flowgraph.blocks.signals import Ancestors, Cloud
 from flowgraph.errors import UnknownNameError
 
-__all__ = ["MOST_PARTICLES", "SCHEMES", "ancestor_index", "draw_ancestors", "quantised", "roughening", "take_ancestors"]
+__all__ = [
+    "MOST_PARTICLES",
+    "SCHEMES",
+    "ancestor_index",
+    "draw_ancestors",
+    "quantised",
+    "roughening",
+    "take_ancestors",
+]
 
 WEIGHT_BITS = 38
 """A weight is a multiple of 2^-38: n times the sum of all then fits int64, for n up to 2^24."""

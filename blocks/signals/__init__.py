@@ -48,6 +48,7 @@ from flowgraph.blocks.signals.motion import (
 from flowgraph.blocks.signals.particles import (
     Ancestors,
     Cloud,
+    Depletion,
     LogLikelihood,
     OutdoorCloud,
     PlaneBelief,
@@ -121,6 +122,7 @@ __all__ = [
     "Weights",
     "LogLikelihood",
     "Ancestors",
+    "Depletion",
     "StateCloud",
     "StateKernels",
     "OutdoorCloud",

@@ -12,6 +12,7 @@ __all__ = [
     "Weights",
     "LogLikelihood",
     "Ancestors",
+    "Depletion",
     "StateCloud",
     "StateKernels",
     "OutdoorCloud",
@@ -57,6 +58,12 @@ class Ancestors(Signal):
 
     index: Array = integer("particles")
     resampled: Array = boolean()
+
+
+class Depletion(Signal):
+    """Whether too few particles have the weight for the cloud to stand for a belief."""
+
+    depleted: Array = boolean()
 
 
 class StateCloud(Signal):
