@@ -35,7 +35,7 @@ from flowgraph.blocks.particles.cloud import (
     start_cloud,
     weights,
 )
-from flowgraph.blocks.particles.lost import believe_pose, depletion, judge_pose
+from flowgraph.blocks.particles.lost import believe_pose, depletion, judge_pose, pose_within_reach
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.particles.resampling import draw_ancestors, take_ancestors
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, PoseAided, on_flight
@@ -74,6 +74,7 @@ def update(
     draws: str,
 ):
     """Correct the cloud with a pose that is believed: likelihood of position times likelihood of attitude."""
+    measured = pose_within_reach(measured, name="reach")
     corrected, position = correct_motion(
         prior, measured, noise=position_noise, lever=lever, at=measured, name="kalman"
     )
@@ -84,7 +85,7 @@ def update(
         prior, measured, **noises, gate=gate, patience=patience, at=measured, name="judge"
     )
     posterior = believe_pose(
-        prior, weighed, measured, innovation, lost, **noises, anew=gate is not None, draws=draws,
+        prior, weighed, measured, innovation, lost, **noises, draws=draws,
         at=measured, name="believe",
     )  # fmt: skip
     return posterior, innovation
@@ -135,8 +136,8 @@ def rbpf_indoor(
     The pose is averaged before resampling, which only adds noise to it. A `reading` of the IMU is of an
     "instant" or the "mean" since the one before, as for `ekf`.
 
-    With a gate, a pose that is too far from the cloud is refused; after `patience` refusals in a row the
-    cloud starts anew about the next one. Without, only a pose is refused of which nothing can be made.
+    With a gate, a pose that is too far from the cloud is refused. After `patience` such poses in a row the
+    cloud starts anew about the next one, without a gate too (`lost.verdict`).
 
     Collected: at every tick `pose`, and `belief`, with its covariance, where that is asked for; at every
     measured pose the `innovation` of the cloud, `effective_sample_size`, `depleted` and `ancestors` (whether

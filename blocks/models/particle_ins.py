@@ -115,7 +115,7 @@ def correct_states(
     Returns:
         The kernels, and the innovation of the whole cloud.
 
-    State: how many poses were refused in a row.
+    State: how many poses were too far off in a row.
     """
     x, kind = cloud.state, cloud.state.dtype
     n = x.shape[0]
@@ -129,7 +129,7 @@ def correct_states(
     H, noise = masked(xp.asarray(np.eye(6, 15), dtype=kind), noise, present, xp)
     S = H @ spread.covariance @ H.mT + noise
     count, innovation, grow = verdict(
-        state, xp.where(present, residual, 0.0), S, present, gate=gate, patience=patience, xp=xp
+        state, xp.where(present, residual, 0.0), S, present, gate=gate, patience=patience, at_once=True, xp=xp
     )
     believed = innovation.accepted
     moving = xp.asarray(np.outer(_MOVING, _MOVING), dtype=kind)

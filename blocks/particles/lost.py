@@ -27,7 +27,9 @@ __all__ = [
     "depletion_remarks",
     "judge_pose",
     "mixture",
+    "pose_within_reach",
     "verdict",
+    "within_reach",
 ]
 
 BELIEVED = 1.0 - 1e-6
@@ -39,6 +41,8 @@ FARTHEST = 1e14
 GROWN = 16.0
 """By how much, at least, the variances of a lost cloud grow at a measurement."""
 
+_REACH = 1e12
+
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -49,39 +53,64 @@ def mixture(weight: Array, residuals: Array, *, xp: Any) -> tuple[Array, Array]:
     return mean, (apart * weight) @ apart.mT
 
 
+def within_reach(x: Array, *, xp: Any) -> Array:
+    """Numbers within +-1e12, that their squares be finite; beyond, in any unit here, no measurement lies."""
+    return xp.maximum(xp.minimum(x, 0.0 * x + _REACH), 0.0 * x - _REACH)
+
+
+@block
+def pose_within_reach(pose: Pose, *, xp: Any) -> Pose:
+    """A pose whose position is `within_reach`."""
+    return Pose(position=within_reach(pose.position, xp=xp), attitude=pose.attitude)
+
+
 def verdict(
-    refused: Array, residual: Array, S: Array, present: Array, *, gate: float | None, patience: int, xp: Any
+    state: Array,
+    residual: Array,
+    S: Array,
+    present: Array,
+    *,
+    gate: float | None,
+    patience: int,
+    at_once: bool = False,
+    xp: Any,
 ) -> tuple[Array, KalmanInnovation, Array]:
     """Whether a cloud, taken for the Gaussian of its mean and covariance, believes a measurement.
 
-    Without a gate it does, but one that is too far off to be expected shows that the cloud has lost track.
-    With one, the first `patience` refusals in a row are taken for outliers; the next one is believed, and the
-    cloud has lost track. A cloud that has must grow, or start anew, before it is corrected.
+    The first `patience` measurements in a row that are too far off are taken for outliers: with a gate they
+    are refused, without one they are believed all the same. The next one shows that the cloud has lost track, and so on until one is near.
+    Such a cloud must grow, or start anew, before it is corrected.
 
     Args:
-        refused: how many measurements were refused in a row.
+        state: how many measurements were too far off in a row.
         residual: measured minus predicted by the cloud's mean (m), 0 where an entry is missing.
         S: the covariance of it (m, m).
         present: (m) which entries there are.
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest nis.
-        patience: how many refusals in a row are taken for outliers.
+        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest nis;
+            `BELIEVED` if left out.
+        patience: how many in a row are taken for outliers.
+        at_once: whether, without a gate, already the first shows that the cloud has lost track.
 
     Returns:
-        Refusals in a row; the innovation; and the factor by which the variances must grow: 1, or where track
-        was lost the nis over its mean, at least 16.
+        How many were too far off in a row; the innovation; and the factor by which the variances must grow:
+        1, or where track was lost the nis over its mean, at least 16.
     """
+    most = 1e10 * xp.sqrt(
+        xp.sum(S * xp.eye(S.shape[-1], dtype=S.dtype), axis=-1)
+    )  # its nis is beyond FARTHEST
+    residual = xp.maximum(xp.minimum(residual, most), -most)
     nis = xp.sum(residual * xp.linalg.solve(S, residual[:, None])[:, 0])
     parts = xp.sum(xp.astype(present, S.dtype))
     usable = nis < FARTHEST
     near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable
-    more = refused + 1.0
-    late = usable if gate is None else usable & (more > float(patience))
-    lost = late & ~near
-    accepted = near | lost
+    far = xp.where(near, 0.0, state + 1.0)
+    wait = 0.0 if gate is None and at_once else float(patience)
+    lost = usable & (far > wait)
+    accepted = usable if gate is None else near | lost
     ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
     grow = xp.where(lost, xp.maximum(ratio, 0.0 * ratio + GROWN), 1.0)
     innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
-    return xp.where(accepted, 0.0, more), innovation, grow
+    return far, innovation, grow
 
 
 @block
@@ -99,8 +128,8 @@ def judge_pose(
 ) -> tuple[Any, tuple[KalmanInnovation, Scalar]]:
     """The innovation (m, world; rad, body) of a whole cloud at a measured pose, and whether to believe it.
 
-    Its covariance is that of the particles' innovations, the mean of their own and the noise. Without a gate
-    all is believed of which anything can be made; with one, see `verdict`.
+    Its covariance is that of the particles' innovations, the mean of their own and the noise. Whether it
+    is believed is as in `verdict`.
 
     Args:
         cloud: at the time of the pose.
@@ -111,14 +140,15 @@ def judge_pose(
     Returns:
         The innovation; and 1 where the cloud has lost track and must start anew, else 0.
 
-    State: how many poses were refused in a row.
+    State: how many poses were too far off in a row.
     """
     weight = xp.exp(cloud.log_weight)
-    apart = pose.position[:, None] - cloud.position
+    point = cloud.position
     if lever != _ORIGIN:
-        apart = apart - lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=apart.dtype), xp=xp)
+        point = point + lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=point.dtype), xp=xp)
     turn = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
-    mean, S = mixture(weight, xp.concat([apart, turn], axis=0), xp=xp)
+    mean, S = mixture(weight, xp.concat([-point, turn], axis=0), xp=xp)
+    mean = mean + xp.concat([pose.position, 0.0 * pose.position])
     own = xp.sum(cloud.position_covariance * weight, axis=-1)
     wide = xp.asarray(np.eye(3, 6), dtype=S.dtype)
     noise = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
@@ -126,8 +156,7 @@ def judge_pose(
     count, innovation, grow = verdict(
         state, mean, 0.5 * (S + S.mT), mean == mean, gate=gate, patience=patience, xp=xp
     )
-    lost = 0.0 * grow if gate is None else xp.astype(grow > 1.0, grow.dtype)
-    return count, (innovation, lost)
+    return count, (innovation, xp.astype(grow > 1.0, grow.dtype))
 
 
 @judge_pose.init
@@ -146,7 +175,6 @@ def believe_pose(
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = _ORIGIN,
-    anew: bool,
     draw: Any,
     xp: Any,
 ) -> Cloud:
@@ -154,17 +182,15 @@ def believe_pose(
     was lost.
 
     A new cloud is equally weighted and lies about the measured pose, with its noise; the velocities stay, 4
-    times as uncertain. Draws `anew` (3, n) where there can be one.
+    times as uncertain. Draws `anew` (3, n).
 
     Args:
         prior, posterior: before and after the correction.
         pose: the measurement; innovation, lost: what `judge_pose` found.
         position_noise, attitude_noise, lever: as there.
-        anew: whether a cloud can start anew, which takes a gate.
     """
     believed = innovation.accepted
-    if anew:
-        posterior = _anew(prior, posterior, pose, lost, position_noise, attitude_noise, lever, draw, xp)
+    posterior = _anew(prior, posterior, pose, lost, position_noise, attitude_noise, lever, draw, xp)
     chosen = {
         name: xp.where(believed, getattr(posterior, name), getattr(prior, name)) for name in prior._fields
     }
