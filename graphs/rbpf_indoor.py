@@ -81,11 +81,11 @@ def update(
     attitude = attitude_likelihood(prior, measured, noise=attitude_noise, at=measured, name="attitude")
     weighed = reweight(corrected, position, attitude, name="weights")
     noises = {"position_noise": position_noise, "attitude_noise": attitude_noise, "lever": lever}
-    innovation, lost = judge_pose(
+    innovation, grow = judge_pose(
         prior, measured, **noises, gate=gate, patience=patience, at=measured, name="judge"
     )
     posterior = believe_pose(
-        prior, weighed, measured, innovation, lost, **noises, draws=draws,
+        prior, weighed, measured, innovation, grow, **noises, draws=draws,
         at=measured, name="believe",
     )  # fmt: skip
     return posterior, innovation

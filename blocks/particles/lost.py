@@ -78,7 +78,8 @@ def verdict(
     """Whether a cloud, taken for the Gaussian of its mean and covariance, believes a measurement.
 
     The first `patience` measurements in a row that are too far off are taken for outliers: with a gate they
-    are refused, without one they are believed all the same. The next one shows that the cloud has lost track, and so on until one is near.
+    are refused, without one they are believed all the same. The next one shows that the cloud has lost track,
+    and so on until one is near.
     Such a cloud must grow, or start anew, before it is corrected.
 
     Args:
@@ -138,7 +139,8 @@ def judge_pose(
         gate, patience: as in `verdict`.
 
     Returns:
-        The innovation; and 1 where the cloud has lost track and must start anew, else 0.
+        The innovation; and 1, or where the cloud has lost track and must start anew the factor by which its
+        variances must grow.
 
     State: how many poses were too far off in a row.
     """
@@ -156,7 +158,7 @@ def judge_pose(
     count, innovation, grow = verdict(
         state, mean, 0.5 * (S + S.mT), mean == mean, gate=gate, patience=patience, xp=xp
     )
-    return count, (innovation, xp.astype(grow > 1.0, grow.dtype))
+    return count, (innovation, grow)
 
 
 @judge_pose.init
@@ -170,7 +172,7 @@ def believe_pose(
     posterior: Cloud,
     pose: Pose,
     innovation: KalmanInnovation,
-    lost: Scalar,
+    grow: Scalar,
     *,
     position_noise: float,
     attitude_noise: float,
@@ -181,16 +183,16 @@ def believe_pose(
     """The corrected cloud where the pose is believed, the prior where it is not, and a new one where track
     was lost.
 
-    A new cloud is equally weighted and lies about the measured pose, with its noise; the velocities stay, 4
-    times as uncertain. Draws `anew` (3, n).
+    A new cloud is equally weighted and lies about the measured pose, with its noise; the velocities stay,
+    with variances `grow` times as large. Draws `anew` (3, n).
 
     Args:
         prior, posterior: before and after the correction.
-        pose: the measurement; innovation, lost: what `judge_pose` found.
+        pose: the measurement; innovation, grow: what `judge_pose` found.
         position_noise, attitude_noise, lever: as there.
     """
     believed = innovation.accepted
-    posterior = _anew(prior, posterior, pose, lost, position_noise, attitude_noise, lever, draw, xp)
+    posterior = _anew(prior, posterior, pose, grow, position_noise, attitude_noise, lever, draw, xp)
     chosen = {
         name: xp.where(believed, getattr(posterior, name), getattr(prior, name)) for name in prior._fields
     }
@@ -198,7 +200,7 @@ def believe_pose(
 
 
 def _anew(
-    prior: Cloud, posterior: Cloud, pose: Pose, lost: Array, position_noise: float, attitude_noise: float,
+    prior: Cloud, posterior: Cloud, pose: Pose, grow: Array, position_noise: float, attitude_noise: float,
     lever: tuple[float, float, float], draw: Any, xp: Any,
 ) -> Cloud:  # fmt: skip
     kind, n = prior.position.dtype, prior.log_weight.shape[-1]
@@ -212,11 +214,11 @@ def _anew(
         attitude=q,
         velocity=prior.velocity,
         position=p,
-        velocity_covariance=GROWN * prior.velocity_covariance,
+        velocity_covariance=grow * prior.velocity_covariance,
         cross_covariance=0.0 * prior.cross_covariance,
         position_covariance=one * position_noise**2 + 0.0 * prior.position_covariance,
     )
-    gone = lost > 0.5
+    gone = grow > 1.0
     return Cloud(
         **{name: xp.where(gone, getattr(fresh, name), getattr(posterior, name)) for name in prior._fields}
     )
@@ -236,9 +238,12 @@ def depletion(effective_sample_size: Scalar, *, numbers: int) -> Depletion:
 IN_A_ROW = 3
 """Depleted updates in a row from which on a cloud does not cover what it should."""
 
+OFTEN = 0.2
+"""Or this part of all updates."""
+
 
 def depletion_remarks(name: str, depleted: Series) -> tuple[str, ...]:
-    """A note where a cloud was depleted `IN_A_ROW` times or more in a row.
+    """A note where a cloud was depleted `IN_A_ROW` times or more in a row, or `OFTEN`.
 
     Args:
         name: of the cloud; empty where there is one.
@@ -248,7 +253,7 @@ def depletion_remarks(name: str, depleted: Series) -> tuple[str, ...]:
     edges = np.diff(np.concatenate([[0], there, [0]]).astype(int))
     first = np.flatnonzero(edges > 0)
     rows = np.flatnonzero(edges < 0) - first
-    if not len(rows) or rows.max() < IN_A_ROW:
+    if not len(rows) or (rows.max() < IN_A_ROW and rows.sum() < max(IN_A_ROW, OFTEN * len(there))):
         return ()
     k = int(rows.argmax())
     seconds = (depleted.time[first[k]] - depleted.time[0]) * 1e-9
