@@ -16,18 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.geometry.rotations import level, to_matrix
 from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds
 from flowgraph.blocks.inertial.calibration import subtract_rest_bias
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import Held, stay
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.spread import spread_cloud
 from flowgraph.blocks.particles.cloud import (
     attitude_likelihood,
     average_attitude,
     average_pose,
+    cloud_belief,
     dominant_eigenvector,
     effective_sample_size,
     propagate_attitude,
@@ -35,12 +37,13 @@ from flowgraph.blocks.particles.cloud import (
     start_cloud,
     weights,
 )
+from flowgraph.blocks.particles.lost import believe_pose, depletion, judge_pose, pose_within_reach
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.particles.resampling import draw_ancestors, take_ancestors
-from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, PoseAided, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Particles, PoseAided, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative
 from flowgraph.blocks.scoring.start import StartPose, turned
-from flowgraph.blocks.scoring.tuning import given, with_imu
+from flowgraph.blocks.scoring.tuning import given, reading_of, with_imu
 from flowgraph.blocks.signals import Cloud, Imu, Pose
 
 LEVEL = 0.1
@@ -72,13 +75,26 @@ def update(
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float],
+    gate: float | None,
+    patience: int,
+    draws: str,
 ):
-    """Correct the cloud with a pose: likelihood of position times likelihood of attitude."""
+    """Correct the cloud with a pose that is believed: likelihood of position times likelihood of attitude."""
+    measured = pose_within_reach(measured, name="reach")
     corrected, position = correct_motion(
         prior, measured, noise=position_noise, lever=lever, at=measured, name="kalman"
     )
     attitude = attitude_likelihood(prior, measured, noise=attitude_noise, at=measured, name="attitude")
-    return reweight(corrected, position, attitude, name="weights")
+    weighed = reweight(corrected, position, attitude, name="weights")
+    noises = {"position_noise": position_noise, "attitude_noise": attitude_noise, "lever": lever}
+    innovation, grow = judge_pose(
+        prior, measured, **noises, gate=gate, patience=patience, at=measured, name="judge"
+    )
+    posterior = believe_pose(
+        prior, weighed, measured, innovation, grow, **noises, draws=draws,
+        at=measured, name="believe",
+    )  # fmt: skip
+    return posterior, innovation
 
 
 @graph
@@ -90,11 +106,12 @@ def resample(cloud: Stream[Cloud], *, below: float, scheme: str, draws: str):
 
 
 @graph
-def average(cloud: Stream[Cloud]):
-    """The weighted expectation of the pose."""
+def average(cloud: Stream[Cloud], *, covariance: bool = True):
+    """The weighted expectation of the pose, and its covariance."""
     weight = weights(cloud)
     attitude = average_attitude(cloud, weight, name="attitude")
-    return average_pose(cloud, weight, attitude, name="pose")
+    pose = average_pose(cloud, weight, attitude, name="pose")
+    return (pose, cloud_belief(cloud, weight, pose, name="spread")) if covariance else (pose, None)
 
 
 @graph
@@ -110,8 +127,12 @@ def rbpf_indoor(
     gravity: tuple[float, float, float] = GRAVITY,
     still: float = 0.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    reading: str = "instant",
+    gate: float | None = None,
+    patience: int = PATIENCE,
     resample_below: float = 0.5,
     scheme: str = "systematic",
+    covariance: bool = True,
     draws: str = "rbpf_indoor",
     held: Held | None = None,
 ):
@@ -119,26 +140,40 @@ def rbpf_indoor(
 
     Every tick predicts to now; a tick with a pose also updates and resamples. There are no bias states: when
     the body stands `still` for some seconds at first, what the IMU reads then is its bias and is subtracted.
-    The pose is averaged before resampling, which only adds noise to it. Collected: `pose` at every tick;
-    `effective_sample_size` and `ancestors` (whether it resampled, and the index of each new particle) at
-    every measured pose.
+    The pose is averaged before resampling, which only adds noise to it. A `reading` of the IMU is of an
+    "instant" or the "mean" since the one before, as for `ekf`.
+
+    With a gate, a pose that is too far from the cloud is refused. After `patience` such poses in a row the
+    cloud starts anew about the next one, without a gate too (`lost.verdict`).
+
+    Collected: at every tick `pose`, and `belief`, with its covariance, where that is asked for; at every
+    measured pose the `innovation` of the cloud, `effective_sample_size`, `depleted` and `ancestors` (whether
+    it resampled, and the index of each new particle).
     """
     if still > 0.0:
         imu = subtract_rest_bias(imu, seconds=still, up=up, gravity=-gravity[2], name="calibrate")
     cloud = delay(start, name="cloud")
-    control = latest(imu, init=Imu.at_rest(gravity), name="control")
-    prior = predict(cloud, control, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | vicon, name="control")
+    drive = driving(last, control, reading)
+    prior = predict(cloud, drive, noise=noise, gravity=gravity, draws=f"{draws}.attitude", at=imu | vicon)
     if held is not None:
         prior = prior if held.longest is None else stay(cloud, prior, longest=held.longest)
         prior = spread_cloud(prior, imu, held=held, draws=f"{draws}.held")
-    posterior = update(
-        prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever
-    )
+    posterior, innovation = update(
+        prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate,
+        patience=patience, draws=f"{draws}.anew",
+    )  # fmt: skip
     fresh, size, ancestors = resample(
         posterior, below=resample_below, scheme=scheme, draws=f"{draws}.resample"
     )
     cloud.feed(merge(fresh, prior, tie="left", name="next"))
-    pose = average(merge(posterior, prior, tie="left", name="now"))
+    last.feed(control)
+    pose, belief = average(merge(posterior, prior, tie="left", name="now"), covariance=covariance)
+    if covariance:
+        collect(belief, "belief")
+    collect(innovation, "innovation")
+    collect(depletion(size, numbers=3), "depleted")
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
@@ -150,6 +185,8 @@ def for_flight(
     unknown_yaw: bool = True,
     filter: PoseAided,
     control: HeldControl,
+    gated: Gated,
+    covariance: bool = True,
     still: NotNegative | None = None,
 ) -> Case:
     """Start and tune the filter for a flight with an IMU and a motion capture.
@@ -167,6 +204,7 @@ def for_flight(
             `ins_eskf`: a data sheet knows nothing of vibration. The simulated one gets 3 and 2: what
             calibration leaves of a bias is no white noise, and particles need room to move after the first
             pose has left a few of them.
+        covariance: whether to give one too, and score it.
         still: seconds at the start in which the body does not move; told by the flight or its readings if
             left out.
 
@@ -202,7 +240,7 @@ def for_flight(
         cloud.particles, seed=cloud.seed, position=begin.position, attitude=attitude, spread=spread
     )
     return on.case(
-        filter.score(on, pose_errors, estimate="pose"),
+        filter.score(on, pose_errors, estimate="belief" if covariance else "pose"),
         inputs=begin.inputs,
         start=start,
         noise=filter.imu_noise(on, (3.0, 2.0) if simulated else (15.0, 20.0)),
@@ -212,6 +250,9 @@ def for_flight(
         still=still,
         up=tuple(up.tolist()),
         held=control.held(on, begin.inputs["imu"], begin.inputs),
+        reading=reading_of(on.flight),
+        covariance=covariance,
+        **gated.gating(),
         **cloud.resampling(),
     )
 

@@ -20,7 +20,16 @@ import numpy.typing as npt
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.inertial.alignment import StartSpread
-from flowgraph.blocks.signals import Attitude, Cloud, Imu, LogLikelihood, Pose, PoseEstimate, Weights
+from flowgraph.blocks.signals import (
+    Attitude,
+    Cloud,
+    Imu,
+    LogLikelihood,
+    Pose,
+    PoseBelief,
+    PoseEstimate,
+    Weights,
+)
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 __all__ = [
@@ -30,6 +39,7 @@ __all__ = [
     "dominant_eigenvector",
     "effective_sample_size",
     "log_sum_exp",
+    "cloud_belief",
     "propagate_attitude",
     "reweight",
     "start_cloud",
@@ -138,6 +148,32 @@ def average_pose(cloud: Cloud, weights: Weights, attitude: Attitude) -> PoseEsti
         position=cloud.position @ weights.weight,
         velocity=cloud.velocity @ weights.weight,
         attitude=attitude.attitude,
+    )
+
+
+@block
+def cloud_belief(cloud: Cloud, weights: Weights, pose: PoseEstimate, *, xp: Any) -> PoseBelief:
+    """The pose with its covariance (9, 9): that of the particles' means, and the mean of their covariances.
+
+        cov = sum(w_i (d_i d_i^T + P_i)),   d_i = (p_i - p, v_i - v, Log(q^-1 q_i))
+
+    in the order of `PoseBelief`. P_i, of position and velocity, is the particle's own; an attitude that is
+    drawn has none.
+    """
+    q, w = pose.attitude, weights.weight
+    turn = -lanes.rotation_vectors_to(cloud.attitude, q, xp=xp)  # Log(q^-1 q_i) = -Log(q_i^-1 q)
+    apart = xp.concat(
+        [cloud.position - pose.position[:, None], cloud.velocity - pose.velocity[:, None], turn], axis=0
+    )
+    P, C, V = (
+        xp.sum(part * w, axis=-1)
+        for part in (cloud.position_covariance, cloud.cross_covariance, cloud.velocity_covariance)
+    )
+    own = xp.concat([xp.concat([P, C], axis=-1), xp.concat([C.mT, V], axis=-1)], axis=-2)
+    wide = xp.asarray(np.eye(6, 9), dtype=q.dtype)
+    total = (apart * w) @ apart.mT + wide.mT @ own @ wide
+    return PoseBelief(
+        position=pose.position, velocity=pose.velocity, attitude=q, covariance=0.5 * (total + total.mT)
     )
 
 
