@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.roots import covariance_root
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     increment_variances,

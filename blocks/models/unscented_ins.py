@@ -22,7 +22,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.kalman.filters import correct
-from flowgraph.blocks.kalman.roots import covariance_root
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
