@@ -75,7 +75,7 @@ def turn_by_gyro(  # type: ignore[no-untyped-def]
 
 
 @turn_by_gyro.init
-def _(attitude: Any, gyro: Any) -> Any:
+def _(attitude: Any, gyro: Any, **_: Any) -> Any:
     return np.zeros(3)
 
 

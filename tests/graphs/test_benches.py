@@ -86,6 +86,16 @@ def test_ese650_has_a_row_a_set_and_filter_beside_what_was_published(tmp_path):
         ese650(data=str(tmp_path), filters="kalmann")
 
 
+def test_ese650_draws_filter_accelerometer_and_gyroscope_against_the_truth(tmp_path):
+    for n in (1, 2):
+        course(tmp_path, n, seconds=4.0)
+    report = ese650(data=str(tmp_path), engine="python")
+    assert set(report.figures) == {"set1.png", "set2.png"}
+    report.figures["set2.png"](tmp_path / "set2.png")
+    assert (tmp_path / "set2.png").stat().st_size > 20_000
+    assert ese650(data=str(tmp_path), engine="python", filters="imu_calibration").figures == {}
+
+
 def test_data_come_from_the_option_the_environment_or_beside(trials, tmp_path, monkeypatch):
     assert len(recordings(str(trials), "broad", "*.mat")) == 2
     assert len(recordings(str(trials / "broad"), "broad", "*.mat")) == 2
