@@ -75,14 +75,13 @@ def _each(one: Any, problem: Problem, run: Drawn, update: Callable[[np.ndarray],
 
 def _stone_soup(updater: str, **settings: Any) -> Callable[[Problem, Drawn], Found]:
     def run_it(problem: Problem, run: Drawn) -> Found:
-        from stonesoup.models.measurement.nonlinear import (
-            NonLinearGaussianMeasurement,  # with the extra `bench`
-        )
-        from stonesoup.types.array import StateVector, StateVectors  # with the extra `bench`
-        from stonesoup.types.detection import Detection  # with the extra `bench`
-        from stonesoup.types.hypothesis import SingleHypothesis  # with the extra `bench`
-        from stonesoup.types.prediction import GaussianStatePrediction  # with the extra `bench`
-        from stonesoup.updater import kalman  # with the extra `bench`
+        # a peer, which is there with the extra `bench` alone
+        from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
+        from stonesoup.types.array import StateVector, StateVectors
+        from stonesoup.types.detection import Detection
+        from stonesoup.types.hypothesis import SingleHypothesis
+        from stonesoup.types.prediction import GaussianStatePrediction
+        from stonesoup.updater import kalman
 
         class Ranges(NonLinearGaussianMeasurement):
             ndim_meas = 2
