@@ -13,6 +13,8 @@ from rooms before it in this list, never from one after it, and nothing goes in 
       unscented    sigma points
       inertial     an inertial unit: prediction, aiding, alignment, calibration
       particles    clouds, resampling, Rao-Blackwell
+      statespace   how something moves and what is seen of it: models, for every method
+      filtering    a filter of any model by any method
     What is estimated
       vision       cameras and tags, and the poses that they give
       models       points, poses and inertial navigation, for each of the methods
@@ -41,6 +43,8 @@ __all__ = [
     "unscented",
     "inertial",
     "particles",
+    "statespace",
+    "filtering",
     "vision",
     "models",
     "orientation",

@@ -22,6 +22,7 @@ from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.graphs.roll_pitch import roll_pitch
 from flowgraph.graphs.tag_pose import tag_pose
+from flowgraph.graphs.tracker import tracker
 from flowgraph.graphs.ukf import ukf
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "roll_pitch",
     "gyro_integration",
     "particle",
+    "tracker",
     "outdoor_eskf",
     "rbpf_outdoor",
 ]

@@ -12,19 +12,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.euler_ins import (
-    euler_angles,
-    navigation_belief,
-    predict_extended,
-    update_pose_angles,
-)
-from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.models.euler_ins import predict_extended, update_pose_angles
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
+from flowgraph.graphs.euler_loop import euler_loop
 from flowgraph.graphs.tag_pose import poses_of
 
 
@@ -38,6 +33,7 @@ def ins_ekf_pose(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -48,26 +44,15 @@ def ins_ekf_pose(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
-    prior = predict_extended(
-        belief, driving(last, control, reading), order=order, noise=noise, name="predict"
-    )
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update_pose_angles(
-        prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
-    )
-    if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
-    belief.feed(posterior)
-    last.feed(control)
-    collect(innovation, "innovation")
-    return {
-        "belief": navigation_belief(posterior, order=order),
-        "angles": euler_angles(posterior, order=order),
-    }
+    return euler_loop(
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=lambda belief, drive: predict_extended(
+            belief, drive, order=order, noise=noise, name="predict"
+        ),
+        update=lambda prior, _: update_pose_angles(
+            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
+        ),
+    )  # fmt: skip
 
 
 @on_flight(ins_ekf_pose, "imu")
@@ -82,6 +67,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
-    return on_measured_pose(on, filter, poses, held=held, **filter.gating())
+    return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags))

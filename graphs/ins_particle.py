@@ -44,6 +44,7 @@ def ins_particle(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     reading: str = "instant",
     resample_below: float = 0.5,
     spread: float = 0.1,
@@ -67,7 +68,7 @@ def ins_particle(
         draws=f"{draws}.process",
         name="predict",
     )
-    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, at=pose, name="update")
+    weighed = weigh_states(prior, pose, order=order, R=R, factor=factor, lever=lever, at=pose, name="update")
     fresh, size, ancestors = resample_states(
         weighed,
         below=resample_below,

@@ -15,23 +15,21 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.euler_ins import (
-    STATE,
-    euler_angles,
-    increment_variances,
-    navigation_belief,
-    update_pose_angles,
-)
-from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.models.euler_ins import STATE, increment_variances, update_pose_angles
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
-from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
+from flowgraph.blocks.scoring.euler import EulerFilter, FarPoints, on_measured_pose
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints
+from flowgraph.graphs.euler_loop import euler_loop
 from flowgraph.graphs.tag_pose import poses_of
+
+FAR = far_points(12)
+"""Of the state and the IMU's twelve noises."""
 
 
 @graph
@@ -44,6 +42,8 @@ def ins_ukf_pose(
     R: Any,
     order: str = "zxy",
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    points: SigmaPoints = FAR,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -54,32 +54,21 @@ def ins_ukf_pose(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | pose, name="control")
-    drive = driving(last, control, reading)
-    prior = predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)),
-        space=STATE, points=far_points(12), name="predict",
+    predict = lambda belief, drive: predict_unscented(
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        points=points, name="predict",
     )  # fmt: skip
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update_pose_angles(
-        prior, pose, order=order, R=R, factor=factor, gate=gate, name="update"
-    )
-    if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
-    belief.feed(posterior)
-    last.feed(control)
-    collect(innovation, "innovation")
-    return {
-        "belief": navigation_belief(posterior, order=order),
-        "angles": euler_angles(posterior, order=order),
-    }
+    return euler_loop(
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=predict,
+        update=lambda prior, _: update_pose_angles(
+            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
+        ),
+    )  # fmt: skip
 
 
 @on_flight(ins_ukf_pose, "imu")
-def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
+def for_flight(on: OnFlight, *, filter: EulerFilter, sigma: FarPoints) -> Case:
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 
     Args:
@@ -91,5 +80,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    held = filter.held(on, on.inputs["imu"])
-    return on_measured_pose(on, filter, poses, held=held, **filter.gating())
+    return on_measured_pose(on, filter, poses, points=sigma.points(12))

@@ -17,26 +17,26 @@ from typing import Annotated
 
 import numpy as np
 
-from flowgraph import Case, DataError, Stream, collect, delay, graph, latest
+from flowgraph import Case, DataError, Stream, graph
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.metrics.errors import interpolate_pose
-from flowgraph.blocks.models.euler_ins import (
-    STATE,
-    euler_angles,
-    increment_variances,
-    navigation_belief,
-    start_gaussian,
-)
-from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
-from flowgraph.blocks.scoring.euler import EulerOrder, ScaledFactors, euler_score
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.euler import EulerKalman, FarPoints
 from flowgraph.blocks.scoring.settings import Positive, named
-from flowgraph.blocks.scoring.tuning import given, reading_of
+from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.blocks.vision.camera import Mount
+from flowgraph.graphs.euler_loop import euler_loop
+
+FAR = (far_points(12), far_points(6))
+"""Of the state and the IMU's noises, and of the state and those of the camera's velocity."""
+
+_REPORTS = EulerKalman(order="zyx")
 
 
 @graph
@@ -51,6 +51,7 @@ def ins_ukf_velocity(
     rate_noise: float,
     rate: str = "gyro",
     order: str = "zyx",
+    points: tuple[SigmaPoints, SigmaPoints] = FAR,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -61,29 +62,18 @@ def ins_ukf_velocity(
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
-    belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | motion, name="control")
-    drive = driving(last, control, reading)
-    prior = predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)),
-        space=STATE, points=far_points(12), name="predict",
+    predict = lambda belief, drive: predict_unscented(
+        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        points=points[0], name="predict",
     )  # fmt: skip
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update_camera_velocity(
-        prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
-        rate_noise=rate_noise, rate=rate, gate=gate, name="update",
+    return euler_loop(
+        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        predict=predict,
+        update=lambda prior, control: update_camera_velocity(
+            prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
+            rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, name="update",
+        ),
     )  # fmt: skip
-    if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
-    belief.feed(posterior)
-    last.feed(control)
-    collect(innovation, "innovation")
-    return {
-        "belief": navigation_belief(posterior, order=order),
-        "angles": euler_angles(posterior, order=order),
-    }
 
 
 @on_flight(ins_ukf_velocity, "imu", "motion")
@@ -91,20 +81,16 @@ def for_flight(
     on: OnFlight,
     *,
     rate: Annotated[str, named("source of the rate", RATES)] = "gyro",
-    order: EulerOrder = "zyx",
-    factors: ScaledFactors,
     velocity_noise: Positive = 0.1,
     rate_noise: Positive | None = None,
-    gated: Gated,
-    control: HeldControl,
-    scored: Scored,
+    filter: EulerKalman = _REPORTS,
+    sigma: FarPoints,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
     Args:
         flight: with the streams `imu` and `motion`, a truth, and the `mount` of the camera in its info.
         rate: gyro (the report's eq. 10) or camera (eq. 9).
-        order: zxy (the course's) or zyx (the report's).
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
 
@@ -122,16 +108,14 @@ def for_flight(
         )
     first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
     position, attitude = interpolate_pose(on.flight.truth, first)
-    return on.case(
-        euler_score(on, scored, order),
-        start=start_gaussian(position[0], attitude[0], order=order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)),
-        noise=factors.imu_noise(on),
+    return filter.case(
+        on,
+        start_gaussian(
+            position[0], attitude[0], order=filter.order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)
+        ),
         mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
-        order=order,
-        reading=reading_of(on.flight),
-        held=control.held(on, on.inputs["imu"]),
-        **gated.gating(),
+        points=(sigma.points(12), sigma.points(6)),
     )

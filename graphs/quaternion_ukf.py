@@ -34,6 +34,7 @@ from flowgraph.blocks.orientation.accelerometer import (
 )
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -110,7 +111,7 @@ def for_flight(
     kappa: float = 0.0,
     mean: str = "kraft",
     still: NotNegative | None = None,
-    frozen: NotNegative = 0.15,
+    frozen: NotNegative | None = None,
     gated: Gated,
     scored: Scored,
 ) -> Case:
@@ -124,8 +125,14 @@ def for_flight(
         alpha, beta, kappa: of that set.
         mean: of quaternions, "kraft" or "markley".
         still: seconds at the start in which the body rests; told by the flight or its readings if left out.
-        frozen: after so many seconds of one level a gyroscope is taken to read nothing; 0 for never.
+        frozen: after so many seconds of one level a gyroscope is taken to read nothing; 0 for never, and what
+            the flight says of its unit if left out: never, for nearly all.
     """
+    after = float(given(frozen, on.flight.info.get("gyro_freezes", 0.0)))
+    if after > 0.0:
+        on.note(
+            "assumed", f"imu: a gyroscope that keeps one level for {after:g} s has frozen, and reads nothing"
+        )
     begin = orientation_start(on.flight, on.inputs["imu"], still)
     return on.case(
         scored.score(on, orientation_errors, innovations=False),
@@ -137,6 +144,6 @@ def for_flight(
         points=SigmaPoints(alpha, beta, kappa, mean) if weighted else SigmaPoints(1.0, 0.0, 0.0, mean),
         still=begin.still,
         up=begin.up,
-        frozen=frozen,
+        frozen=after,
         **gated.gating(),
     )

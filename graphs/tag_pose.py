@@ -15,6 +15,7 @@ import numpy as np
 from flowgraph import Case, DataError, Flight, Result, Series, Stream, delay, graph, simulate
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.euler import MEASURED
 from flowgraph.blocks.scoring.settings import Positive, named, positive
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Pose, PoseMeasurement, Tags
@@ -104,9 +105,16 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
     Raises:
         DataError: where it has none of them, or no image shows a tag.
     """
-    if "pose" in flight.streams:
-        return flight.need(graph_name, "pose")["pose"]
-    if "tags" in flight.streams:
+    source = next((name for name in MEASURED if name in flight.streams), None)
+    if source is None:
+        raise DataError(
+            f"this flight lacks what {graph_name} needs",
+            path=flight.name,
+            expected="one of the streams pose, tags and vicon",
+            got=", ".join(flight.streams) or "no stream",
+            fix="choose another flight, or build the graph with your own sources",
+        )
+    if source == "tags":
         case = tag_pose.case(flight, tags=tags)
         found = simulate(case.graph, case.inputs)["pose"]
         if not len(found):
@@ -118,18 +126,12 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
                 fix="check the map's ids, or the setting tags",
             )
         return Series(found.time, found.values, name="pose")
-    if "vicon" in flight.streams:
-        vicon = flight.need(graph_name, "vicon")["vicon"]
-        pose: Any = vicon.values
-        assert isinstance(pose, Pose)
-        return Series(vicon.time, as_measurements(pose.position, pose.attitude), name="pose")
-    raise DataError(
-        f"this flight lacks what {graph_name} needs",
-        path=flight.name,
-        expected="one of the streams pose, tags and vicon",
-        got=", ".join(flight.streams) or "no stream",
-        fix="choose another flight, or build the graph with your own sources",
-    )
+    measured = flight.need(graph_name, source)[source]
+    if source == "pose":
+        return measured
+    pose: Any = measured.values
+    assert isinstance(pose, Pose)
+    return Series(measured.time, as_measurements(pose.position, pose.attitude), name="pose")
 
 
 __all__ = ["PoseMeasurement", "poses_of", "tag_pose"]

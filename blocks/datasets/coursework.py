@@ -16,7 +16,8 @@ from flowgraph.blocks.geometry.euler import (
     matrix_from_angles,
     wrapped,
 )
-from flowgraph.blocks.metrics.errors import interpolate_pose
+from flowgraph.blocks.metrics.truth import interpolate_pose, known
+from flowgraph.blocks.signals import PoseMeasurement
 from flowgraph.blocks.vision.camera import Camera
 from flowgraph.blocks.vision.mapping import frames_of
 from flowgraph.blocks.vision.pnp import measure, rotation_of
@@ -25,6 +26,7 @@ from flowgraph.errors import DataError
 __all__ = ["estimate_covariances", "estimate_pose"]
 
 _COURSE = Parameters.of_the_course()
+_DOUBTFUL = 2.0  # px
 
 
 def estimate_pose(
@@ -39,7 +41,9 @@ def estimate_pose(
     Args:
         packet: with `id` and `p1` to `p4` (2 x n px), as in studentdataN.mat; one tag may come without axes.
         parameters: map, camera and mount.
-        camera: another camera, such as `parameters.camera.rectified()`.
+        camera: of the image. If left out, its corners are taken as those of a raw or of a rectified image,
+            whichever reprojects better. Two tags or more tell; one alone does not, and its camera should be
+            named, or `near`.
         near: the (position (3, 1), angles (3, 1)) of the packet before, which decides between two poses that
             explain few tags about equally well.
 
@@ -54,15 +58,20 @@ def estimate_pose(
     before = None
     if near is not None:
         before = np.ravel(near[0]), matrix_from_angles(np.ravel(near[1]), order="zxy", xp=np)
-    pose = measure(
-        ids,
-        corners,
-        tag_map=parameters.tag_map,
-        camera=parameters.camera if camera is None else camera,
-        mount=parameters.mount,
-        near=before,
-    )
-    if pose is None:
+    cameras = [camera] if camera is not None else [parameters.camera, parameters.camera.rectified()]
+
+    def seen_by(cameras: list[Camera], *, reject: bool) -> list[tuple[PoseMeasurement, Camera]]:
+        found = [
+            measure(
+                ids, corners, tag_map=parameters.tag_map, camera=c, mount=parameters.mount, near=before,
+                reject=reject,
+            )
+            for c in cameras
+        ]  # fmt: skip
+        return [(pose, c) for pose, c in zip(found, cameras, strict=True) if pose is not None]
+
+    found = seen_by(cameras, reject=False)
+    if not found:
         raise DataError(
             "no pose: no tag of the map is seen",
             path="packet.id",
@@ -70,6 +79,12 @@ def estimate_pose(
             got=str(ids.tolist()),
             fix="pass over packets without tags",
         )
+    if min(float(pose.error) for pose, _ in found) > _DOUBTFUL:  # of neither: a tag may be taken for another
+        found = seen_by(cameras, reject=True)
+    fit = lambda one: (-int(one[0].tags), float(one[0].error))
+    if before is not None and int(found[0][0].tags) == 1:
+        fit = lambda one: (-1, float(np.linalg.norm(one[0].position - before[0])))
+    ((pose, _),) = seen_by([min(found, key=fit)[1]], reject=True)
     angles = angles_from_matrix(rotation_of(pose.attitude), order="zxy", xp=np)
     return pose.position.reshape(3, 1), np.asarray(angles).reshape(3, 1)
 
@@ -78,8 +93,8 @@ def estimate_covariances(filename: str | Path, *, parameters: str | Path | None 
     """R (6, 6): the covariance of measured minus true (x, y, z, roll, pitch, yaw) over a flight, m and rad.
 
     R = sum of r r^T / (n - 1), about zero and not about the mean: what the measurement is off by always
-    belongs to its error. The motion capture is interpolated at the stamps; packets outside it, and those
-    without tags, are left out. Angles are Z-X-Y, their differences wrapped.
+    belongs to its error. The motion capture is interpolated at the stamps; packets outside it or in its gaps,
+    and those without tags, are left out. Angles are Z-X-Y, their differences wrapped.
 
     Raises:
         DataError: when fewer than two packets can be compared.
@@ -96,7 +111,7 @@ def estimate_covariances(filename: str | Path, *, parameters: str | Path | None 
         if pose is None:
             continue
         near = pose.position, rotation_of(pose.attitude)
-        if truth is None or not truth.time[0] <= tags_time <= truth.time[-1]:
+        if truth is None or not known(truth, np.array([tags_time]))[0]:
             continue
         p, q = interpolate_pose(truth, np.array([tags_time]))
         a, b = (np.asarray(angles_from_quaternion(x, order="zxy", xp=np)) for x in (pose.attitude, q[0]))

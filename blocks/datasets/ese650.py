@@ -40,10 +40,14 @@ from flowgraph.blocks.signals import Attitude, Imu, ImuCounts
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["DATA_SHEET", "LATE", "NOISE", "SETTINGS", "load", "sets_in"]
+__all__ = ["DATA_SHEET", "FREEZES", "LATE", "NOISE", "SETTINGS", "load", "sets_in"]
 
 LATE = -0.01
 """What is added to the stamps of the motion capture, s, when nothing else is said."""
+
+FREEZES = 0.15
+"""s: after so long at one level the gyroscope of these recordings has stopped measuring, as it does for a
+second or two when it is knocked."""
 
 NOISE = ImuNoise(gyro=0.01, accelerometer=0.05, gyro_bias=1e-3, accelerometer_bias=1e-2)
 """Densities of the order of what the unit's readings at rest show."""
@@ -78,7 +82,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
     Returns:
         A `Flight`. truth: `Attitude` of the motion capture, where it saw the body. info: `imu_noise`,
-        `calibration` (`CountsCalibration`), `calibrated_by` (the numbers of the sets), `absent`.
+        `calibration` (`CountsCalibration`), `calibrated_by` (the numbers of the sets), `gyro_freezes` (s, see
+        `FREEZES`), `absent`.
 
     Raises:
         DataError: a file is missing or cut off, a field is missing or of another shape, a matrix is no
@@ -113,6 +118,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     columns = {"gyro": reading.gyro, "specific_force": reading.specific_force}
     made.add("imu", str(folder / f"imuRaw{n}.mat"), counts.time, columns, Imu)
     made.info.update(calibration=calibration, calibrated_by=by)
+    made.info["gyro_freezes"] = FREEZES
     made.info["imu_noise"] = imu_noise(given, "ese650", made.notes, NOISE)
     source = f"sets {', '.join(map(str, by))}" if by else "the data sheet"
     made.notes.append(note("info", f"imu: calibrated by {source}"))

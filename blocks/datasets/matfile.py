@@ -46,18 +46,26 @@ def read_mat(file: Path, fields: Mapping[str, tuple[int | None, ...]]) -> dict[s
     return {name: _array(file, name, content.get(name), shape) for name, shape in fields.items()}
 
 
-def read_structs(file: Path, *names: str) -> dict[str, Any]:
-    """The variables of a .mat file, structs as dictionaries; `names` must be among them.
+def read_structs(file: Path, *names: str, also: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The variables of a .mat file, structs as dictionaries: `names`, which must be there, and `also`.
 
     Raises:
         DataError: the file is missing, cut off or no .mat file, or lacks a variable.
     """
-    found = _content(file, list(names), simplify_cells=True)
+    found = _content(file, list(names), also, simplify_cells=True)
     return {name: value for name, value in found.items() if not name.startswith("__")}
 
 
-def columns_of(content: Mapping[str, Any], name: str, file: Path, columns: int | None = None) -> np.ndarray:
-    """A variable as float64: (n,), or (n, columns) finite numbers, a single row included.
+def columns_of(
+    content: Mapping[str, Any],
+    name: str,
+    file: Path,
+    columns: int | None = None,
+    *,
+    fix: str = "mend or delete the row",
+    gaps: bool = False,
+) -> np.ndarray:
+    """A variable as float64: (n,), or (n, columns) numbers, a single row included; finite but for `gaps`.
 
     Raises:
         DataError: naming file, variable and the first bad row.
@@ -76,18 +84,18 @@ def columns_of(content: Mapping[str, Any], name: str, file: Path, columns: int |
             fix="this may be a file of another family",
         )
     bad = ~np.isfinite(x if columns is None else x.sum(axis=1))
-    if bad.any():
+    if bad.any() and not gaps:
         raise DataError(
             f"field {name!r} holds a value that is not finite",
             path=f"{file}: {name}, row {int(np.flatnonzero(bad)[0]) + 1}",
             expected="finite numbers",
             got=f"NaN or infinity in {int(bad.sum())} rows",
-            fix="mend or delete the row",
+            fix=fix,
         )
     return x
 
 
-def _content(file: Path, names: list[str], **how: Any) -> dict[str, Any]:
+def _content(file: Path, names: list[str], also: tuple[str, ...] = (), **how: Any) -> dict[str, Any]:
     if not file.is_file():
         raise DataError(
             f"{file.name} is missing",
@@ -101,7 +109,7 @@ def _content(file: Path, names: list[str], **how: Any) -> dict[str, Any]:
     try:
         content = content_of(file, most=2**40)
         _check_parts(content)
-        found: dict[str, Any] = loadmat(io.BytesIO(content), variable_names=names, **how)
+        found: dict[str, Any] = loadmat(io.BytesIO(content), variable_names=[*names, *also], **how)
         held = [name for name, _, _ in whosmat(io.BytesIO(content))] if set(names) - set(found) else []
     except NotImplementedError:
         raise DataError(

@@ -9,7 +9,8 @@
 Files differ, and this is what they do: a file may have `drpy` in place of `omg`; a packet with one tag has a
 plain number as `id` and corners of one axis; a packet without tags has empty arrays, or no such fields; a
 file of one packet holds a struct in place of an array of structs; the first packets may precede the first row
-of vicon; stamps may repeat. The angles of vicon are Z-X-Y, its rates are taken as those of the body.
+of vicon, of which some may be NaN, or there is no vicon; stamps may repeat. The angles of vicon are Z-X-Y,
+its rates are taken as those of the body.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.datasets.malformed import MALFORMED, Records
 from flowgraph.blocks.datasets.matfile import read_structs
 from flowgraph.blocks.datasets.parameters import Parameters, parse_parameters
 from flowgraph.blocks.datasets.shape import (
@@ -30,6 +32,7 @@ from flowgraph.blocks.datasets.shape import (
     imu_noise,
     known,
     number,
+    present,
     split_argument,
     stream_settings,
 )
@@ -48,6 +51,7 @@ __all__ = ["NOISE", "SETTINGS", "load", "packet_tags", "packets", "vicon_rows"]
 SETTINGS: Mapping[str, str] = {
     "images": "auto, raw or rectified: whether corners are of distorted images; auto takes what fits better",
     "most_tags": "room for tags in an image",
+    **MALFORMED,
     **NOISE_SETTINGS,
     **stream_settings("imu", "tags", "truth", only=("time_offset", "every")),
 }
@@ -57,6 +61,7 @@ NOISE = ImuNoise(gyro=0.01, accelerometer=0.1, gyro_bias=5e-4, accelerometer_bia
 """Densities for the course's quadrotor, whose frame vibrates."""
 
 _CORNERS = ("p1", "p2", "p3", "p4")
+_MEND = "mend the packet, or leave it out: malformed=skip"
 
 
 def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
@@ -68,7 +73,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         settings: any of `SETTINGS`.
 
     Returns:
-        A `Flight`; truth: `MotionTruth`, in which the packets before and after are not covered. info:
+        A `Flight`; truth: `MotionTruth`, in which the packets before and after are not covered, and masked
+        where a row of vicon is not finite; None without a motion capture. info:
         `camera` (rectified, if the images are), `mount`, `tag_map`, `imu_noise`.
 
     Raises:
@@ -76,7 +82,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         DeclarationError, UnknownNameError: for settings.
     """
     file, beside = split_argument(argument, "studentdata:FILE[:PARAMETERS]")
-    content = read_structs(file, "data", "time", "vicon")
+    content = read_structs(file, "data", also=("time", "vicon"))
     parameters = Parameters.of_the_course() if beside is None else parse_parameters(beside)
     return flight_of(content, parameters, file, settings or {})
 
@@ -88,7 +94,8 @@ def flight_of(
     given: Mapping[str, str | float],
     noise: ImuNoise | None = None,
 ) -> Flight:
-    """The flight of the variables `data`, `time` and `vicon`; `file` is what messages call them.
+    """The flight of the variables `data` and, where there is one, of the motion capture, `time` and `vicon`;
+    `file` is what messages call them.
 
     The unit's noise is `noise` where it is known.
     """
@@ -99,40 +106,46 @@ def flight_of(
     notes += parameters.notes
     found = packets(content["data"], file)
     room = int(number(given, "most_tags", 108, "studentdata", positive=True))
-    seconds = np.array([_numbers(p, "t", 1, file, k)[0] for k, p in enumerate(found, start=1)])
-    rate_name = "omg" if "omg" in found[0] else "drpy"
+    rate_name = "omg" if any("omg" in p for p in found) else "drpy"
     if rate_name == "drpy":
         notes.append(note("assumed", f"{file.name}: drpy is taken for omg"))
-    gyro = np.array([_numbers(p, rate_name, 3, file, k) for k, p in enumerate(found, start=1)])
-    force = np.array([_numbers(p, "acc", 3, file, k) for k, p in enumerate(found, start=1)])
-    frames = [packet_tags(p, f"{file}: data, packet {k}") for k, p in enumerate(found, start=1)]
-    for k, (ids, _) in enumerate(frames, start=1):
-        if len(ids) > room:
-            raise DataError(
-                "a packet has more tags than there is room for",
-                path=f"{file}: data, packet {k}",
-                expected=f"at most {room}",
-                got=str(len(ids)),
-                fix="raise most_tags",
-            )
+    records = Records(given, "studentdata")
+    times: list[float] = []
+    readings: list[np.ndarray | None] = []
+    frames: list[Any] = []
+    for k, packet in enumerate(found, start=1):
+        stamp = records.read(_numbers, packet, ("t",), 1, file, k)
+        if stamp is None:
+            continue
+        times.append(stamp[0])
+        readings.append(records.read(_numbers, packet, (rate_name, "acc"), 3, file, k))
+        frames.append(records.read(_tags, packet, room, file, k))
+    notes += records.said(file.name, len(found))
+    seconds = np.array(times)
     keep, more = strictly_later(seconds, "data", file)
     notes += more
-    imu = Series.from_seconds(seconds[keep], Imu(gyro=gyro[keep], specific_force=force[keep]), name="imu")
-    made.take(imu, f"{file}: data")
-    kept = [f for f, k in zip(frames, keep, strict=True) if k]
+    rows = [k for k in np.flatnonzero(keep).tolist() if readings[k] is not None]
+    read = np.array([readings[k] for k in rows]).reshape(-1, 6)
+    imu = Imu(gyro=read[:, :3], specific_force=read[:, 3:])
+    made.take(Series.from_seconds(seconds[rows], imu, name="imu"), f"{file}: data")
+    rows = [k for k in np.flatnonzero(keep).tolist() if frames[k] is not None]
     camera = parameters.camera
-    if any(len(ids) for ids, _ in kept):
-        made.take(tags_series(imu.time, kept, room=room), f"{file}: data")
+    if any(len(frames[k][0]) for k in rows):
+        kept = [frames[k] for k in rows]
+        stamps = Series.from_seconds(seconds[rows], seconds[rows]).time
+        made.take(tags_series(stamps, kept, room=room), f"{file}: data")
         camera, said = _camera(images, parameters, kept)
         notes.append(note("info" if images != "auto" else "assumed", said))
     else:
         notes.append(note("info", f"{file.name}: no packet has tags"))
-    truth, more = _truth(content, file)
-    notes += more
-    made.take(truth, f"{file}: vicon")
-    early = int((made.streams["imu"].time < truth.time[0]).sum())
-    if early:
-        notes.append(note("info", f"{file.name}: {early} packets precede the first row of vicon"))
+    truth = _truth(content, file, made)
+    if truth is None:
+        notes.append(note("info", f"{file.name}: no motion capture, and no score"))
+    else:
+        made.take(truth, f"{file}: vicon")
+        early = int((made.streams["imu"].time < truth.time[0]).sum())
+        if early:
+            notes.append(note("info", f"{file.name}: {early} packets precede the first row of vicon"))
     made.info.update(
         camera=camera,
         mount=parameters.mount,
@@ -180,25 +193,46 @@ def packet_tags(packet: Mapping[str, Any], where: str) -> tuple[np.ndarray, np.n
             path=where,
             expected=f"p1 to p4 of 2 x {ids.size} pixels, for {ids.size} ids",
             got=", ".join(f"{n}: {np.shape(packet[n])}" for n in _CORNERS if n in packet) + f" ({error})",
-            fix="mend the packet, or leave it out",
+            fix=_MEND,
         ) from error
     return names.astype(int), corners.transpose(2, 0, 1)
 
 
-def _numbers(packet: Mapping[str, Any], name: str, size: int, file: Path, row: int) -> np.ndarray:
-    try:
-        x = np.asarray(packet[name], dtype=float).ravel()
-        if x.size != size or not np.isfinite(x).all():
-            raise ValueError
-    except (KeyError, TypeError, ValueError):
+def _tags(packet: Mapping[str, Any], room: int, file: Path, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """`packet_tags`, for which there is room."""
+    where = f"{file}: data, packet {row}"
+    ids, corners = packet_tags(packet, where)
+    if len(ids) > room:
         raise DataError(
-            f"field {name!r} of a packet is missing or malformed",
-            path=f"{file}: data, packet {row}",
-            expected=f"{size} finite number{'s' * (size > 1)}",
-            got=repr(packet.get(name, "no such field"))[:60],
-            fix="mend the packet, or leave it out",
-        ) from None
-    return x
+            "a packet has more tags than there is room for",
+            path=where,
+            expected=f"at most {room}",
+            got=str(len(ids)),
+            fix="raise most_tags",
+        )
+    return ids, corners
+
+
+def _numbers(
+    packet: Mapping[str, Any], names: tuple[str, ...], size: int, file: Path, row: int
+) -> np.ndarray:
+    """The numbers of these fields, `size` each, one after the other."""
+    found = []
+    for name in names:
+        try:
+            x = np.asarray(packet[name], dtype=float).ravel()
+            if x.size != size or not np.isfinite(x).all():
+                raise ValueError
+        except (KeyError, TypeError, ValueError):
+            raise DataError(
+                f"field {name!r} of a packet is missing or malformed",
+                path=f"{file}: data, packet {row}",
+                expected=f"{size} finite number{'s' * (size > 1)}",
+                got=repr(packet.get(name, "no such field"))[:60],
+                fix=_MEND,
+            ) from None
+        found.append(x)
+    return np.concatenate(found)
 
 
 def vicon_rows(content: Mapping[str, Any], file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +242,7 @@ def vicon_rows(content: Mapping[str, Any], file: Path) -> tuple[np.ndarray, np.n
         DataError: when stamps and rows do not fit.
     """
     try:
-        seconds = np.asarray(content["time"], dtype=float).ravel()
+        seconds = np.asarray(content.get("time", []), dtype=float).ravel()
         x = np.asarray(content["vicon"], dtype=float)
     except (TypeError, ValueError):
         seconds, x = np.zeros(0), np.zeros((0, 0))
@@ -221,45 +255,55 @@ def vicon_rows(content: Mapping[str, Any], file: Path) -> tuple[np.ndarray, np.n
             "'vicon' does not fit 'time'",
             path=str(file),
             expected="12 rows, and a column for each stamp",
-            got=f"vicon {np.shape(content['vicon'])}, time {np.shape(content['time'])}",
+            got=f"vicon {np.shape(content['vicon'])}, time {np.shape(content.get('time', []))}",
             fix="restore the file",
         )
     return seconds, x
 
 
-def _truth(content: Mapping[str, Any], file: Path) -> tuple[Series, list[str]]:
+def _truth(content: Mapping[str, Any], file: Path, made: Recording) -> Series | None:
+    """The motion capture; rows that are not finite are masked. None where there is none."""
+    if not np.size(content.get("vicon", [])):
+        return None
     seconds, x = vicon_rows(content, file)
-    finite = np.isfinite(x).all(axis=1) & np.isfinite(seconds)
-    notes = (
-        []
-        if finite.all()
-        else [note("skipped", f"{file.name}: {int((~finite).sum())} rows of vicon are not finite: left out")]
-    )
-    seconds, x = seconds[finite], x[finite]
+    known = np.isfinite(seconds)
+    if not known.all():
+        many = int((~known).sum())
+        made.notes.append(note("skipped", f"{file.name}: {many} stamps of vicon are not finite: left out"))
+    x = np.where(np.isfinite(x), x, np.nan)
+    if not np.isfinite(x[known]).all(axis=1).any():
+        return None
+    seconds, x = seconds[known], x[known]
     keep, more = strictly_later(seconds, "vicon", file)
-    x = x[keep]
+    made.notes += more
+    time = Series.from_seconds(seconds[keep], seconds[keep]).time
+    time, x = present("truth", f"{file}: vicon", time, x[keep], made.notes, made.info["absent"])
     truth = MotionTruth(
         position=x[:, :3],
         velocity=x[:, 6:9],
         attitude=np.asarray(quaternion_from_angles(x[:, 3:6], order="zxy", xp=np)),
         rate=x[:, 9:12],
     )
-    return Series.from_seconds(seconds[keep], truth, name="truth"), notes + more
+    return Series(time, truth, name="truth", gaps=True)
 
 
 def _camera(images: str, parameters: Parameters, frames: list[Any]) -> tuple[Camera, str]:
     """The camera of the images, and a note on how well both readings of them reproject."""
-    raw, rectified = parameters.camera, parameters.camera.rectified()
     rich = sorted((f for f in frames if len(f[0])), key=lambda f: -len(f[0]))[:400]
     sample = rich[:: max(len(rich) // 40, 1)]
-    errors = {}
-    for name, camera in (("raw", raw), ("rectified", rectified)):
-        poses = [
-            measure(i, c, tag_map=parameters.tag_map, camera=camera, mount=parameters.mount)
-            for i, c in sample
-        ]
-        errors[name] = float(np.median([float(p.error) for p in poses if p is not None] or [np.inf]))
-    chosen = min(errors, key=lambda name: errors[name]) if images == "auto" else images
+    cameras = {"raw": parameters.camera, "rectified": parameters.camera.rectified()}
+    errors = {
+        name: float(
+            np.median([e for f in sample if np.isfinite(e := _reprojection(f, parameters, c))] or np.inf)
+        )
+        for name, c in cameras.items()
+    }
+    name = min(errors, key=lambda name: errors[name]) if images == "auto" else images
     figures = ", ".join(f"{name} {error:.3f} px" for name, error in errors.items())
-    said = f"images taken as {chosen}{' (asked for)' * (images != 'auto')}; reprojection as {figures}"
-    return raw if chosen == "raw" else rectified, said
+    said = f"images taken as {name}{' (asked for)' * (images != 'auto')}; reprojection as {figures}"
+    return cameras[name], said
+
+
+def _reprojection(frame: Any, parameters: Parameters, camera: Camera) -> float:
+    found = measure(*frame, tag_map=parameters.tag_map, camera=camera, mount=parameters.mount, reject=False)
+    return np.inf if found is None else float(found.error)

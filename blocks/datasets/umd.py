@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.datasets.malformed import MALFORMED, Records
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
 from flowgraph.blocks.datasets.shape import (
     NOISE_SETTINGS,
@@ -38,6 +39,7 @@ from flowgraph.blocks.signals import Imu
 from flowgraph.blocks.vision.camera import Camera, Mount
 from flowgraph.blocks.vision.pnp import rotation_of
 from flowgraph.blocks.vision.tags import tags_series
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["SETTINGS", "load"]
@@ -45,6 +47,7 @@ __all__ = ["SETTINGS", "load"]
 SETTINGS: Mapping[str, str] = {
     **stream_settings("imu", "tags", only=("time_offset", "every")),
     **NOISE_SETTINGS,
+    **MALFORMED,
     "most_tags": "room for tags in an image",
 }
 """The settings of `load` and what they mean."""
@@ -71,7 +74,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     content = read_structs(file, "DetAll", "TLeftImgs", "IMU")
     calibration = beside or file.parent / "CalibParams.mat"
     camera, mount, side = _calibration(calibration)
-    images, imu = columns_of(content, "TLeftImgs", file), columns_of(content, "IMU", file, 11)
+    records = Records(given, "umd")
+    images, imu = columns_of(content, "TLeftImgs", file), _readings(content, file, records.skips)
     detections = np.atleast_1d(np.asarray(content["DetAll"], dtype=object))
     if len(detections) != len(images):
         raise DataError(
@@ -82,11 +86,18 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             fix="restore the file",
         )
     room = int(number(given, "most_tags", 64, "umd", positive=True))
-    frames = [_detected(cell, row, file, room) for row, cell in enumerate(detections, start=1)]
+    frames = [records.read(_detected, cell, row, file, room) for row, cell in enumerate(detections, start=1)]
+    made = Recording(file.stem, kind="umd", given=given, place=str(file))
+    made.notes += records.said(f"{file.name}: images", len(frames))
+    whole = np.isfinite(imu).all(axis=1)
+    if not whole.all():
+        sentence = f"{file.name}: {int((~whole).sum())} of {len(imu)} rows of IMU are not finite: left out"
+        made.notes.append(note("skipped", sentence))
+    imu = imu[whole]
     keep_image, notes = strictly_later(images, "TLeftImgs", file)
     keep_imu, more = strictly_later(imu[:, 10], "IMU", file)
+    keep_image &= np.array([f is not None for f in frames])
     u = imu[keep_imu]
-    made = Recording(file.stem, kind="umd", given=given, place=str(file))
     made.notes += [*notes, *more]
     readings = Imu(gyro=u[:, 7:10], specific_force=u[:, 4:7])
     made.take(Series.from_seconds(u[:, 10], readings, name="imu"), f"{file}: IMU")
@@ -96,6 +107,11 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     unit = imu_noise(given, "umd", made.notes, NOISE)
     made.info.update(camera=camera, mount=mount, tag_side=side, imu_noise=unit, **PIXELS)
     return made.flight()
+
+
+def _readings(content: Mapping[str, Any], file: Path, gaps: bool) -> np.ndarray:
+    fix = "mend or delete the row, or leave it out: malformed=skip"
+    return columns_of(content, "IMU", file, 11, fix=fix, gaps=gaps)
 
 
 NOISE = ImuNoise(gyro=0.02, accelerometer=0.6, gyro_bias=2e-4, accelerometer_bias=2e-3)
@@ -136,6 +152,6 @@ def _detected(cell: Any, row: int, file: Path, room: int) -> tuple[np.ndarray, n
             path=f"{file}: DetAll, cell {row}",
             expected=f"at most {room} rows of an id and four corners: 9 finite numbers",
             got=f"shape {table.shape}",
-            fix="mend the cell, or raise most_tags",
+            fix="mend the cell, raise most_tags, or leave it out: malformed=skip",
         )
     return table[:, 0].astype(int), table[:, 1:].reshape(-1, 4, 2)

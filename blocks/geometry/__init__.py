@@ -3,7 +3,8 @@
 A filter of poses is mostly about attitudes, and an attitude is no vector. `rotations` has the quaternions
 that all of this library uses: Hamilton, scalar first, body to world. `euler` goes to and from three angles,
 in two conventions. `manifold` declares once which parts of a state are angles or quaternions, so that a
-filter can move it, subtract it and average it without knowing more. `lanes` does the same maths for n
+filter can move it, subtract it and average it without knowing more; `groups` adds rigid motions to such
+parts, and `views` gives functions of a state its parts by name. `lanes` does the same maths for n
 particles side by side, with n as the last axis, and is used by its module name; `geodetic` turns latitude,
 longitude and height into metres, with NumPy. All others take their array namespace as `xp`, so they run on
 NumPy arrays and in a block.
@@ -35,7 +36,8 @@ from flowgraph.blocks.geometry.geodetic import (
     from_enu,
     to_enu,
 )
-from flowgraph.blocks.geometry.manifold import Part, StateSpace, angle, euclidean, quaternion
+from flowgraph.blocks.geometry.groups import SE, SE_2, SO, swept, turned_by
+from flowgraph.blocks.geometry.manifold import Part, Quaternion, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     between_vectors,
     conjugate,
@@ -53,6 +55,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_rotation_vector,
     world_error,
 )
+from flowgraph.blocks.geometry.views import View, array_of, joined, stacked_parts
 
 __all__ = [
     "multiply",
@@ -84,10 +87,20 @@ __all__ = [
     "world_rate_matrix",
     "wrapped",
     "Part",
+    "Quaternion",
     "StateSpace",
     "angle",
     "euclidean",
     "quaternion",
+    "SO",
+    "SE",
+    "SE_2",
+    "swept",
+    "turned_by",
+    "View",
+    "array_of",
+    "joined",
+    "stacked_parts",
     "SEMI_MAJOR_AXIS",
     "FLATTENING",
     "as_geodetic",

@@ -1,15 +1,18 @@
 """States that are not vectors: angles and quaternions, declared once and respected everywhere.
 
-A `StateSpace` says what the numbers of a state or a measurement are, part by part:
+A `StateSpace` says what the numbers of a state or a measurement are, part by part, with or without names:
 
-    heading_and_place = StateSpace(euclidean(2), angle())
+    CAR = StateSpace(position=euclidean(2), heading=angle(), speed=euclidean(1))
     pose = StateSpace(euclidean(3), quaternion())
 
-Three operations are all that a filter needs of it. `plus(x, d)` moves a state by a small vector, `minus(a,
-b)` is the vector that moves b to a, and `mean` is the state from which the weighted differences add up to
-zero. On vectors they are +, - and the ordinary mean; an angle is wrapped into (-pi, pi], and a quaternion, of
-four numbers, moves by a rotation vector of three: q * Exp(d). Covariances live in the tangent space, whose
-dimension is `tangent`.
+With names, a function of the state reads `x.position` and `x.heading`: see `views`. Rigid motions, whose
+parts do not move one by one, are in `groups`.
+
+Three operations are all that a filter needs of a space. `plus(x, d)` moves a state by a small vector,
+`minus(a, b)` is the vector that moves b to a, and `mean` is the state from which the weighted differences
+add up to zero. On vectors they are +, - and the ordinary mean; an angle is wrapped into (-pi, pi], and a
+quaternion, of four numbers, moves by a rotation vector of three: q * Exp(d). Covariances live in the tangent
+space, whose dimension is `tangent`.
 
 Source: C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound state representations
 through encapsulation of manifolds", Information Fusion 14(1), 2013, secs. 3-4.
@@ -21,7 +24,7 @@ import abc
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,9 +37,11 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
     to_rotation_vector,
 )
-from flowgraph.errors import DeclarationError
+from flowgraph.blocks.geometry.views import View, joined, need_names
+from flowgraph.blocks.signals import Gaussian
+from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["Part", "StateSpace", "angle", "euclidean", "quaternion"]
+__all__ = ["Part", "Quaternion", "StateSpace", "angle", "euclidean", "quaternion"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,14 @@ class Part(abc.ABC):
 
     size: int
     tangent: int
+
+    fields: ClassVar[Any] = ()
+    """Names of parts of the part, each with its place in `size`."""
+
+    @property
+    def rest(self) -> np.ndarray:
+        """The element (size) from which nothing has moved."""
+        return np.zeros(self.size)
 
     @property
     def curved(self) -> bool:
@@ -61,6 +74,11 @@ class Part(abc.ABC):
 
     def turn(self, d: Array, xp: Any) -> Array | None:
         """How far tangent vectors, the columns of d (..., tangent, n), turn, in rad; None: not at all."""
+        return None
+
+    def reset_table(self) -> np.ndarray | None:
+        """(tangent, tangent, tangent): d @ table is what a move by d adds to the error's Jacobian, which is
+        the identity without it; to first order. None: nothing."""
         return None
 
 
@@ -83,7 +101,13 @@ class _Angle(Part):
         return xp.abs(d)
 
 
-class _Quaternion(Part):
+class Quaternion(Part):
+    """A unit quaternion; see `quaternion`."""
+
+    @property
+    def rest(self) -> np.ndarray:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         return normalize(multiply(x, from_rotation_vector(d, xp=xp), xp=xp), xp=xp)
 
@@ -92,6 +116,9 @@ class _Quaternion(Part):
 
     def turn(self, d: Array, xp: Any) -> Array:
         return xp.sqrt(xp.sum(d * d, axis=-2, keepdims=True))
+
+    def reset_table(self) -> np.ndarray:
+        return -0.5 * np.asarray(skew(np.eye(3), xp=np))
 
 
 def _wrapped(x: Array, xp: Any) -> Array:
@@ -111,41 +138,55 @@ def angle(n: int = 1) -> Part:
 
 def quaternion() -> Part:
     """A unit quaternion (w, x, y, z); its error is a right (body) rotation vector, rad."""
-    return _Quaternion(4, 3)
+    return Quaternion(4, 3)
 
 
 class StateSpace:
     """The product of its parts, in order. Immutable.
 
     Args:
-        parts: made by `euclidean(n)`, `angle(n)` and `quaternion()`.
+        parts: made by `euclidean(n)`, `angle(n)`, `quaternion()`, `SO(n)`, `SE(n)` and `SE_2(n)`.
+        named: the same by name, in place of parts without names.
 
     Raises:
-        DeclarationError: without a part.
+        DeclarationError: without a part, with both kinds, or with a name that an array's attribute has.
     """
 
-    def __init__(self, *parts: Part) -> None:
-        if not parts or not all(isinstance(p, Part) for p in parts):
+    def __init__(self, *parts: Part, **named: Part) -> None:
+        both = (*parts, *named.values())
+        if not both or (parts and named) or not all(isinstance(p, Part) for p in both):
             raise DeclarationError(
                 "a state space is made of parts",
                 path="StateSpace",
                 expected="euclidean(n), angle(n) and quaternion()",
-                got=", ".join(map(repr, parts)) or "none",
+                got=", ".join(map(repr, both)) or "none",
                 fix="write StateSpace(euclidean(3), quaternion())",
             )
-        self.parts = parts
-        self.size, self.tangent = sum(p.size for p in parts), sum(p.tangent for p in parts)
-        self._flat = all(isinstance(p, _Euclidean) for p in parts)
+        need_names(named)
+        self.parts, self.names = both, tuple(named)
+        self.size, self.tangent = sum(p.size for p in both), sum(p.tangent for p in both)
+        self._flat = all(isinstance(p, _Euclidean) for p in both)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, StateSpace) and self.parts == other.parts
+        return isinstance(other, StateSpace) and (self.parts, self.names) == (other.parts, other.names)
 
     def __hash__(self) -> int:
-        return hash(self.parts)
+        return hash((self.parts, self.names))
 
     def __repr__(self) -> str:
-        inside = ", ".join(f"{type(p).__name__[1:].lower()}({p.size})" for p in self.parts)
-        return f"StateSpace({inside})"
+        kinds = [f"{type(p).__name__.lstrip('_').lower()}({p.size})" for p in self.parts]
+        named = [f"{n}={k}" for n, k in zip(self.names, kinds, strict=True)] if self.names else kinds
+        return f"StateSpace({', '.join(named)})"
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is a vector space."""
+        return self._flat
+
+    @property
+    def rest(self) -> np.ndarray:
+        """The state (size) of zeros, and of attitudes that are not turned."""
+        return np.concatenate([p.rest for p in self.parts])
 
     def places(self) -> list[tuple[Part, slice, slice]]:
         """Each part, with its place in a state and in a tangent vector."""
@@ -153,8 +194,64 @@ class StateSpace:
         on = [0, *itertools.accumulate(p.tangent for p in self.parts)]
         return [(p, slice(at[k], at[k + 1]), slice(on[k], on[k + 1])) for k, p in enumerate(self.parts)]
 
-    def plus(self, x: Array, d: Array, xp: Any) -> Array:
-        """The state (..., size): x moved by d (..., tangent)."""
+    def view(self, x: Array, xp: Any = np) -> Any:
+        """States (..., size) whose parts have names; themselves where the space has none."""
+        if not self.names or isinstance(x, View):
+            return x
+        return View(x, self, xp)
+
+    def covers(self, name: str) -> slice:
+        """Where a part stands in a tangent vector, and in a covariance.
+
+        Raises:
+            UnknownNameError: for a name that no part has.
+        """
+        if name not in self.names:
+            raise UnknownNameError("part", name, self.names, path="StateSpace")
+        return self.places()[self.names.index(name)][2]
+
+    def resting(self) -> Gaussian:
+        """The state at rest, with a covariance of one."""
+        return Gaussian(mean=self.rest, covariance=np.eye(self.tangent))
+
+    def gaussian(self, **parts: tuple[Any, Any]) -> Gaussian:
+        """A belief to start from: for each part by name its mean and standard deviation.
+
+            CAR.gaussian(position=((0.0, 0.0), 2.0), heading=(0.3, 0.1), speed=(5.0, 1.0))
+
+        Args:
+            parts: (mean, deviation); the deviation is one number or one for each direction of the part.
+
+        Raises:
+            UnknownNameError, DeclarationError: where the parts are not those of the space.
+        """
+        for name in parts:
+            self.covers(name)
+        means = {name: np.asarray(mean, dtype=float) for name, (mean, _) in parts.items()}
+        spread = {name: np.asarray(sigma, dtype=float) for name, (_, sigma) in parts.items()}
+        mean = joined(self, means, self.rest, np, tangent=False)
+        deviations = joined(self, spread, self.rest, np, tangent=True)
+        return Gaussian(mean=mean, covariance=np.diag(deviations**2))
+
+    def plus(
+        self, x: Array, d: Array | None = None, xp: Any = None, *, velocity: Any = None, dt: Any = None
+    ) -> Any:
+        """The state (..., size): x moved by d (..., tangent), or by a velocity over dt seconds.
+
+            CAR.plus(x, velocity=(x.speed * along, turn_rate, acceleration), dt=dt)
+
+        Args:
+            x: (..., size); of a view, the result is one too.
+            d: (..., tangent).
+            velocity: in place of d: of each part in order, (..., its tangent), or by name in a dict, which
+                leaves out what does not move. A part of one direction may leave out the last axis.
+            dt: s.
+        """
+        if isinstance(x, View):
+            d = joined(self, velocity, x.array, x.xp, tangent=True) * dt if d is None else d
+            return View(self.plus(x.array, d, x.xp), self, x.xp)
+        if d is None:
+            d = joined(self, velocity, x, xp, tangent=True) * dt
         if self._flat:
             return x + d
         moved = [p.plus(x[..., at], d[..., on], xp) for p, at, on in self.places()]
@@ -184,17 +281,18 @@ class StateSpace:
 
         A rotation by d leaves of a right rotation error I - skew(d)/2, to first order (Solà 2017, eq. 287).
         """
-        if not any(isinstance(p, _Quaternion) for p in self.parts):
+        if self._reset_table is None:
             return None
         table = xp.asarray(self._reset_table, dtype=d.dtype)
         turned = xp.reshape(d @ table, (*d.shape[:-1], self.tangent, self.tangent))
         return turned + xp.eye(self.tangent, dtype=d.dtype)
 
     @functools.cached_property
-    def _reset_table(self) -> np.ndarray:
-        """(tangent, tangent^2): maps d to the matrix with -skew(d)/2 for each quaternion."""
+    def _reset_table(self) -> np.ndarray | None:
+        """(tangent, tangent^2): maps d to the sum of what the parts say."""
         table = np.zeros((self.tangent, self.tangent, self.tangent))
-        for part, _, on in self.places():
-            if isinstance(part, _Quaternion):
-                table[on, on, on] = -0.5 * np.asarray(skew(np.eye(3), xp=np))
-        return table.reshape(self.tangent, -1)
+        known = [(part.reset_table(), on) for part, _, on in self.places()]
+        for own, on in known:
+            if own is not None:
+                table[on, on, on] = own
+        return None if all(own is None for own, _ in known) else table.reshape(self.tangent, -1)

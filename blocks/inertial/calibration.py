@@ -80,8 +80,9 @@ def silence_frozen_gyro(
 
     Some units stop measuring when they are knocked, and for a second or two give one level on each axis. A
     reading is frozen when for `seconds` none has been further than `tolerance` from the first of them on any
-    axis, and on every axis it is at least `least`: no body that is held or flies turns so steadily about an
-    axis oblique to all three of its own.
+    axis, and on every axis it is at least `least`: a body that is held in the hand or flies hardly turns so
+    steadily about an axis oblique to all three of its own. On a turntable it does, so this is for units that
+    are known to freeze.
 
     Fires with each reading. The specific force passes through.
 

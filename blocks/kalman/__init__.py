@@ -20,15 +20,9 @@ from flowgraph.blocks.kalman.filters import (
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
-from flowgraph.blocks.kalman.roots import (
-    covariance_root,
-    lower_root,
-    predict_root,
-    semidefinite_root,
-    update_extended_root,
-    update_root,
-)
+from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
@@ -47,6 +41,7 @@ __all__ = [
     "update_extended",
     "update_linear",
     "lower_root",
+    "correct_root",
     "predict_root",
     "semidefinite_root",
     "update_extended_root",

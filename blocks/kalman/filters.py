@@ -63,11 +63,8 @@ def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt:
 
     Source: Bar-Shalom et al. eqs. 5.2.3-2, 5.2.3-5. (R. Fiszel's thesis, 2017, prints S- for S there.)
     """
-    F, G, Q = model.discrete(dt, xp, belief.mean.dtype)
-    return Gaussian(
-        mean=(F @ belief.mean[..., None] + G @ control[..., None])[..., 0],
-        covariance=_symmetric(F @ belief.covariance @ F.mT + Q),
-    )
+    mean, F, Q = model.linearised(belief.mean, control, dt, xp)
+    return Gaussian(mean=mean, covariance=_symmetric(F @ belief.covariance @ F.mT + Q))
 
 
 @block
@@ -223,10 +220,14 @@ def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
 
 def accepts(nis: Array, gate: float | None, present: Array, xp: Any) -> Array:
     """Whether an innovation (...) of the entries `present` (..., m) passes the gate; all do without one."""
+    return passes(nis, gate, xp.sum(xp.astype(present, nis.dtype), axis=-1), present.shape[-1], xp)
+
+
+def passes(nis: Array, gate: float | None, parts: Array, m: int, xp: Any) -> Array:
+    """Whether an innovation (...) of so many parts (...) of m passes the gate; all do without one."""
     if gate is None:
         return nis == nis
-    limits = gate_table(gate, present.shape[-1])
-    parts = xp.sum(xp.astype(present, nis.dtype), axis=-1)[..., None]
+    limits, parts = gate_table(gate, m), parts[..., None]
     places = xp.asarray(np.arange(len(limits)), dtype=nis.dtype)
     return nis <= xp.sum(xp.where(parts == places, xp.asarray(limits, dtype=nis.dtype), 0.0), axis=-1)
 

@@ -19,6 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.kalman.triangles import semidefinite_root
+from flowgraph.blocks.signals import vector_of
 from flowgraph.errors import DeclarationError
 
 __all__ = ["LinearModel"]
@@ -44,25 +47,43 @@ class LinearModel:
 
     Args:
         A: (n, n), 1/s.
-        B: (n, m): what a control does.
-        density: (n, n) D, the spectral density of the driving noise.
+        B: (n, m): what a control does; None where there is none.
+        density: (n, n) D, the spectral density of the driving noise; (n) is its diagonal.
         order: of the sums.
+        space: of the state; n numbers without names if left out.
 
     Raises:
         DeclarationError: where the shapes do not fit together.
     """
 
     def __init__(
-        self, A: npt.ArrayLike, B: npt.ArrayLike, density: npt.ArrayLike, *, order: int = 12
+        self,
+        A: npt.ArrayLike,
+        B: npt.ArrayLike | None,
+        density: npt.ArrayLike,
+        *,
+        order: int = 12,
+        space: StateSpace | None = None,
     ) -> None:
-        A, B, D = (np.array(x, dtype=float) for x in (A, B, density))
+        A, D = np.array(A, dtype=float), np.array(density, dtype=float)
         n = len(A)
-        if A.shape != (n, n) or D.shape != (n, n) or B.ndim != 2 or len(B) != n:
+        self.driven = B is not None
+        B = np.zeros((n, 1)) if B is None else np.array(B, dtype=float)
+        D = np.diag(D) if D.shape == (n,) else D
+        self.space = StateSpace(euclidean(n)) if space is None else space
+        if (
+            self.space.size != n
+            or self.space.tangent != n
+            or A.shape != (n, n)
+            or D.shape != (n, n)
+            or B.ndim != 2
+            or len(B) != n
+        ):
             raise DeclarationError(
                 "the matrices of a linear model do not fit together",
                 path="LinearModel",
                 expected="A (n, n), B (n, m) and density (n, n)",
-                got=f"A {A.shape}, B {B.shape}, density {D.shape}",
+                got=f"A {A.shape}, B {B.shape}, density {D.shape}, {self.space}",
                 fix="give each one row for each state",
             )
         self.size = n
@@ -106,6 +127,32 @@ class LinearModel:
             Q = xp.where(go, F @ Q @ F.mT + Q, Q)
             E = xp.where(go, E @ E + 2.0 * E, E)
         return E + one, G, Q
+
+    # -- what every method asks of a motion; see `statespace` ------------------------------------------
+
+    @property
+    def linear(self) -> bool:
+        """That it is."""
+        return True
+
+    def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
+        """The states (..., n), one a row, after dt seconds with noises w (..., n) of covariance Q."""
+        F, G, _ = self.discrete(dt, xp, x.dtype)
+        d = x @ F.mT - x
+        d = d + (G @ vector_of(control, xp)[..., None])[..., 0] if self.driven else d
+        return self.space.plus(x, d if w is None else d + w, xp)
+
+    def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array:
+        """A triangular root of Q."""
+        return semidefinite_root(self.discrete(dt, xp, kind)[2], xp=xp)
+
+    def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
+        """(F x + G u, F, Q) at the state x (n)."""
+        F, G, Q = self.discrete(dt, xp, x.dtype)
+        after = (F @ x[..., None])[..., 0]
+        if self.driven:
+            after = (F @ x[..., None] + G @ vector_of(control, xp)[..., None])[..., 0]
+        return after if self.space.flat else self.space.plus(x, after - x, xp), F, Q
 
     def transitions(self, time: np.ndarray) -> np.ndarray:
         """F (k - 1, n, n) from each of the times (k,) int64 ns to the next, as the smoothers ask for it."""

@@ -1,16 +1,13 @@
-"""The Kalman filter on triangular roots of covariances, out of operations that every backend has.
+"""The Kalman filter on triangular roots of covariances.
 
-A covariance P = L L^T kept as its root L has twice the digits and cannot become negative. Filters on roots
-need one thing: the triangle of a wide matrix, usually by a QR factorization. That is no instruction of a
-pipeline, so here it is written out: one Householder reflection a row, a fixed number of them.
+A covariance P = L L^T kept as its root L has twice the digits and cannot become negative. All that filters on
+roots need is the triangle of a wide matrix; see `triangles`.
 
 The linear filter is here whole, of the extended one the correction. Its prediction is its user's own model:
 `predict_root` shows the one line that it takes, the triangle of [F L, Q^(1/2)]. The graph `ekf` does not run
 on roots: its 10 x 10 covariance is singular along the quaternion.
 
-Sources: G. Golub and C. Van Loan, "Matrix Computations", 4th ed., 2013: algorithms 5.1.1, 5.2.1 and 4.2.2
-(the triangles); P. Kaminski, A. Bryson, S. Schmidt, "Discrete square root filtering: a survey", IEEE TAC
-16(6), 1971 (the filter).
+Source: P. Kaminski, A. Bryson, S. Schmidt, "Discrete square root filtering: a survey", IEEE TAC 16(6), 1971.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, block
@@ -26,19 +22,10 @@ from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
+from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
 from flowgraph.blocks.signals import GaussianRoot, KalmanInnovation
 
-__all__ = [
-    "covariance_root",
-    "lower_root",
-    "predict_root",
-    "semidefinite_root",
-    "update_extended_root",
-    "update_root",
-]
-
-_FIRM = 1e-12
-"""The share of its diagonal from which a pivot is not made by rounding: Cholesky's signs are then sure."""
+__all__ = ["correct_root", "predict_root", "update_extended_root", "update_root"]
 
 
 @block
@@ -109,11 +96,27 @@ def _update(
     prior: GaussianRoot, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
 ) -> tuple[GaussianRoot, Any]:  # fmt: skip
-    kind, m = prior.mean.dtype, H.shape[-2]
-    R = noise_matrix(R, m, "R", kind=kind, xp=xp)
+    R = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
     residual, present = innovate(measured, predicted, measured_space, xp)
+    shift, root, innovation = correct_root(
+        prior.root, residual, H, R, present=present, gate=gate, space=space, xp=xp
+    )
+    posterior = GaussianRoot(mean=moved(prior.mean, shift, space, xp), root=root)
+    return posterior, where_any(present, innovation, xp)
+
+
+def correct_root(
+    L: Array, residual: Array, H: Array, R: Array, *,
+    present: Array, gate: float | None = None, space: StateSpace | None = None, xp: Any,
+) -> tuple[Array, Array, KalmanInnovation]:  # fmt: skip
+    """The correction on a root: the gain times the residual, the new root, and the innovation.
+
+    Args:
+        L: prior root (..., t, t).
+        residual, H, R, present, gate, space: as for `correct`; a missing entry of the residual is 0.
+    """
+    kind, m = L.dtype, H.shape[-2]
     H, R = masked(H, R, present, xp)
-    L = prior.root
     top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
     below = xp.concat([0.0 * (H @ L).mT, L], axis=-1)
     whole = lower_root(xp.concat([top, below], axis=-2), xp=xp)
@@ -131,68 +134,4 @@ def _update(
         parts=xp.sum(xp.astype(present, kind), axis=-1),
         accepted=accepted,
     )
-    root = xp.where(accepted[..., None, None], new, L)
-    posterior = GaussianRoot(mean=moved(prior.mean, shift, space, xp), root=root)
-    return posterior, where_any(present, innovation, xp)
-
-
-def lower_root(wide: Array, *, xp: Any) -> Array:
-    """The lower triangle L (..., n, n) with L L^T = A A^T and no negative diagonal, of A (..., n, m), m >= n.
-
-    A is turned from the right by n reflections, each of which clears one row beyond its diagonal; A A^T is
-    never formed. A row of zeros stays one.
-    """
-    n, m = wide.shape[-2:]
-    one = np.eye(m)
-    for j in range(n):
-        row = wide[..., j, :] * xp.asarray(np.arange(m) >= j, dtype=wide.dtype)
-        first = row[..., j : j + 1]
-        length = xp.sqrt(xp.linalg.vecdot(row, row))[..., None]
-        u = row + xp.where(first < 0.0, -length, length) * xp.asarray(one[j], dtype=wide.dtype)
-        square = xp.linalg.vecdot(u, u)[..., None]
-        scale = xp.where(square > 0.0, 2.0 / xp.where(square > 0.0, square, 1.0), 0.0)
-        wide = wide - (wide @ u[..., None]) * (scale * u)[..., None, :]
-    lower = xp.tril(wide[..., :n])
-    diagonal = xp.sum(lower * xp.eye(n, dtype=lower.dtype), axis=-2)
-    return lower * xp.where(diagonal < 0.0, -1.0, 1.0)[..., None, :]
-
-
-def semidefinite_root(P: Array, *, xp: Any) -> Array:
-    """The lower triangle L (..., n, n) with L L^T = P, for a P that may be singular, or zero.
-
-    Cholesky's factorization by outer products; a pivot below 1e-15 of its own diagonal counts as zero.
-    """
-    return _outer_root(P, xp)[0]
-
-
-def covariance_root(P: Array, *, xp: Any) -> Array:
-    """`semidefinite_root`, which is Cholesky's own wherever P is clearly positive definite.
-
-    So a filter whose start is known in some direction goes on, and others have the digits of Cholesky.
-    """
-    if isinstance(P, np.ndarray):  # the same root, without computing what will not be taken
-        try:
-            root = np.linalg.cholesky(P)
-        except np.linalg.LinAlgError:
-            root = np.zeros_like(P)
-        pivots, variances = (np.diagonal(x, axis1=-2, axis2=-1) for x in (root, P))
-        if (pivots * pivots > 2.0 * _FIRM * variances).all():
-            return root
-    root, firm = _outer_root(P, xp)
-    firm = firm[..., None, None]
-    return xp.where(firm, xp.linalg.cholesky(xp.where(firm, P, xp.eye(P.shape[-1], dtype=P.dtype))), root)
-
-
-def _outer_root(P: Array, xp: Any) -> tuple[Array, Array]:
-    """The root, and whether (...) every pivot is well above the rounding of its diagonal."""
-    n = P.shape[-1]
-    variance = xp.sum(P * xp.eye(n, dtype=P.dtype), axis=-1)
-    columns, firm = [], variance[..., :1] > 0.0
-    for j in range(n):
-        pivot, least = P[..., j, j : j + 1], variance[..., j : j + 1]
-        solid = (pivot > least * 1e-15) & (pivot > 0.0)
-        firm = firm & (pivot > least * _FIRM)
-        column = P[..., :, j] / xp.sqrt(xp.where(solid, pivot, 1.0)) * xp.astype(solid, P.dtype)
-        columns.append(column)
-        P = P - column[..., :, None] * column[..., None, :]
-    return xp.tril(xp.stack(columns, axis=-1)), firm[..., 0] & xp.all(variance > 0.0, axis=-1)
+    return shift, xp.where(accepted[..., None, None], new, L), innovation

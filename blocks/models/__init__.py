@@ -9,6 +9,8 @@ The rooms of methods (`kalman`, `unscented`, `particles`) know nothing of bodies
     unscented_ins   the same by sigma points, and a camera's velocity
     particle_ins    the same by particles
     plane           a point in the plane: the smallest problem for particles
+    tracking        points, vehicles that turn and a pendulum, for any method of `filtering`
+    inertial_pose   the pose that an IMU carries, for any method
 
 Several have a `STATE` and a `move`, so the modules are what is public: `from flowgraph.blocks.models import
 pose`, or names from a module. None is imported before it is asked for: those that see by a camera load
@@ -17,4 +19,14 @@ OpenCV.
 
 from __future__ import annotations
 
-__all__ = ["point", "pose", "unscented_pose", "euler_ins", "unscented_ins", "particle_ins", "plane"]
+__all__ = [
+    "point",
+    "pose",
+    "unscented_pose",
+    "euler_ins",
+    "unscented_ins",
+    "particle_ins",
+    "plane",
+    "tracking",
+    "inertial_pose",
+]

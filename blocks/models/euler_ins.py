@@ -40,6 +40,7 @@ from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import Correction, correct
+from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
 __all__ = [
@@ -179,7 +180,26 @@ def pose_noise(
     one, none = xp.eye(3, dtype=kind), xp.zeros((3, 3), dtype=kind)
     W = inverse_rate_matrix(e, order=order, xp=xp)
     T = xp.concat([xp.concat([one, none], axis=-1), xp.concat([none, W], axis=-1)], axis=-2)
-    return xp.asarray(np.asarray(R, dtype=float), dtype=kind) + factor * (T @ pose.covariance @ T.mT)
+    return noise_matrix(R, 6, "R", kind=kind, xp=xp) + factor * (T @ pose.covariance @ T.mT)
+
+
+def seen_place(x: Array, lever: tuple[float, float, float], *, order: str, xp: Any) -> Array:
+    """Where the measured point (..., 3) of a body in the states x (..., 15) is: p + R(e) lever."""
+    if not any(lever):
+        return x[..., 0:3]
+    arm = xp.asarray(lever, dtype=x.dtype)
+    return x[..., 0:3] + (matrix_from_angles(x[..., 3:6], order=order, xp=xp) @ arm[:, None])[..., 0]
+
+
+def sees_pose(e: Array, lever: tuple[float, float, float], *, order: str, xp: Any) -> Array:
+    """H (6, 15) of a measured pose whose position is of a point: d(R(e) lever)/de = -R [lever]x G."""
+    H = xp.asarray(_SEES_POSE, dtype=e.dtype)
+    if not any(lever):
+        return H
+    arm = skew(xp.asarray(lever, dtype=e.dtype), xp=xp)
+    R, G = (f(e, order=order, xp=xp) for f in (matrix_from_angles, body_rate_matrix))
+    place, angles = (xp.asarray(np.eye(n, 3, shift), dtype=e.dtype) for n, shift in ((6, 0), (15, -3)))
+    return H - place @ (R @ arm @ G) @ angles.mT
 
 
 @block
@@ -190,28 +210,31 @@ def update_pose_angles(
     order: str,
     R: npt.ArrayLike,
     factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
-    """Correct with a measured pose, z = (p, e) + noise; without one the prior passes through.
+    """Correct with a measured pose, z = (p + R(e) lever, e) + noise; without one the prior passes through.
 
-    The measurement is linear in the state, so an extended and an unscented filter correct alike. Differences
-    of angles are wrapped.
+    Without a lever the measurement is linear in the state, and with one nearly so, for it measures the angles
+    too: an extended and an unscented filter correct alike. Differences of angles are wrapped.
 
     Args:
         prior: over `STATE`.
         pose: measured; or absent.
         order: "zxy" or "zyx".
-        R: (6, 6) covariance of (position, angles), m and rad.
+        R: covariance (6, 6) of (position, angles), m and rad, its diagonal (6), or one variance.
         factor: on the measurement's own covariance, which is added to R.
+        lever: the point in the body whose position is measured, m.
         gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
     """
     if pose is None:
         return prior, None
     e = prior.mean[..., 3:6]
     z = xp.concat([pose.position, measured_angles(pose.attitude, e, order=order, xp=xp)], axis=-1)
-    residual = _POSE.minus(z, prior.mean[..., 0:6], xp)
-    H = xp.asarray(_SEES_POSE, dtype=e.dtype)
+    expected = xp.concat([seen_place(prior.mean, lever, order=order, xp=xp), e], axis=-1)
+    residual = _POSE.minus(z, expected, xp)
+    H = sees_pose(e, lever, order=order, xp=xp)
     noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
     return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, xp=xp), xp)
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.roots import covariance_root
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import (
     STATE,
     increment_variances,
@@ -28,6 +28,7 @@ from flowgraph.blocks.models.euler_ins import (
     measured_angles,
     move,
     pose_noise,
+    seen_place,
 )
 from flowgraph.blocks.particles.cloud import log_sum_exp
 from flowgraph.blocks.particles.resampling import ancestor_index
@@ -67,7 +68,14 @@ def propagate_states(
 
 @block
 def weigh_states(
-    cloud: StateCloud, pose: PoseMeasurement, *, order: str, R: npt.ArrayLike, factor: float = 1.0, xp: Any
+    cloud: StateCloud,
+    pose: PoseMeasurement,
+    *,
+    order: str,
+    R: npt.ArrayLike,
+    factor: float = 1.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    xp: Any,
 ) -> StateCloud:
     """Multiply the weights by the likelihood of a measured pose, and normalise.
 
@@ -77,12 +85,13 @@ def weigh_states(
         cloud: at the time of the pose.
         pose: measured.
         order: "zxy" or "zyx".
-        R, factor: as in `euler_ins.update_pose_angles`.
+        R, factor, lever: as in `euler_ins.update_pose_angles`.
     """
     middle = _circular_mean(cloud, xp)
     z = measured_angles(pose.attitude, middle, order=order, xp=xp)
     turn = angle(3).minus(z, cloud.state[:, 3:6], xp)
-    r = xp.concat([pose.position - cloud.state[:, 0:3], turn], axis=-1)
+    seen = seen_place(cloud.state, lever, order=order, xp=xp)
+    r = xp.concat([pose.position - seen, turn], axis=-1)
     noise = pose_noise(pose, middle, R=R, factor=factor, order=order, xp=xp)
     squared = xp.sum(r * xp.linalg.solve(noise, r.mT).mT, axis=-1)
     log_weight = cloud.log_weight - 0.5 * squared

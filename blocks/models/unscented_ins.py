@@ -14,7 +14,7 @@ and R. van der Merwe, 2001 (alpha, beta); the report's sec. on its two filters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,14 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.kalman.filters import correct
-from flowgraph.blocks.kalman.roots import covariance_root
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import camera_velocity
 from flowgraph.errors import UnknownNameError
+from flowgraph.language.block import Limit
 
 __all__ = ["RATES", "carried", "far_points", "update_camera_velocity"]
 
@@ -48,9 +49,20 @@ def carried(order: str) -> Callable[..., Array]:
     return moved
 
 
-def far_points(noises: int) -> SigmaPoints:
-    """Points sqrt(3) deviations away from the mean of a state with so many noises."""
-    return SigmaPoints(alpha=math.sqrt(3.0 / (STATE.tangent + noises)))
+def far_points(
+    noises: int, *, alpha: float | None = None, beta: float = 2.0, kappa: float = 0.0
+) -> SigmaPoints:
+    """Points sqrt(3) deviations away from the mean of a state with so many noises, where no alpha is given.
+
+    Raises:
+        DeclarationError: where the numbers make no set, as a kappa that takes all the spread away.
+    """
+    n = STATE.tangent + noises
+    if alpha is None:
+        alpha = math.sqrt(3.0 / n) if kappa == 0.0 else math.sqrt(3.0) / SigmaPoints(kappa=kappa).scale(n)
+    points = SigmaPoints(alpha=alpha, beta=beta, kappa=kappa)
+    points.scale(n)
+    return points
 
 
 @block
@@ -64,6 +76,7 @@ def update_camera_velocity(
     velocity_noise: float,
     rate_noise: float,
     rate: str = "gyro",
+    points: SigmaPoints | None = None,
     gate: float | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
@@ -84,6 +97,7 @@ def update_camera_velocity(
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate that is taken, rad/s.
         rate: "gyro" or "camera".
+        points: the set of sigma points; sqrt(3) deviations away if left out.
         gate: when given, a measurement with a nis above it changes nothing (for three numbers 16.3 is
             99.9 %).
 
@@ -95,7 +109,7 @@ def update_camera_velocity(
     if motion is None:
         return prior, None
     x, kind = prior.mean, prior.mean.dtype
-    n, points = x.shape[-1], far_points(6)
+    n, points = x.shape[-1], far_points(6) if points is None else points
     scale = points.scale(n + 6)
     S = covariance_root(prior.covariance, xp=xp)
     deviations = xp.asarray(np.diag(np.repeat([velocity_noise, rate_noise], 3)), dtype=kind)
@@ -117,3 +131,8 @@ def update_camera_velocity(
     residual = motion.velocity - cluster.mean
     found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, xp=xp)
     return moved_by(prior, found, xp)
+
+
+@update_camera_velocity.limited
+def _limits(*, points: SigmaPoints | None = None, **_: Any) -> Sequence[Limit]:
+    return () if points is None else points.limits()

@@ -2,10 +2,11 @@
 
 `cases` makes a case of a flight, with the settings that filters share, each declared once as `settings` lets
 graphs do; `point` does so for linear filters, and `euler` for those with Euler angles. `tuning` finds the
-noise that a filter is told, in its settings or in the flight; `streams` makes the streams that it asks for
-out of those that a flight has. `scorer` compares a run with the truth: errors, consistency, and the same for
-the smoothed run; `orientation` counts only the times that a recording says count, and `calibration` how well
-one explains its windows. `settings`, `point`, `euler` and `calibration` are imported by their own names.
+noise that a filter is told, in its settings or in the flight, and `covariances` reads a whole one; `streams`
+makes the streams that it asks for out of those that a flight has. `scorer` compares a run with the truth:
+errors, consistency, and the same for the smoothed run; `orientation` counts only the times that a recording
+says count, and `calibration` how well one explains its windows. `settings`, `point`, `euler` and
+`calibration` are imported by their own names.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from flowgraph.blocks.scoring.cases import (
     on_capture,
     on_flight,
 )
-from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
+from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
+from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
 from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, StartPose
 from flowgraph.blocks.scoring.streams import (
@@ -50,6 +52,8 @@ __all__ = [
     "point",
     "euler",
     "calibration",
+    "Covariance",
+    "six_by_six",
     "OnFlight",
     "on_flight",
     "on_capture",
@@ -81,6 +85,7 @@ __all__ = [
     "told_acceleration",
     "with_parts",
     "Share",
+    "counted",
     "counted_errors",
     "scored_errors",
 ]

@@ -11,6 +11,7 @@ from flowgraph.blocks.signals.beliefs import (
     AttitudeBelief,
     AttitudeBiasBelief,
     AttitudeRateBelief,
+    Bank,
     Belief,
     EulerAngles,
     Gaussian,
@@ -66,8 +67,10 @@ from flowgraph.blocks.signals.sensors import (
     PointReading,
     Range,
     SpecificForce,
+    Steering,
     Thrust,
 )
+from flowgraph.blocks.signals.vectors import vector_of
 from flowgraph.blocks.signals.vision import (
     CameraMotion,
     PoseMeasurement,
@@ -99,11 +102,13 @@ __all__ = [
     "Thrust",
     "BodyRate",
     "PointReading",
+    "Steering",
     "Tags",
     "PoseMeasurement",
     "CameraMotion",
     "Gaussian",
     "GaussianRoot",
+    "Bank",
     "KalmanInnovation",
     "Innovation",
     "Belief",
@@ -129,4 +134,5 @@ __all__ = [
     "CountsSum",
     "Window",
     "NormalEquations",
+    "vector_of",
 ]

@@ -11,6 +11,7 @@ from flowgraph import Array, Signal, boolean, real
 __all__ = [
     "Gaussian",
     "GaussianRoot",
+    "Bank",
     "KalmanInnovation",
     "Innovation",
     "Belief",
@@ -38,6 +39,14 @@ class GaussianRoot(Signal):
 
     mean: Array = real("n")
     root: Array = real("t", "t")
+
+
+class Bank(Signal):
+    """Gaussian beliefs under several models: how likely each is (weights add up to 1), and what it says."""
+
+    weight: Array = real("models")
+    mean: Array = real("models", "n")
+    covariance: Array = real("models", "t", "t")
 
 
 class KalmanInnovation(Signal):

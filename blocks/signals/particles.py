@@ -59,10 +59,10 @@ class Ancestors(Signal):
 
 
 class StateCloud(Signal):
-    """Weighted states. log_weight: natural logarithm, the weights add up to 1. state: (p, e, v, b_g, b_a)."""
+    """Weighted states. log_weight: natural logarithm, the weights add up to 1. state: one a particle."""
 
     log_weight: Array = real("particles")
-    state: Array = real("particles", 15)
+    state: Array = real("particles", "size")
 
 
 class OutdoorCloud(Signal):

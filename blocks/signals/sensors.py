@@ -20,6 +20,7 @@ __all__ = [
     "Thrust",
     "BodyRate",
     "PointReading",
+    "Steering",
 ]
 
 
@@ -108,3 +109,10 @@ class PointReading(Signal):
 
     acceleration: Array = real(3, unit="m/s^2", frame="world")
     position: Array = real(3, unit="m", frame="world")
+
+
+class Steering(Signal):
+    """What a driver does: the angle of the front wheels (rad, to the left) and the acceleration (m/s^2)."""
+
+    angle: Array = real(unit="rad")
+    acceleration: Array = real(unit="m/s^2")

@@ -7,15 +7,30 @@ are those of `models` and `orientation`, or your own.
 
 from __future__ import annotations
 
-from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
-from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, MEANS, Cluster, SigmaPoints, mean_turn
+from flowgraph.blocks.unscented.filters import (
+    predict_unscented,
+    through_motion,
+    through_observation,
+    update_unscented,
+)
+from flowgraph.blocks.unscented.sigma_points import (
+    GAUSSIAN,
+    MEANS,
+    Cluster,
+    SigmaPoints,
+    mean_move,
+    mean_turn,
+)
 
 __all__ = [
     "GAUSSIAN",
     "MEANS",
     "Cluster",
     "SigmaPoints",
+    "mean_move",
     "mean_turn",
     "predict_unscented",
+    "through_motion",
+    "through_observation",
     "update_unscented",
 ]

@@ -27,12 +27,12 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
 from flowgraph.blocks.kalman.matrices import noise_matrix
-from flowgraph.blocks.kalman.roots import covariance_root, semidefinite_root
+from flowgraph.blocks.kalman.triangles import covariance_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
 from flowgraph.language.block import Limit
 
-__all__ = ["predict_unscented", "update_unscented"]
+__all__ = ["predict_unscented", "through_motion", "through_observation", "update_unscented"]
 
 
 @block
@@ -71,29 +71,43 @@ def predict_unscented(
         space: of the state; without one it is a vector.
         points: the set of sigma points.
     """
-    x, kind = belief.mean, belief.mean.dtype
-    t = belief.covariance.shape[-1]
+    t, kind = belief.covariance.shape[-1], belief.mean.dtype
     added = None if Q is None else noise_matrix(Q, t, "predict_unscented.Q", kind=kind, xp=xp) * dt
     P = belief.covariance + added if added is not None and Q_first else belief.covariance
-    extra = 0 if noise is None else np.atleast_1d(np.asarray(noise)).shape[-1]
-    root = covariance_root(P, xp=xp)
-    scale = points.reach(root, points.scale(t + extra), space, xp)
-    apart = points.around(root, scale, xp)
-    w = None
+    shaken = None
     if noise is not None:
         # the root of a constant, scaled: the noise over no time has none
+        extra = np.atleast_1d(np.asarray(noise)).shape[-1]
         density = noise_matrix(noise, extra, "predict_unscented.noise", kind=np.float64, xp=np)
         shaken = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
-        blown = points.around(shaken * xp.sqrt(xp.asarray(dt, dtype=kind)), scale, xp)
-        w = xp.zeros((*blown.shape[:-2], 1 + apart.shape[-2], extra), dtype=kind)
-        w = xp.concat([w, blown], axis=-2)
-        apart = xp.concat([apart, xp.zeros((*apart.shape[:-2], 2 * extra, P.shape[-1]), dtype=kind)], axis=-2)
-    images = move(_spread(x, apart, space, xp), control, w, dt, xp)
-    cluster = points.cluster(images, space, scale, xp)
-    P = points.covariance(cluster, cluster, scale)
+        shaken = shaken * xp.sqrt(xp.asarray(dt, dtype=kind))
+    carry = lambda x, w: move(x, control, w, dt, xp)
+    mean, P = through_motion(belief.mean, P, carry, shaken, space=space, points=points, xp=xp)
     if added is not None and not Q_first:
         P = P + added
-    return Gaussian(mean=cluster.mean, covariance=0.5 * (P + P.mT))
+    return Gaussian(mean=mean, covariance=0.5 * (P + P.mT))
+
+
+def through_motion(
+    x: Array,
+    P: Array,
+    carry: Callable[..., Array],
+    shaken: Array | None,
+    *,
+    space: StateSpace | None,
+    points: SigmaPoints,
+    xp: Any,
+) -> tuple[Array, Array]:
+    """The mean and covariance of what a motion makes of a Gaussian (x, P) and of its own noise.
+
+    Args:
+        carry: `carry(x, w) -> x'`, on x (..., k, size) and w (..., k, n_w), a point a row.
+        shaken: a root (n_w, n_w) of the covariance of w; None: w is None.
+        space, points: as in `predict_unscented`.
+    """
+    apart, w, scale = _placed(P, shaken, space, points, xp)
+    cluster = points.cluster(carry(_spread(x, apart, space, xp), w), space, scale, xp)
+    return cluster.mean, points.covariance(cluster, cluster, scale)
 
 
 @block
@@ -131,17 +145,45 @@ def update_unscented(
     """
     if measured is None:
         return prior, None
-    x, P = prior.mean, prior.covariance
-    root = covariance_root(P, xp=xp)
-    scale = points.reach(root, points.scale(P.shape[-1]), space, xp)
-    apart = points.around(root, scale, xp)
-    z = points.cluster(observe(_spread(x, apart, space, xp), xp), measured_space, scale, xp)
+    seen = lambda x, v: observe(x, xp)
+    noise = lambda m: noise_matrix(R, m, "update_unscented.R", kind=prior.mean.dtype, xp=xp)
+    return through_observation(
+        prior, measured, seen, noise, None,
+        space=space, measured_space=measured_space, points=points, gate=gate, xp=xp,
+    )  # fmt: skip
+
+
+def through_observation(
+    prior: Gaussian,
+    measured: Array,
+    seen: Callable[..., Array],
+    added: Callable[[int], Array] | None,
+    shaken: Array | None,
+    *,
+    space: StateSpace | None,
+    measured_space: StateSpace | None,
+    points: SigmaPoints,
+    gate: float | None,
+    xp: Any,
+) -> tuple[Gaussian, Any]:
+    """Correct with what is seen of a Gaussian, and the innovation, present where any entry was measured.
+
+    Args:
+        seen: `seen(x, v) -> z`, on x (..., k, size) and v (..., k, n_v), a point a row.
+        added: the covariance of noise that is added, by the number of entries; None where it goes in.
+        shaken: a root (n_v, n_v) of the covariance of v; None: v is None.
+        prior, measured, space, measured_space, points, gate: as in `update_unscented`.
+    """
+    x, P, kind = prior.mean, prior.covariance, prior.mean.dtype
+    apart, v, scale = _placed(P, shaken, space, points, xp)
+    z = points.cluster(seen(_spread(x, apart, space, xp), v), measured_space, scale, xp)
     residual, present = innovate(measured, z.mean, measured_space, xp)
-    noise = noise_matrix(R, residual.shape[-1], "update_unscented.R", kind=x.dtype, xp=xp)
+    m = residual.shape[-1]
+    noise = xp.zeros((m, m), dtype=kind) if added is None else added(m)
     outer, noise = masked(z.outer.mT, noise, present, xp)
-    seen = Cluster(z.mean, outer.mT, z.centre * xp.astype(present, x.dtype)[..., None, :])
-    S = points.covariance(seen, seen, scale) + noise
-    C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), seen, scale)
+    around = Cluster(z.mean, outer.mT, z.centre * xp.astype(present, kind)[..., None, :])
+    S = points.covariance(around, around, scale) + noise
+    C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), around, scale)
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
@@ -149,7 +191,7 @@ def update_unscented(
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
-    left, central = apart - seen.outer @ K.mT, -seen.centre @ K.mT
+    left, central = apart - around.outer @ K.mT, -around.centre @ K.mT
     if turn is not None:
         left, central, K = left @ turn.mT, central @ turn.mT, turn @ K
     rest = Cluster(x, left, central)
@@ -169,6 +211,23 @@ def update_unscented(
 @update_unscented.limited
 def _limits(*, points: SigmaPoints = GAUSSIAN, **_: Any) -> Sequence[Limit]:
     return points.limits()
+
+
+def _placed(
+    P: Array, shaken: Array | None, space: StateSpace | None, points: SigmaPoints, xp: Any
+) -> tuple[Array, Array | None, Any]:
+    """The outer points (..., 2 (t + n), t) as tangent vectors, the noises (..., 1 + 2 (t + n), n) of all, and
+    the scale."""
+    n = 0 if shaken is None else shaken.shape[-1]
+    root = covariance_root(P, xp=xp)
+    scale = points.reach(root, points.scale(P.shape[-1] + n), space, xp)
+    apart = points.around(root, scale, xp)
+    if shaken is None:
+        return apart, None, scale
+    blown = points.around(shaken, scale, xp)
+    still = xp.zeros((*blown.shape[:-2], 1 + apart.shape[-2], n), dtype=P.dtype)
+    none = xp.zeros((*apart.shape[:-2], 2 * n, P.shape[-1]), dtype=P.dtype)
+    return xp.concat([apart, none], axis=-2), xp.concat([still, blown], axis=-2), scale
 
 
 def _spread(x: Array, apart: Array, space: StateSpace | None, xp: Any) -> Array:

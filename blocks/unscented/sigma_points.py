@@ -32,12 +32,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph import Array
-from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.geometry.manifold import Part, Quaternion, StateSpace
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.block import Limit
 
-__all__ = ["GAUSSIAN", "MEANS", "Cluster", "SigmaPoints", "mean_turn"]
+__all__ = ["GAUSSIAN", "MEANS", "Cluster", "SigmaPoints", "mean_move", "mean_turn"]
 
 MEANS = ("markley", "kraft")
 """How quaternions are averaged: by the dominant eigenvector, or by gradient descent."""
@@ -176,16 +176,18 @@ class SigmaPoints:
             mean = first + shift if space is None else space.plus(first, shift, xp)
             return Cluster(mean[..., 0, :], apart, -shift)
         apart = space.minus(others, first, xp)
-        moves = [
-            mean_turn(apart[..., on], weight, self.mean, xp)
-            if part.curved
-            else xp.sum(apart[..., on], axis=-2, keepdims=True) * weight
-            for part, _, on in space.places()
-        ]
+        moves = [self._move(part, apart[..., on], weight, xp) for part, _, on in space.places()]
         mean = space.plus(first, xp.concat(moves, axis=-1), xp)
         seen = space.minus(images, mean, xp)
         centre = seen[..., :1, :]
         return Cluster(mean[..., 0, :], seen[..., 1:, :] - centre, centre)
+
+    def _move(self, part: Part, apart: Array, weight: Any, xp: Any) -> Array:
+        """How far (..., 1, t) the mean of a part lies from its central image."""
+        if isinstance(part, Quaternion):
+            return mean_turn(apart, weight, self.mean, xp)
+        shift = xp.sum(apart, axis=-2, keepdims=True) * weight
+        return mean_move(part, apart, shift, weight, xp) if part.curved else shift
 
     def covariance(self, a: Cluster, b: Cluster, scale: float | Reach) -> Array:
         """The covariance (..., t_a, t_b) of two clusters of the same points."""
@@ -245,6 +247,27 @@ def mean_turn(turns: Array, weight: float | Array, method: str, xp: Any) -> Arra
     rest = both[..., 1:, :]
     lost = xp.sqrt(xp.sum(rest * rest, axis=(-2, -1), keepdims=True)) > ahead
     return xp.where(lost, xp.sum(turns, axis=-2, keepdims=True) * weight, mean)
+
+
+def mean_move(part: Part, apart: Array, shift: Array, weight: Any, xp: Any) -> Array:
+    """The move (..., 1, t) from a central element of a group to the mean of it and others.
+
+    The element from which the weighted moves to all add up to zero, by 8 steps of gradient descent from the
+    sum `shift` of the moves from the centre, as for "kraft".
+
+    Args:
+        part: of the state.
+        apart: (..., k, t), from the central element to each of the others.
+        weight: of each of the others.
+    """
+    centre = xp.asarray(part.rest, dtype=apart.dtype) + 0.0 * shift[..., :1]
+    others = part.plus(centre, apart, xp)
+    for _ in range(_STEPS):
+        m = part.plus(centre, shift, xp)
+        back = part.minus(centre, m, xp)
+        step = xp.sum(part.minus(others, m, xp) - back, axis=-2, keepdims=True) * weight + back
+        shift = part.minus(part.plus(m, step, xp), centre, xp)
+    return shift
 
 
 def _dominant(M: Array, xp: Any) -> Array:

@@ -154,7 +154,7 @@ def _first_guess(
             tried.add(k)
             ids, corners = images[k]
             world = np.array([_laid(places[int(i)], square) for i in ids[is_known]])
-            found = solve(corners[is_known], world, camera)
+            found = solve(corners[is_known], world, camera, reject=False)  # the places are rough
             if found is None:
                 continue
             cameras[k] = found.R, found.t

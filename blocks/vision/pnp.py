@@ -6,15 +6,22 @@ small in the image has two poses that explain it about equally well: where the c
 the one nearer to the previous pose, or to the prior, is taken. Linearised at the answer, the reprojection
 gives the covariance.
 
+A tag that was taken for another is far from where it should be, and draws the pose after it. So where a tag
+is off by more than noise, pairs of tags propose poses, and the one that most of the tags agree with decides:
+those that are off by many deviations from what the majority says are left out. Without a majority all remain,
+and the covariance, which follows the residual, says what such a pose is worth.
+
 This runs on the host: OpenCV is no array-API operation. A pipeline reads the poses as a source.
 
-Sources: G. Terzakis and M. Lourakis, "A consistently fast and globally optimal solution to the
+Sources: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981 (here over all pairs, or a fixed
+selection of them); G. Terzakis and M. Lourakis, "A consistently fast and globally optimal solution to the
 perspective-n-point problem", ECCV 2020; T. Collins and A. Bartoli, "Infinitesimal plane-based pose
 estimation", IJCV 109, 2014.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import cv2
@@ -32,16 +39,23 @@ __all__ = ["Solution", "find_pose", "quaternion_of", "rotation_of", "solve"]
 _REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-14)
 _HOPELESS = 4.0  # a start with so many times the best one's error is not refined
 _APART = 16.0  # squared errors closer than this, in units of the noise, do not tell two poses apart
+_DOUBTFUL = 4.0  # a tag so many deviations off (root mean square of its corners) makes the others be asked
+_WRONG = 8.0  # a tag so many deviations off what most of the others say is left out
+_LOOSE = 16.0  # a pose from two tags alone is right to so many deviations
+_PROPOSALS, _ROUNDS, _WHOLE = 60, 10, 3  # after so many pairs with which all tags agree, all do
+_CONTRADICTED = 16.0  # on the covariance, and as often as there are tags, where tags contradict each other:
+# the corners of a wrong one err together, and the pose gave way to it by half
 
 
 class Solution(NamedTuple):
     """x_camera = R x_world + t; the reprojection error (px, root mean square over the corners' distances);
-    and the covariance (6, 6) of (left rotation vector of R, t)."""
+    the covariance (6, 6) of (left rotation vector of R, t); and which tags (k,) it rests on."""
 
     R: np.ndarray
     t: np.ndarray
     error: float
     covariance: np.ndarray
+    used: np.ndarray
 
 
 def solve(
@@ -51,6 +65,7 @@ def solve(
     *,
     near: tuple[np.ndarray, np.ndarray] | None = None,
     pixel_noise: float = 0.5,
+    reject: bool = True,
 ) -> Solution | None:
     """The camera's pose from pixels (k, 4, 2) of points (k, 4, 3) in the world; None where there is none.
 
@@ -59,9 +74,34 @@ def solve(
         camera: with its distortion.
         near: (R, t) that the answer should be near to, where corners alone leave it open.
         pixel_noise: standard deviation of a corner's coordinate, px; what the covariance assumes at least.
+        reject: whether tags that most of the others contradict are left out.
     """
-    z = np.ascontiguousarray(np.asarray(corners, dtype=float).reshape(-1, 2))
-    X = np.ascontiguousarray(np.asarray(places, dtype=float).reshape(-1, 3))
+    z = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
+    X = np.asarray(places, dtype=float).reshape(-1, 4, 3)
+    found = _fit(z, X, camera, near, pixel_noise)
+    worst = np.inf if found is None else float(_off(found.R, found.t, z, X, camera).max())
+    if worst < _DOUBTFUL * pixel_noise or not reject:
+        return found
+    agreed = _agreed(z, X, camera, near, pixel_noise)
+    better = None if agreed is None else _fit(z[agreed], X[agreed], camera, near, pixel_noise)
+    if better is not None:
+        return better._replace(used=agreed)
+    if found is not None and worst >= _WRONG * pixel_noise:
+        return found._replace(covariance=found.covariance * _CONTRADICTED * len(z))
+    return found
+
+
+def _fit(
+    z: np.ndarray,
+    X: np.ndarray,
+    camera: Camera,
+    near: tuple[np.ndarray, np.ndarray] | None,
+    pixel_noise: float,
+) -> Solution | None:
+    """The pose that all tags together explain best."""
+    used = np.ones(len(z), bool)
+    z = np.ascontiguousarray(z.reshape(-1, 2))
+    X = np.ascontiguousarray(X.reshape(-1, 3))
     if len(z) < 4:
         return None
     found = []
@@ -87,7 +127,52 @@ def solve(
     to_left = np.eye(6)
     to_left[:3, :3] = _left_jacobian(r[:, 0])
     covariance = to_left @ np.linalg.inv(information) @ to_left.T * variance
-    return Solution(R, t[:, 0], float(np.sqrt(error / len(z))), covariance)
+    return Solution(R, t[:, 0], float(np.sqrt(error / len(z))), covariance, used)
+
+
+def _off(R: np.ndarray, t: np.ndarray, z: np.ndarray, X: np.ndarray, camera: Camera) -> np.ndarray:
+    """By how much the coordinates of each tag's corners are off (k,), px, root mean square."""
+    seen = X @ R.T + t
+    if not (np.isfinite(seen).all() and (seen[..., 2] > 1e-6).all()):
+        return np.full(len(z), np.inf)
+    return np.asarray(np.sqrt(np.mean((camera.project(seen) - z) ** 2, axis=(1, 2))))
+
+
+def _agreed(
+    z: np.ndarray,
+    X: np.ndarray,
+    camera: Camera,
+    near: tuple[np.ndarray, np.ndarray] | None,
+    pixel_noise: float,
+) -> np.ndarray | None:
+    """The tags (k,) that agree on a pose, where they are most of them and all others are far from it; None
+    where no tags but all agree, or no majority does."""
+    pairs = list(itertools.combinations(range(len(z)), 2))
+    order = np.random.default_rng(0).permutation(len(pairs))[:_PROPOSALS]  # the same ones every time
+    whole = 0
+    for pair in (list(pairs[k]) for k in order if len(z) > 2):
+        agreed = np.isin(np.arange(len(z)), pair)
+        if whole == _WHOLE:
+            return None
+        wide = _LOOSE  # what two tags say of others far away
+        for _ in range(_ROUNDS):
+            pose = _fit(z[agreed], X[agreed], camera, near, pixel_noise)
+            if pose is None:
+                break
+            off = _off(pose.R, pose.t, z, X, camera)
+            if agreed.sum() == 2 and not (off[agreed] < _WRONG * pixel_noise).all():
+                break
+            again = off < wide * pixel_noise * np.clip(np.median(off[agreed]) / pixel_noise, 1.0, 2.0)
+            if wide == _WRONG and (again == agreed).all():
+                if agreed.all():
+                    whole += 1
+                elif 2 * agreed.sum() > len(z):
+                    return agreed
+                break
+            agreed, wide = again, _WRONG
+            if agreed.sum() < 2:
+                break
+    return None
 
 
 def _starts(
@@ -173,6 +258,7 @@ def measure(
     mount: Mount,
     near: tuple[np.ndarray, np.ndarray] | None = None,
     pixel_noise: float = 0.5,
+    reject: bool = True,
 ) -> PoseMeasurement | None:
     """The body's pose from the tags of one image; None where the map knows none of them.
 
@@ -180,14 +266,15 @@ def measure(
         ids, corners: (k,) and (k, 4, 2) px.
         near: the body's (position (3,), attitude (3, 3)) that decides between two poses that look alike.
         tag_map, camera, mount, pixel_noise: see `find_pose`.
+        reject: see `solve`.
     """
     places, known = tag_map.find(ids)
     if not known.any():
         return None
     guess = None if near is None else mount.view(*near)
     z = np.asarray(corners, dtype=float)[known]
-    solution = solve(z, places[known], camera, near=guess, pixel_noise=pixel_noise)
-    return None if solution is None else body_measurement(solution, mount, int(known.sum()))
+    solution = solve(z, places[known], camera, near=guess, pixel_noise=pixel_noise, reject=reject)
+    return None if solution is None else body_measurement(solution, mount, int(solution.used.sum()))
 
 
 @block(host=True)

@@ -242,7 +242,9 @@ def _pictures(
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         seen = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
-        found["navigation.png"] = lambda file: plot_navigation(estimate, flight.truth, file, observed=seen)
+        found["navigation.png"] = lambda file: plot_navigation(
+            estimate, flight.truth, file, observed=seen, order=case.order
+        )
         if seen is not None:
             found["trajectory.png"] = lambda file: plot_space(estimate, flight.truth, seen, file)
     elif "attitude" in estimate.leaves:

@@ -41,7 +41,8 @@ class Case:
         inputs: the flight's streams by source name.
         score: `result -> {metric: value}`, against the flight's truth. It may have a method `reads(graph)`,
             the names of the streams that it looks at; then a study of many runs at once keeps only those. It
-            may have a method `remarks(result)`, notes on what the figures do not tell.
+            may have a method `remarks(result)`, notes on what the figures do not tell, and an attribute
+            `order`, the convention of the graph's own angles, in which pictures draw them: "zyx" or "zxy".
         estimate: name of the collected stream that the score and the pictures are of.
         notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
     """
@@ -51,6 +52,11 @@ class Case:
     score: Callable[[Result], dict[str, float]]
     estimate: str = "belief"
     notes: tuple[str, ...] = ()
+
+    @property
+    def order(self) -> str:
+        """The convention in which roll, pitch and yaw are drawn."""
+        return str(getattr(self.score, "order", "zyx"))
 
     def remarks(self, result: Result) -> tuple[str, ...]:
         """All notes on a run: the case's, the result's, and those of the score."""

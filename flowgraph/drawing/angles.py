@@ -9,27 +9,48 @@ from flowgraph.data.series import Series
 NAMES = ("roll", "pitch", "yaw")
 
 
-def euler_angles(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 3) roll, pitch and yaw (Z-Y-X) in degrees of (n, 4) w, x, y, z, without jumps."""
+def angle_name(k: int, order: str) -> str:
+    """Of roll, pitch or yaw; with the convention where it is not the usual one."""
+    return NAMES[k] + (f" ({order})" if order != "zyx" else "")
+
+
+def euler_angles(quaternion: np.ndarray, order: str = "zyx") -> np.ndarray:
+    """(n, 3) roll, pitch and yaw in degrees of (n, 4) w, x, y, z, without jumps.
+
+    R = Rz(yaw) Ry(pitch) Rx(roll), or for "zxy" R = Rz(yaw) Rx(roll) Ry(pitch).
+    """
     w, x, y, z = quaternion.T
+    if order == "zxy":
+        roll = np.arcsin(np.clip(2 * (w * x + y * z), -1.0, 1.0))
+        pitch = np.arctan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y))
+        yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z))
+        return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=0))
 
 
-def euler_variances(quaternion: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(n, 3) variances of roll, pitch and yaw, degrees squared, from (n, 3, 3) of a turn of the body.
+def angle_rates(quaternion: np.ndarray, order: str = "zyx") -> np.ndarray:
+    """E (n, 3, 3) with d(roll, pitch, yaw) = E d(rotation vector in the body).
 
-    By the rates of the angles, d(roll, pitch, yaw) = E d(rotation vector), which has no bound at a pitch of
-    90 degrees.
+    It has no bound where the middle angle is 90 degrees: the pitch of "zyx", the roll of "zxy".
     """
-    roll, pitch, _ = np.deg2rad(euler_angles(quaternion)).T
-    level = np.maximum(np.abs(np.cos(pitch)), 1e-3)
-    s, c, slope = np.sin(roll), np.cos(roll), np.sin(pitch) / level
+    roll, pitch, _ = np.deg2rad(euler_angles(quaternion, order)).T
+    outer, middle = (pitch, roll) if order == "zxy" else (roll, pitch)
+    level = np.maximum(np.abs(np.cos(middle)), 1e-3)
+    s, c, slope = np.sin(outer), np.cos(outer), np.sin(middle) / level
     one, none = np.ones_like(s), np.zeros_like(s)
-    E = np.array([[one, s * slope, c * slope], [none, c, -s], [none, s / level, c / level]])
-    E = np.moveaxis(E, 2, 0)
+    if order == "zxy":
+        E = np.array([[c, none, s], [s * slope, one, -c * slope], [-s / level, none, c / level]])
+    else:
+        E = np.array([[one, s * slope, c * slope], [none, c, -s], [none, s / level, c / level]])
+    return np.moveaxis(E, 2, 0)
+
+
+def euler_variances(quaternion: np.ndarray, spread: np.ndarray, order: str = "zyx") -> np.ndarray:
+    """(n, 3) variances of roll, pitch and yaw, degrees squared, from (n, 3, 3) of a turn of the body."""
+    E = angle_rates(quaternion, order)
     return np.asarray(np.einsum("nij,njk,nik->ni", E, spread, E) * np.rad2deg(1.0) ** 2)
 
 

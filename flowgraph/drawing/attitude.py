@@ -7,8 +7,9 @@ error is split as one would judge it, into a turn about the vertical (heading) a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from flowgraph.drawing import canvas
 from flowgraph.drawing.angles import NAMES, between, euler_angles, euler_variances, matrices
 from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
 from flowgraph.drawing.fields import find, need
+from flowgraph.errors import DataError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,6 +58,50 @@ def plot_orientation(estimate: Series, truth: Series | None = None, file: str | 
         _draw_biases(axes[-1], estimate, bias[0], truth, start)
     for axis in axes[-1]:
         axis.set_xlabel("time since the start [s]")
+    return canvas.save(figure, file)
+
+
+@canvas.picture
+def plot_comparison(
+    estimates: Mapping[str, Series], truth: Series | None = None, file: str | Path | None = None
+) -> Figure:
+    """Roll, pitch and yaw of several filters over the truth, a panel an angle.
+
+    Args:
+        estimates: by name, each with `attitude`; the first is drawn on top.
+        truth: with `attitude`, at times of its own, NaN where it is not known.
+        file: ending in .png, .svg or .pdf.
+
+    Raises:
+        UnknownNameError: where an estimate has no attitude, or for an unknown file ending.
+        DataError: where one has no values, or there is none.
+    """
+    if not estimates:
+        raise DataError(
+            "there is nothing to compare",
+            path="estimates",
+            expected="the series of one filter at least",
+            got="none",
+            fix="run a filter that gives attitudes",
+        )
+    start = min(int(s.time[0]) if len(need(s, "attitude")[0]) else 0 for s in estimates.values())
+    figure = canvas.new_figure(11, 8.0)
+    axes = figure.subplots(3, 1, sharex=True)
+    looks: Any = [{"color": colour, "lw": 1.0} for colour in COLOURS]
+    shown = [(name, s, looks[k % len(looks)]) for k, (name, s) in enumerate(estimates.items())]
+    if truth is not None and len(truth) and find(truth, "attitude") is not None:
+        shown.append(("truth", truth, {"color": TRUTH, "lw": 1.0, "ls": "--"}))
+    for name, series, look in [*shown[1:], shown[0]]:
+        q = need(series, "attitude")[0]
+        known = np.isfinite(q).all(axis=1)
+        angles = np.full((len(q), 3), np.nan)
+        angles[known] = _wrapped(euler_angles(q[known]))
+        for axis, angle in zip(axes, angles.T, strict=True):
+            axis.plot((series.time - start) * 1e-9, _broken(angle), label=name, **look)
+    for k, axis in enumerate(axes):
+        _name(axis, NAMES[k], "[deg]")
+    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), loc="upper right")
+    axes[-1].set_xlabel("time since the start [s]")
     return canvas.save(figure, file)
 
 
@@ -164,4 +210,4 @@ def _name(axis: Axes, title: str, unit: str) -> None:
     axis.set_ylabel(unit)
 
 
-__all__ = ["plot_orientation"]
+__all__ = ["plot_comparison", "plot_orientation"]

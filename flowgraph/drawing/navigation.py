@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flowgraph.data.series import Series
 from flowgraph.drawing import canvas
-from flowgraph.drawing.angles import NAMES, between, euler_angles, euler_variances, turn_between
+from flowgraph.drawing.angles import angle_name, between, euler_angles, euler_variances, turn_between
 from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
 from flowgraph.drawing.fields import SIZES, STATES, find, need, unit_words, variance_of
 from flowgraph.errors import DataError
@@ -56,6 +56,7 @@ def plot_navigation(
     file: str | Path | None = None,
     *,
     observed: Series | None = None,
+    order: str = "zyx",
     extra: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Figure:
     """One page on a navigation filter: trajectory, errors, attitude and biases; only what exists is drawn.
@@ -67,6 +68,7 @@ def plot_navigation(
         truth: the same fields, at times of its own, or None.
         file: ending in .png, .svg or .pdf.
         observed: what a sensor said of the `position`, drawn as dots; or None.
+        order: convention of roll, pitch and yaw: "zyx", R = Rz Ry Rx, or "zxy", R = Rz Rx Ry.
         extra: more panels, by title: an array with one value for each time of the estimate, such as
             `{"tilt error [deg]": tilt, "heading error [deg]": heading}`.
 
@@ -96,7 +98,7 @@ def plot_navigation(
         for k in range(3):
             axis = figure.add_subplot(grid[row, k])
             if field == "attitude":
-                _angle(axis, estimate, truth, k)
+                _angle(axis, estimate, truth, k, order)
             elif field == "attitude error":
                 assert truth is not None
                 _turn(axis, estimate, truth, k)
@@ -181,22 +183,22 @@ def _value(axis: Axes, estimate: Series, truth: Series | None, field: str, k: in
         canvas.scale_when_settled(axis, estimate.seconds, value[:, k], low, high)
 
 
-def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int) -> None:
+def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, order: str) -> None:
     q = need(estimate, "attitude")[0]
-    angle = euler_angles(q)[:, k]
+    angle = euler_angles(q, order)[:, k]
     found = find(estimate, "covariance")
     banded = found is not None and found[0].shape[-1] in SIZES and found[0].shape[-1] >= 9
     if found is not None and banded:
-        variance = euler_variances(q, found[0][:, 6:9, 6:9])[:, k]
+        variance = euler_variances(q, found[0][:, 6:9, 6:9], order)[:, k]
         _within(axis, estimate.seconds, angle, np.minimum(variance, _HALF_A_TURN**2))
     axis.plot(estimate.seconds, angle, color=COLOURS[k], lw=1.0)
     known = None if truth is None else find(truth, "attitude")
     if truth is not None and known is not None:
-        right = euler_angles(known[0])[:, k]
+        right = euler_angles(known[0], order)[:, k]
         begin = np.interp(0, truth.time - estimate.time[0], right)
         right = right + 360 * np.round((angle[0] - begin) / 360)  # the same turn as the estimate
         axis.plot(_since(truth, estimate), right, color=TRUTH, lw=0.9, ls="--")
-    canvas.title(axis, NAMES[k] + (", with 3σ" if banded else ""))
+    canvas.title(axis, angle_name(k, order) + (", with 3σ" if banded else ""))
     axis.set_ylabel("[deg]")
     canvas.nothing_here(axis, angle)
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph.data.series import Series
 from flowgraph.drawing import canvas
+from flowgraph.drawing.angles import angle_name, euler_angles, euler_variances
 from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
 from flowgraph.drawing.fields import STATES
 from flowgraph.errors import DataError
@@ -83,6 +84,8 @@ def plot_ins(
     truth: Series | None = None,
     observed: Series | None = None,
     file: str | Path | None = None,
+    *,
+    order: str = "zyx",
 ) -> Figure:
     """States over time with 3-sigma bands, and the errors; written to `file` if given.
 
@@ -91,6 +94,7 @@ def plot_ins(
         truth: with `position` and `attitude`, and perhaps `velocity` and biases; or None.
         observed: with `position` and `attitude`, drawn as dots; or None.
         file: ending in .png, .svg or .pdf.
+        order: convention of roll, pitch and yaw: "zyx" or "zxy".
 
     Raises:
         DataError: where a series is empty or has no positions.
@@ -108,7 +112,7 @@ def plot_ins(
             axis = axes[row, k]
             sigma = deviation[:, STATES[name] + k]
             if name == "attitude":
-                _angles(axis, estimate, truth, observed, k, seconds, sigma)
+                _attitude(axis, estimate, truth, observed, k, order)
             else:
                 unit, letters = _UNITS[name]
                 _state(axis, estimate, truth, observed, name, k, seconds, sigma)
@@ -169,26 +173,23 @@ def _rotations(series: Series) -> Rotation:
     return Rotation.from_quat(series["attitude"][:, [1, 2, 3, 0]])
 
 
-def _angles(
-    axis: Axes, estimate: Series, truth: Series | None, observed: Series | None, k: int,
-    seconds: np.ndarray, sigma: np.ndarray,
-) -> None:  # fmt: skip
-    """Roll, pitch or yaw (Z-Y-X), degrees, without jumps of a turn; the band is that of the body's axis."""
-
-    def drawn(series: Series) -> np.ndarray:
-        turned: np.ndarray = _rotations(series).as_euler("ZYX")
-        return np.degrees(np.unwrap(turned[:, 2 - k]))
-
-    value = drawn(estimate)
-    wide = 3.0 * np.degrees(sigma)
-    axis.fill_between(seconds, value - wide, value + wide, color=BAND, alpha=0.4, lw=0)
+def _attitude(
+    axis: Axes, estimate: Series, truth: Series | None, observed: Series | None, k: int, order: str
+) -> None:
+    """Roll, pitch or yaw, degrees, without jumps of a turn, in the band that the filter claims for it."""
+    drawn = lambda series: euler_angles(series["attitude"], order)[:, k]
+    value, at = drawn(estimate), STATES["attitude"]
+    spread = estimate["covariance"][:, at : at + 3, at : at + 3]
+    variance = np.minimum(euler_variances(estimate["attitude"], spread, order)[:, k], 180.0**2)
+    wide = 3.0 * canvas.deviation(variance)
+    axis.fill_between(estimate.seconds, value - wide, value + wide, color=BAND, alpha=0.4, lw=0)
     if observed is not None and "attitude" in observed.leaves:
         axis.plot(_since(observed, estimate), drawn(observed), ".", ms=1.5, color=_SEEN)
     if truth is not None and "attitude" in truth.leaves:
         inside = _within(truth, estimate)
         axis.plot(_since(truth, estimate)[inside], drawn(truth)[inside], color=TRUTH, lw=1)
-    axis.plot(seconds, value, color=COLOURS[0], lw=1)
-    axis.set_title(("roll", "pitch", "yaw")[k], loc="left", fontsize=9)
+    axis.plot(estimate.seconds, value, color=COLOURS[0], lw=1)
+    axis.set_title(angle_name(k, order), loc="left", fontsize=9)
     axis.set_ylabel("[deg]")
 
 

@@ -61,6 +61,8 @@ def apriltag(
     for file in sorted(root.glob("**/studentdata*.mat")):
         flight = studentdata.load(str(file))
         notes += [f"{flight.name}: {note}" for note in flight.notes]
+        if flight.truth is None:
+            continue  # the notes say that there is no motion capture
         if "tags" in flight.streams:
             number = int("".join(c for c in file.stem if c.isdigit()) or 0)
             rows += _posed(flight, figures, particles=particles, published=PUBLISHED.get(number))
@@ -113,7 +115,7 @@ def _posed(
         case = graph.case(flight, **settings)
         result = simulate(case.graph, case.inputs)
         if name == "ins_ukf_pose":
-            _draw(figures, flight, result)
+            _draw(figures, flight, result, case.order)
         theirs = {"ins_ekf_pose": 0, "ins_particle": 1}.get(name.partition(",")[0])
         yield _row(
             flight.name, name, case.score(result), raw,
@@ -121,7 +123,7 @@ def _posed(
         )  # fmt: skip
 
 
-def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: Any) -> None:
+def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: Any, order: str) -> None:
     # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.trajectory import plot_ins, plot_space
 
@@ -131,7 +133,7 @@ def _draw(figures: dict[str, Callable[[Path], None]], flight: Flight, result: An
         plot_space(belief, flight.truth, observed, file)
 
     def states(file: Path) -> None:
-        plot_ins(belief, flight.truth, observed, file)
+        plot_ins(belief, flight.truth, observed, file, order=order)
 
     figures[f"{flight.name}_space.png"], figures[f"{flight.name}_states.png"] = space, states
 
@@ -163,7 +165,7 @@ def _flown(
         case = graph.case(flight, **settings)
         result = simulate(case.graph, case.inputs)
         if "ukf_pose" in name:
-            _draw(figures, flight, result)
+            _draw(figures, flight, result, case.order)
         if "velocity" in name:
             grown = {span: drift(result["belief"], flight.truth, span) for span in SPANS}
             said = "; ".join(f"{h:.4f} in {span:g} s ({a:.4f})" for span, (a, h) in grown.items())

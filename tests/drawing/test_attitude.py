@@ -14,7 +14,7 @@ from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.signals import Attitude, AttitudeBiasBelief
 from flowgraph.cli import app
 from flowgraph.drawing.angles import euler_angles, euler_variances
-from flowgraph.drawing.attitude import plot_orientation
+from flowgraph.drawing.attitude import plot_comparison, plot_orientation
 
 
 def belief(n: int = 50) -> tuple[Series, Series]:
@@ -54,6 +54,26 @@ def test_angles_errors_and_biases_are_drawn_with_bands(tmp_path):
     assert not gap[:20].any()
     np.testing.assert_allclose(heading[~gap], 2.0, atol=1e-6)
     np.testing.assert_allclose(lines(figure, "inclination error")[-1][~gap], 0.0, atol=1e-5)
+
+
+def test_filters_are_compared_over_the_truth(tmp_path):
+    estimate, truth = belief()
+    other = Series(estimate.time[::2], Attitude(attitude=estimate["attitude"][::2]))
+    figure = plot_comparison({"filter": estimate, "gyroscope": other}, truth, tmp_path / "c.svg")
+    assert [a.get_title(loc="left") for a in figure.axes] == ["roll", "pitch", "yaw"]
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["gyroscope", "truth", "filter"]
+    seen, right, ours = lines(figure, "yaw")
+    assert [len(y) for y in (seen, right, ours)] == [25, 50, 50]
+    assert np.isnan(right[20:25]).all()
+    both = np.isfinite(right) & np.isfinite(ours)
+    np.testing.assert_allclose((ours - right)[both], 2.0, atol=1e-6)
+    assert len(plot_comparison({"filter": estimate}).axes[0].lines) == 1
+    with pytest.raises(DataError, match="there is nothing to compare"):
+        plot_comparison({})
+    with pytest.raises(UnknownNameError, match="attitude"):
+        plot_comparison({"bias": Series(estimate.time, estimate["gyro_bias"])})
 
 
 def test_only_what_exists_is_drawn():

@@ -273,7 +273,7 @@ def test_a_dot_program_that_fails_is_replaced_or_named(script, tmp_path, monkeyp
     dot.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     pytest.importorskip("pygraphviz")
-    assert draw(built()).startswith("<svg")
+    assert str(draw(built())).startswith("<svg")
     monkeypatch.setitem(sys.modules, "pygraphviz", None)
     with pytest.raises(MissingDependencyError, match="nothing here can lay out") as caught:
         draw(built())

@@ -27,6 +27,7 @@ OWN = {
     "rbpf_indoor": ("sim", [_FEW]),
     "marg": ("sim:thesis", ["sensors=imu,magnetometer"]),
     "particle": ("sim:plane", [_FEW]),
+    "tracker": ("sim:plane", []),
     "ins_ekf_pose": ("course", []),
     "ins_ukf_pose": ("course", []),
     "ins_ukf_velocity": ("course", []),

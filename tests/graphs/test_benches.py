@@ -52,6 +52,10 @@ def test_broad_has_a_row_a_trial_and_filter_and_their_means(trials):
     for figure in ("total_rmse_deg", "heading_rmse_deg", "inclination_rmse_deg"):
         assert ours[2][figure] == pytest.approx((ours[0][figure] + ours[1][figure]) / 2)
         assert 0.0 < ours[2][figure] < 2.0
+    for figure in ("tilt_nees_median", "heading_nees_median"):
+        one, two, all_of_them = (row[figure] for row in ours)
+        assert 0.0 < min(one, two) <= all_of_them <= max(one, two)
+        assert not any(figure in row for row in report.rows if row["filter"] != "marg")
 
 
 @pytest.mark.parametrize("peer", ["vqf", "madgwick"])
@@ -84,6 +88,16 @@ def test_ese650_has_a_row_a_set_and_filter_beside_what_was_published(tmp_path):
     assert report.rows[3]["yaw_rmse_rad"] == PUBLISHED[2][2] == 0.411
     with pytest.raises(UnknownNameError, match="no graph is called 'kalmann'"):
         ese650(data=str(tmp_path), filters="kalmann")
+
+
+def test_ese650_draws_filter_accelerometer_and_gyroscope_against_the_truth(tmp_path):
+    for n in (1, 2):
+        course(tmp_path, n, seconds=4.0)
+    report = ese650(data=str(tmp_path), engine="python")
+    assert set(report.figures) == {"set1.png", "set2.png"}
+    report.figures["set2.png"](tmp_path / "set2.png")
+    assert (tmp_path / "set2.png").stat().st_size > 20_000
+    assert ese650(data=str(tmp_path), engine="python", filters="imu_calibration").figures == {}
 
 
 def test_data_come_from_the_option_the_environment_or_beside(trials, tmp_path, monkeypatch):

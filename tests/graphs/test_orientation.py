@@ -157,7 +157,7 @@ def test_the_engines_agree(name):
 
 
 def test_they_are_lowered_and_drawn():
-    paths = ("calibrate", "thaw", "predict_unscented", "reading", "update_unscented", "named_orientation")
+    paths = ("calibrate", "predict_unscented", "reading", "update_unscented", "named_orientation")
     is_lowered_and_drawn(a_case("quaternion_ukf"), *paths)
     is_lowered_and_drawn(a_case("roll_pitch"), "attitude")
     is_lowered_and_drawn(a_case("gyro_integration"), "attitude")
@@ -229,6 +229,30 @@ def test_a_body_at_rest_or_turning_about_one_axis_is_not_taken_for_frozen():
     np.testing.assert_array_equal(silenced(still), still)
     turning = still + np.array([0.0, 0.5, 0.0])
     np.testing.assert_array_equal(silenced(turning), turning)
+
+
+def turntable(rate: np.ndarray, seconds: float = 8.0) -> Flight:
+    """A body that rests for a second and then turns evenly, with an exact unit."""
+    time = np.arange(0, round(seconds * 100)) * 10_000_000
+    turned = np.maximum(time * 1e-9 - 1.0, 0.0)[:, None] * rate
+    q = np.asarray(from_rotation_vector(turned, xp=np))
+    x = np.concatenate([q, np.where(time[:, None] >= 10**9, rate, 0.0)], axis=1)
+    z = see_rate_and_gravity(x, np)
+    imu = Series(time, Imu(gyro=x[:, 4:], specific_force=z[:, 3:]), name="imu")
+    return Flight("turntable", {"imu": imu}, Series(time, Attitude(attitude=q), name="truth"), {})
+
+
+@pytest.mark.parametrize("rate", [(0.5, 0.5, 0.5), (0.2, -0.3, 0.15), (-1.0, 0.4, 0.8)], ids=str)
+def test_a_gyroscope_that_turns_evenly_is_not_frozen(rate):
+    """At 0.5 rad/s an axis it ended a hundred degrees off."""
+    made = turntable(np.array(rate))
+    assert score(quaternion_ukf, made)["total_rmse_deg"] < 0.5
+    assert not any("frozen" in n for n in quaternion_ukf.case(made).notes)
+    known = Flight(made.name, made.streams, made.truth, {"gyro_freezes": 0.15})
+    assert score(quaternion_ukf, known)["total_rmse_deg"] > 10.0
+    assert any("0.15 s has frozen" in n for n in quaternion_ukf.case(known).notes)
+    assert score(quaternion_ukf, known, frozen=0.0)["total_rmse_deg"] < 0.5
+    is_lowered_and_drawn(quaternion_ukf.case(known), "thaw")
 
 
 def test_rest_is_found_in_the_readings():

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flowgraph import DataError, DeclarationError, Series, UnknownNameError
-from flowgraph.blocks.datasets.course import Motion, see
+from flowgraph.blocks.datasets.course import Motion, see, simulated_content
 from flowgraph.blocks.datasets.parameters import Parameters
+from flowgraph.blocks.datasets.studentdata import packet_tags
 from flowgraph.blocks.geometry import to_matrix
 from flowgraph.blocks.models.unscented_ins import update_camera_velocity
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, MotionTruth
@@ -306,3 +307,79 @@ def test_a_delay_is_found():
     assert np.allclose(to_matrix(q, xp=np), flight.attitude(t))
     with pytest.raises(DataError, match=r"do not overlap"):
         velocity_error(late, truth, COURSE_MOUNT, 100.0)
+
+
+# Tags that were taken for others
+
+
+def an_image(k: int = 0, tags: int = 99, noise: float = 0.5, seed: int = 1) -> tuple[Any, Any, Any]:
+    """The ids and corners of a packet of a simulated flight, and where the body is."""
+    made = simulated_content(seed, duration=0.01 * (k + 1), pixel_noise=noise)
+    ids, corners = packet_tags(made["data"][k], "packet")
+    return ids[:tags].copy(), corners[:tags].copy(), made["vicon"][:3, k]
+
+
+def measured(ids: Any, corners: Any, **more: Any) -> Any:
+    return measure(ids, corners, tag_map=course_map(), camera=COURSE_CAMERA, mount=COURSE_MOUNT, **more)
+
+
+def spoil(ids: Any, corners: Any, how: str, which: int) -> None:
+    if how == "an id":
+        ids[which] = (ids[which] + 41) % 108
+    elif how == "the order of corners":
+        corners[which] = corners[which][[2, 3, 0, 1]]
+    elif how == "a corner":
+        corners[which, 1] += [25.0, -18.0]
+    else:
+        ids[which] = ids[which - 1]
+
+
+SPOILT = ["an id", "the order of corners", "a corner", "an id that is there twice"]
+
+
+@pytest.mark.parametrize("how", SPOILT)
+@pytest.mark.parametrize(("tags", "wrong"), [(99, 1), (99, 3), (6, 2), (4, 1)])
+def test_wrong_tags_are_left_out(how, tags, wrong):
+    for seed in range(1, 4):
+        ids, corners, place = an_image(3, tags, seed=seed)
+        whole = measured(ids, corners)
+        for which in range(1, 1 + wrong):
+            spoil(ids, corners, how, which)
+        found = measured(ids, corners)
+        assert int(found.tags) == len(ids) - wrong
+        error = found.position - place
+        assert np.linalg.norm(error) < 0.06
+        assert error @ np.linalg.solve(found.covariance[:3, :3], error) < 16.3  # 99.9 %
+        assert np.trace(found.covariance) >= np.trace(whole.covariance)
+
+
+def test_one_of_seventeen_costs_nothing():
+    """It cost half a metre."""
+    ids, corners, place = an_image(0, 17)
+    assert len(ids) >= 8
+    spoil(ids, corners, "an id", 5)
+    assert np.linalg.norm(measured(ids, corners, reject=False).position - place) > 0.1
+    assert np.linalg.norm(measured(ids, corners).position - place) < 0.02
+
+
+def test_where_no_majority_decides_the_covariance_says_so():
+    inside = []
+    for k in range(0, 40, 4):
+        ids, corners, place = an_image(k, 2)
+        spoil(ids, corners, "an id", 0)
+        found = measured(ids, corners)
+        assert int(found.tags) == 2
+        error = found.position - place
+        inside.append(error @ np.linalg.solve(found.covariance[:3, :3], error) < 16.3)
+        assert np.sqrt(np.trace(found.covariance[:3, :3])) > 0.1
+    assert np.mean(inside) > 0.7
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5, 1.5])
+def test_honest_tags_are_all_used(noise):
+    """Also where corners are worse than they were said to be; the pose is to the bit what it was."""
+    for k in range(4):
+        ids, corners, _ = an_image(k, noise=noise)
+        found, plain = measured(ids, corners), measured(ids, corners, reject=False)
+        for name in ("position", "attitude", "covariance", "tags"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))

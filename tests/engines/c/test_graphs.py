@@ -27,6 +27,7 @@ SINGLE = {
     "gyro_integration": 1e-3,
     "marg": 1e-3,
     "particle": 5e-2,
+    "tracker": 1e-4,
     "ins_particle": 0.2,  # of 60 particles; one that is drawn in place of another moves the mean
     "rbpf_indoor": 5e-2,
     "rbpf_outdoor": 5e-2,

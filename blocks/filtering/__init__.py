@@ -1,0 +1,101 @@
+"""Filters: the belief about a state that moves as one model says and is seen as others say.
+
+A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
+by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
+of those that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
+"""
+
+from __future__ import annotations
+
+from flowgraph.blocks.filtering.banks import Interacting, imm
+from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
+from flowgraph.blocks.filtering.gaussian import (
+    Extended,
+    GaussianMethod,
+    Linear,
+    SquareRoot,
+    Unscented,
+    innovation_log_likelihood,
+)
+from flowgraph.blocks.filtering.methods import (
+    Advanced,
+    Method,
+    Seen,
+    correct,
+    cubature,
+    extended,
+    linear,
+    predict,
+    square_root,
+    unscented,
+)
+from flowgraph.blocks.filtering.particles import (
+    PROPOSALS,
+    Particles,
+    auxiliary_cloud,
+    carry_cloud,
+    cloud_size,
+    guide_cloud,
+    particles,
+    resample_cloud,
+    weigh_cloud,
+)
+from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
+from flowgraph.blocks.kalman import LinearModel
+from flowgraph.blocks.signals import Gaussian
+from flowgraph.blocks.statespace import (
+    DiscreteModel,
+    LinearMeasurement,
+    MeasurementModel,
+    MotionModel,
+    runge_kutta,
+)
+from flowgraph.blocks.unscented import SigmaPoints
+
+__all__ = [
+    "StateSpace",
+    "euclidean",
+    "angle",
+    "quaternion",
+    "SO",
+    "SE",
+    "SE_2",
+    "MotionModel",
+    "runge_kutta",
+    "LinearModel",
+    "DiscreteModel",
+    "MeasurementModel",
+    "LinearMeasurement",
+    "Gaussian",
+    "filtered",
+    "first",
+    "FirstMeasurement",
+    "linear",
+    "extended",
+    "square_root",
+    "unscented",
+    "cubature",
+    "SigmaPoints",
+    "imm",
+    "Interacting",
+    "particles",
+    "PROPOSALS",
+    "Particles",
+    "carry_cloud",
+    "guide_cloud",
+    "auxiliary_cloud",
+    "weigh_cloud",
+    "resample_cloud",
+    "cloud_size",
+    "Method",
+    "Advanced",
+    "Seen",
+    "predict",
+    "correct",
+    "GaussianMethod",
+    "Linear",
+    "Extended",
+    "SquareRoot",
+    "Unscented",
+    "innovation_log_likelihood",
+]

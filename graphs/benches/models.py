@@ -1,0 +1,147 @@
+"""Every method on every problem: how good it is, how honest, what it costs, and whether a peer agrees.
+
+The truth of each problem is drawn from its own model, so that an exact filter has a NEES of the dimension of
+its state, and the log-likelihood compares the methods: the higher, the better the measurements were foretold.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Report, UnknownNameError, simulate
+from flowgraph.blocks.filtering import cubature, extended, linear, particles, unscented
+from flowgraph.graphs.benches.model_peers import PEERS
+from flowgraph.graphs.benches.model_problems import PROBLEMS, Drawn, Problem, declared, drawn
+from flowgraph.language.checks import need_count
+
+__all__ = ["METHODS", "models"]
+
+METHODS: dict[str, Callable[[int], Any]] = {
+    "linear": lambda n: linear(),
+    "extended": lambda n: extended(),
+    "iterated": lambda n: extended(iterations=3),
+    "unscented": lambda n: unscented(),
+    "cubature": lambda n: cubature(),
+    "bootstrap": lambda n: particles(n),
+    "guided": lambda n: particles(n, proposal="guided"),
+}
+"""By name, given the number of particles."""
+
+
+def models(
+    *,
+    problem: str = "all",
+    method: str = "all",
+    runs: int = 5,
+    particles: int = 1000,
+    engine: str = "c",
+    seed: int = 0,
+) -> Report:
+    """Filters of a model by every method, beside peers: from a point to a pose and a stochastic volatility.
+
+    Args:
+        problem: point, radar, ranges, turn, bicycle, pendulum, pose, volatility, or all.
+        method: linear, extended, iterated, unscented, cubature, bootstrap, guided, or all.
+        runs: drawn from the model, over which errors are averaged.
+        particles: how many.
+        engine: that runs the filters.
+        seed: of the first run; the next has the next.
+
+    Returns:
+        A row a problem and method: `problem`, `filter`, `rmse` (of the numbers of the tangent space
+        together), `nees_mean` (right: `dimension`), `dimension`, `log_likelihood` (of a run), `peer`,
+        `peer_difference` (the largest of means, relative to max(1, |x|), and covariances, relative to the
+        deviations; of particles on `point` the difference of the log-likelihood from the exact one; None
+        without a peer), and `c_us`, the time a tick of the engine's loop (of `engine`, "c" if left out).
+
+    Raises:
+        UnknownNameError: for a problem or method that is not there; DeclarationError: for a number out of
+            range.
+    """
+    for name, value, known in (("problem", problem, PROBLEMS), ("method", method, METHODS)):
+        if value != "all" and value not in known:
+            raise UnknownNameError(name, value, ["all", *known], path=f"models.{name}")
+    need_count("models", "runs", runs, least=1)
+    need_count("models", "particles", particles, least=1)
+    rows = []
+    for which in PROBLEMS if problem == "all" else (problem,):
+        made = PROBLEMS[which]()
+        some = [drawn(made, seed + k) for k in range(runs)]
+        declaration = declared(made)
+        for name in METHODS if method == "all" else (method,):
+            if name == "linear" and not made.linear:
+                continue
+            rows.append(_row(which, name, made, declaration, some, particles, engine, seed))
+    notes = [f"{runs} runs a row, drawn from the model; {particles} particles"]
+    missing = sorted({p for p, _ in PEERS.values() if importlib.util.find_spec(p) is None})
+    notes += [f"without {name}, which is not installed (extra bench)" for name in missing]
+    return Report(rows, {}, tuple(notes))
+
+
+def _row(
+    which: str,
+    name: str,
+    made: Problem,
+    declaration: Any,
+    some: list[Drawn],
+    count: int,
+    engine: str,
+    seed: int,
+) -> dict[str, Any]:
+    built = declaration.build(method=METHODS[name](count), sizes=_sizes(some[0]))
+    space, squares, nees, likely, seconds, ticks = made.motion.space, [], [], [], 0.0, 0
+    first = None
+    for k, run in enumerate(some):
+        result = simulate(built, run.inputs, engine=engine, seed=seed + k)
+        belief = result["output"]
+        apart = np.asarray(space.minus(run.truth, belief["mean"], np))
+        squares.append(np.mean(np.sum(apart**2, axis=-1)))
+        solved = np.linalg.solve(belief["covariance"], apart[..., None])[..., 0]
+        nees.append(np.mean(np.sum(apart * solved, axis=-1)))
+        likely.append(result["log_likelihood"]["value"].sum())
+        seconds, ticks = seconds + result.wall_s, ticks + result.ticks
+        first = first or belief
+    peer, difference = _peer(which, name, made, some[0], first, likely[0], declaration, engine)
+    return {
+        "problem": which,
+        "filter": name,
+        "rmse": float(np.sqrt(np.mean(squares))),
+        "nees_mean": float(np.mean(nees)),
+        "dimension": space.tangent,
+        "log_likelihood": float(np.mean(likely)),
+        "peer": peer,
+        "peer_difference": difference,
+        "c_us": 1e6 * seconds / ticks,
+    }
+
+
+def _sizes(run: Drawn) -> dict[str, int]:
+    return {"m": run.inputs["z"]["value"].shape[-1]}
+
+
+def _peer(
+    which: str,
+    name: str,
+    made: Problem,
+    run: Drawn,
+    belief: Any,
+    likely: float,
+    declaration: Any,
+    engine: str,
+) -> tuple[str | None, float | None]:
+    """Who has the same method, and how far it is from ours on the first run."""
+    if made.linear and name in ("bootstrap", "guided"):
+        exact = simulate(declaration.build(method=linear(), sizes=_sizes(run)), run.inputs, engine=engine)
+        return "linear", float(likely - exact["log_likelihood"]["value"].sum())
+    peer, theirs = PEERS.get((which, name), (None, None))
+    if peer is None or theirs is None or importlib.util.find_spec(peer) is None:
+        return None, None
+    mean, covariance = theirs(made, run)
+    off = np.abs(belief["mean"] - mean) / np.maximum(1.0, np.abs(mean))
+    deviation = np.sqrt(np.einsum("nii->ni", covariance))
+    wide = np.abs(belief["covariance"] - covariance) / (deviation[:, :, None] * deviation[:, None, :])
+    return peer, float(max(off.max(), wide.max()))

@@ -1,0 +1,63 @@
+"""The tick that the Kalman filters of fifteen numbers with Euler angles share, whatever predicts.
+
+The belief of the tick before is predicted to now with what the IMU says of the step, made less sure where
+the reading is old, corrected where there is a measurement, and doubted where a
+gate has refused a run of them. What differs is handed in: `ins_ekf_pose`, `ins_ukf_pose` and
+`ins_ukf_velocity` are their predictions, their corrections, and this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flowgraph import collect, delay, latest
+from flowgraph.blocks.kalman.lost import Held, bridge, find_back
+from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
+from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.signals import Gaussian, Imu
+
+__all__ = ["euler_loop"]
+
+
+def euler_loop(
+    imu: Any,
+    measured: Any,
+    *,
+    start: Gaussian,
+    order: str,
+    reading: str,
+    predict: Callable[[Any, Any], Any],
+    update: Callable[[Any, Any], Any],
+    gate: float | None,
+    patience: int,
+    held: Held | None,
+) -> dict[str, Any]:
+    """Wire the loop, and name what a graph collects: `belief`, `angles` and the `innovation`.
+
+    Args:
+        imu, measured: the sources.
+        start: the belief over `euler_ins.STATE`.
+        order: "zxy" or "zyx".
+        reading: of the IMU, "instant" or "mean"; see `driving`.
+        predict: `(belief, drive)`, the prior.
+        update: `(prior, control)`, the posterior and the innovation.
+        gate, patience: whether `update` refuses measurements, and how many in a row are taken for outliers.
+        held: from which age on a reading is old.
+    """
+    belief = delay(start, name="belief")
+    last = delay(Imu.at_rest(), name="last_control")
+    control = latest(imu, init=Imu.at_rest(), at=imu | measured, name="control")
+    prior = predict(belief, driving(last, control, reading))
+    if held is not None:
+        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    posterior, innovation = update(prior, control)
+    if gate is not None:
+        posterior = find_back(posterior, innovation, patience=patience, moving=9)
+    belief.feed(posterior)
+    last.feed(control)
+    collect(innovation, "innovation")
+    return {
+        "belief": navigation_belief(posterior, order=order),
+        "angles": euler_angles(posterior, order=order),
+    }

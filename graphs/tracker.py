@@ -1,0 +1,111 @@
+"""tracker: a point in the plane that is seen now and then, by any method of filtering.
+
+The model is declared once, a velocity that wanders and a position that is measured, and the method is a
+setting: Kalman, extended, unscented, cubature, particles, or two motions of which either may be the true one.
+For a linear model with Gaussian noise the first four are one filter, and particles approach it.
+
+    p' = v      v' = w      z = p + N(0, noise^2 I)
+
+Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+sec. 6.2.2. The model stands in `blocks/models/tracking.py`, the methods in `blocks/filtering`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+
+from flowgraph import Case, Stream, block, graph
+from flowgraph.blocks.filtering import (
+    LinearMeasurement,
+    cubature,
+    extended,
+    filtered,
+    imm,
+    linear,
+    particles,
+    unscented,
+)
+from flowgraph.blocks.metrics.errors import plane_errors
+from flowgraph.blocks.models.tracking import constant_velocity
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.settings import Positive, one_of
+from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
+
+METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
+
+
+@block
+def seen_in_plane(belief: Gaussian) -> PlaneBelief:
+    """The position of a belief about position and velocity."""
+    return PlaneBelief(position=belief.mean[..., :2], covariance=belief.covariance[..., :2, :2])
+
+
+@graph
+def tracker(
+    position: Stream[PlanePosition],
+    *,
+    start: Gaussian,
+    wander: float,
+    position_noise: float,
+    method: Any = None,
+    gate: float | None = None,
+    patience: int = 5,
+):
+    """A point whose velocity wanders, followed by its positions.
+
+    Collected at every position: `belief`, `prior`, `posterior`, `innovation` and `log_likelihood`.
+    """
+    motion = constant_velocity(wander)
+    seen = LinearMeasurement(motion.space, np.eye(2, 4), noise=position_noise**2)
+    belief = filtered(
+        motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience
+    )
+    return {"belief": seen_in_plane(belief), "posterior": belief}
+
+
+@on_flight(tracker, "position")
+def for_flight(
+    on: OnFlight,
+    *,
+    method: Annotated[str, one_of(*METHODS)] = "linear",
+    wander: Positive = 2.0,
+    calm: Positive = 0.1,
+    position_noise: Positive | None = None,
+    cloud: Particles,
+    gated: Gated,
+    scored: Scored,
+) -> Case:
+    """Start the filter at the first position of a flight in the plane, such as `sim:plane`.
+
+    Args:
+        flight: with the stream `position`.
+        method: linear, extended, unscented, cubature, particles, or imm, which also has a motion of density
+            `calm`.
+        wander: density of the acceleration, m/s^2/sqrt(Hz).
+        calm: that of the other motion of imm.
+        position_noise: standard deviation in m; the flight's own if left out.
+
+    Raises:
+        DataError: where the flight lacks the stream; DeclarationError: for a setting that is out of range.
+    """
+    motion = constant_velocity(wander)
+    chosen = {
+        "linear": linear,
+        "extended": extended,
+        "unscented": unscented,
+        "cubature": cubature,
+        "particles": lambda: particles(cloud.particles, seed=cloud.seed, **cloud.resampling()),
+        "imm": lambda: imm(motion, constant_velocity(calm), method=linear()),
+    }[method]()
+    noise = on.noise("position_noise", position_noise)
+    first = on.inputs["position"]["position"][0]
+    return on.case(
+        scored.score(on, plane_errors),
+        start=motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0)),
+        wander=wander,
+        position_noise=noise,
+        method=chosen,
+        **gated.gating(),
+    )
