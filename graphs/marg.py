@@ -25,8 +25,10 @@ import numpy as np
 from flowgraph import Case, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import static_alignment, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.lost import Held, bridged
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
+    doubt_heading,
     join_orientation,
     predict_heading,
     start_heading,
@@ -40,7 +42,7 @@ from flowgraph.blocks.orientation.marg import (
     predict_level,
     start_level,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import counted_errors
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.scoring.tuning import given
@@ -64,6 +66,7 @@ def marg(
     rest: RestRule = _REST,
     trust: FieldTrust = _TRUST,
     north: float = np.pi / 2.0,
+    held: Held | None = None,
 ):
     """Orientation and gyroscope bias from nine axes, tilt and heading apart.
 
@@ -74,17 +77,20 @@ def marg(
     reading = latest(imu, init=Imu.at_rest(), at=ticks, name="reading")
     still = detect_rest(reading, rule=rest, name="rest")
     moved = predict_level(tilt, reading, noise=noise, scale=scale)
+    moved = bridged(tilt, moved, imu, held=held, velocity=0, attitude=3)
     level = hold_velocity(
         moved, reading, still, noise=noise, speed=speed, speed_memory=speed_memory, name="level"
     )
     wandered = predict_heading(angle, level, reading, still, drift=drift, scale=scale)
+    if held is not None:
+        wandered = doubt_heading(wandered, imu, held=held)
     found = update_heading(wandered, level, magnetometer, trust=trust, north=north, name="heading")
     tilt.feed(level)
     angle.feed(found)
     return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}
 
 
-@on_flight(marg, "imu", "magnetometer")
+@on_flight(marg, "imu", "magnetometer", measured=None)
 def for_flight(
     on: OnFlight,
     *,
@@ -96,6 +102,7 @@ def for_flight(
     heading_density: Positive = 0.085,
     hold: NotNegative = 0.3,
     align: Positive = 2.0,
+    control: HeldControl,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight with an IMU and a magnetometer, aligned by its first readings.
@@ -135,4 +142,5 @@ def for_flight(
         scale=scale,
         trust=FieldTrust(density=heading_density, hold=hold),
         north=north,
+        held=control.held(on, imu),
     )

@@ -22,6 +22,7 @@ from flowgraph import block
 from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, normalize, rotate, to_matrix
 from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.lost import Held, aged
 from flowgraph.blocks.signals import (
     Alignment,
     AttitudeBiasBelief,
@@ -35,6 +36,7 @@ from flowgraph.blocks.signals import (
 __all__ = [
     "FieldTrust",
     "OrientationBelief",
+    "doubt_heading",
     "join_orientation",
     "predict_heading",
     "start_heading",
@@ -111,6 +113,23 @@ def predict_heading(
         strength=belief.strength,
         dip=belief.dip,
     )
+
+
+@block
+def doubt_heading(  # type: ignore[no-untyped-def]
+    state, belief: HeadingBelief, imu: Imu | None, *, held: Held, dt: float, xp: Any
+) -> tuple[Any, HeadingBelief]:
+    """Make a heading less sure by the age of the reading of the gyroscope: rate^2 w, as `bridge` has it.
+
+    State: that age, s.
+    """
+    rest, _, w = aged(state, imu, held, dt, xp)
+    return rest, belief.replace(variance=belief.variance + held.rate**2 * w)
+
+
+@doubt_heading.init
+def _fresh(*_: Any, **__: Any) -> Any:
+    return np.float64(0.0)
 
 
 @block
