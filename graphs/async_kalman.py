@@ -22,6 +22,7 @@ from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
 from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 
 
@@ -74,7 +75,7 @@ def async_kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@on_flight(async_kalman, "imu", "vicon")
+@on_flight(async_kalman, "imu", "vicon", told=with_imu)
 def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 

@@ -28,7 +28,8 @@ from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spre
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
-from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
@@ -88,6 +89,7 @@ def for_flight(
     gyro_noise: NotNegative | None = None,
     accelerometer_noise: NotNegative | None = None,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with a gyroscope and an accelerometer, at the truth's first attitude.
 
@@ -99,14 +101,16 @@ def for_flight(
         gyro_noise, accelerometer_noise: densities in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), for the covariance;
             the flight's own if left out.
     """
-    flight, (gyro, push), noise = on.flight, on.inputs.values(), None
+    flight, push, noise = on.flight, on.inputs["accelerometer"], None
+    attitude, begin = started.levelled(on, "accelerometer", push["force"], deviates=covariance)
     if covariance:
         force = reading_deviation(flight, "accelerometer", push, accelerometer_noise)
-        start = 1e-3 if flight.truth is not None else 0.3
-        noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start)
+        start = 1e-3 if begin.told else 0.3
+        noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start, begin.heading)
     return on.case(
         scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
-        start=first_attitude(flight, gyro, on.first_up("accelerometer", push["force"])),
+        inputs=begin.inputs,
+        start=Attitude(attitude=attitude),
         alpha=alpha,
         reading=reading_of(flight, "gyro"),
         covariance=noise,

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flowgraph import collect, delay, latest
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
@@ -32,6 +33,7 @@ def euler_loop(
     gate: float | None,
     patience: int,
     held: Held | None,
+    gravity: tuple[float, float, float] = GRAVITY,
 ) -> dict[str, Any]:
     """Wire the loop, and name what a graph collects: `belief`, `angles` and the `innovation`.
 
@@ -44,10 +46,11 @@ def euler_loop(
         update: `(prior, control)`, the posterior and the innovation.
         gate, patience: whether `update` refuses measurements, and how many in a row are taken for outliers.
         held: from which age on a reading is old.
+        gravity: in the world, m/s^2, for what a unit at rest reads.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | measured, name="control")
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | measured, name="control")
     prior = predict(belief, driving(last, control, reading))
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update(prior, control)

@@ -23,6 +23,7 @@ from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.point import between, point_belief, point_model, whole
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, readings
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, PointReading, WorldAcceleration
 
 
@@ -66,7 +67,7 @@ def kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@on_flight(kalman, "imu", "vicon")
+@on_flight(kalman, "imu", "vicon", told=with_imu)
 def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.plane import (
@@ -29,6 +29,7 @@ from flowgraph.blocks.models.plane import (
     weigh_plane,
 )
 from flowgraph.blocks.models.spread import spread_plane
+from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
@@ -50,8 +51,8 @@ def particle(
     """Bootstrap particle filter of a point in the plane.
 
     Every tick moves the cloud to now; a tick with a position also weighs it and may resample it. Collected:
-    `belief` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at every
-    position.
+    `belief` at every tick, averaged before resampling; `effective_sample_size`, `depleted` and `ancestors`
+    at every position.
     """
     cloud = delay(start, name="cloud")
     control = latest(velocity, init=PlaneVelocity(velocity=np.zeros(2)), name="control")
@@ -67,6 +68,7 @@ def particle(
         weighed, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", name="resample"
     )
     cloud.feed(merge(fresh, moved, tie="left", name="next"))
+    collect(depletion(size, numbers=2), "depleted")
     belief = average_plane(merge(weighed, moved, tie="left", name="now"), name="average")
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 

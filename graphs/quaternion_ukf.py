@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph
-from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
 from flowgraph.blocks.kalman.lost import PATIENCE, find_back, stay
 from flowgraph.blocks.metrics.errors import orientation_errors
@@ -34,6 +34,7 @@ from flowgraph.blocks.orientation.accelerometer import (
 )
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
@@ -106,8 +107,8 @@ def for_flight(
     *,
     attitude_walk: Positive = 0.02,
     rate_walk: Positive = 10.0,
-    gyro_noise: Positive = 0.02,
-    force_noise: Positive = 2.0,
+    gyro_noise: Positive | None = None,
+    force_noise: Positive | None = None,
     weighted: bool = False,
     alpha: Positive = 1.0,
     beta: float = 2.0,
@@ -117,13 +118,15 @@ def for_flight(
     frozen: NotNegative | None = None,
     gated: Gated,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
     Args:
         flight: with the stream `imu`.
         attitude_walk, rate_walk: densities of the random walks, rad/sqrt(s) and rad/s/sqrt(s).
-        gyro_noise, force_noise: standard deviations of one reading, rad/s and m/s^2.
+        gyro_noise, force_noise: standard deviations of one reading, rad/s and m/s^2; those that the flight
+            brings, or 0.02 and 2, if left out.
         weighted: whether the sigma points are the scaled set of alpha, beta and kappa.
         alpha, beta, kappa: of that set.
         mean: of quaternions, "kraft" or "markley".
@@ -136,14 +139,20 @@ def for_flight(
         on.note(
             "assumed", f"imu: a gyroscope that keeps one level for {after:g} s has frozen, and reads nothing"
         )
-    begin = orientation_start(on.flight, on.inputs["imu"], still)
+    brought = on.flight.info.get("orientation_noise", {})
+    begin, pose = started.orientation(on, on.inputs["imu"], still)
+    start = start_orientation(begin.attitude)
+    if pose.heading is not None:
+        up = to_matrix(begin.attitude, xp=np)[2]  # the vertical, in the body
+        start.covariance[:3, :3] += np.outer(up, up) * (pose.heading**2 - up @ start.covariance[:3, :3] @ up)
     return on.case(
         scored.score(on, orientation_errors, innovations=False),
-        start=start_orientation(begin.attitude),
+        inputs=pose.inputs,
+        start=start,
         attitude_walk=attitude_walk,
         rate_walk=rate_walk,
-        gyro_noise=gyro_noise,
-        force_noise=force_noise,
+        gyro_noise=given(gyro_noise, brought.get("gyro", 0.02)),
+        force_noise=given(force_noise, brought.get("force", 2.0)),
         points=SigmaPoints(alpha, beta, kappa, mean) if weighted else SigmaPoints(1.0, 0.0, 0.0, mean),
         still=begin.still,
         up=begin.up,

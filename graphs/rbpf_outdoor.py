@@ -14,7 +14,7 @@ q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
 
 from __future__ import annotations
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
@@ -25,6 +25,7 @@ from flowgraph.blocks.outdoor.cloud import (
     correct_field,
     correct_flow,
     correct_position,
+    outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
@@ -32,6 +33,7 @@ from flowgraph.blocks.outdoor.cloud import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
+from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.particles.resampling import draw_ancestors
 from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
@@ -39,10 +41,11 @@ from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Out
 
 
 @graph
-def average(cloud: Stream[Cloud]):
-    """The weighted expectation of the pose."""
-    weight = weights(cloud)
-    return average_pose(cloud, weight, average_attitude(cloud, weight, name="attitude"), name="pose")
+def average(cloud: Stream[OutdoorCloud], plain: Stream[Cloud]):
+    """The weighted expectation of the pose, and its covariance."""
+    weight = weights(plain)
+    pose = average_pose(plain, weight, average_attitude(plain, weight, name="attitude"), name="pose")
+    return pose, outdoor_belief(cloud, plain, weight, pose, name="spread")
 
 
 @graph
@@ -67,8 +70,8 @@ def rbpf_outdoor(
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
     resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `pose` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at
-    every tick with a reading.
+    Collected: `pose` and `belief`, with its covariance, at every tick, averaged before resampling;
+    `effective_sample_size`, `depleted` and `ancestors` at every tick with a reading.
     """
     s = sensors
     cloud = delay(start, name="cloud")
@@ -94,7 +97,10 @@ def rbpf_outdoor(
     fresh = take_picture(fresh, optical_flow, draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
-    return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
+    pose, belief = average(now, plain)
+    collect(belief, "belief")
+    collect(depletion(size, numbers=3), "depleted")
+    return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
 @on_flight(rbpf_outdoor, measured=None)
@@ -112,7 +118,7 @@ def for_flight(on: OnFlight, *, cloud: Particles, control: HeldControl, scored: 
     """
     inputs, sensors, first = outdoor_flight(on.flight, on.name)
     return on.case(
-        scored.score(on, pose_errors, estimate="pose"),
+        scored.score(on, pose_errors, estimate="belief"),
         inputs=inputs,
         start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
         sensors=sensors,

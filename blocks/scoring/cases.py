@@ -75,6 +75,16 @@ class OnFlight:
         """The graph's."""
         return self.graph.name
 
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """In the world, m/s^2: zero for a unit that reads the coordinate acceleration."""
+        return tuple(self.flight.info.get("gravity", GRAVITY))
+
+    @property
+    def weightless(self) -> bool:
+        """Whether the unit's readings know no gravity, and so show no vertical."""
+        return not any(self.gravity)
+
     def need(self, *streams: str, fix: str = "choose another flight") -> dict[str, Series]:
         """`Flight.need` of the graph."""
         return self.flight.need(self.name, *streams, fix=fix)
@@ -336,12 +346,12 @@ class PoseNoises(Settings):
 
 
 @dataclass(frozen=True)
-class PoseAided(Factors, PoseNoises, Scored):
+class PoseAided(Factors, PoseNoises, Scored, Started):
     """What every filter has that is driven by an IMU and corrected by poses."""
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, HeldControl, Gated, Started):
+class PoseFilter(PoseAided, HeldControl, Gated):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 
@@ -392,17 +402,17 @@ def on_capture(
         settings: of the graph itself.
     """
     vicon, info = on.inputs["vicon"], on.flight.info
-    first = vicon[0]
-    pose = filter.pose(on, int(vicon.time[0]), first.position, first.attitude, usual="file")
+    pose = filter.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file")
     return on.case(
         filter.score(on, pose_errors, steps=steps),
+        inputs=pose.inputs,
         start=_started(start, pose),
         noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
         **filter.measured(on),
         lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
         reading=reading_of(on.flight),
-        gravity=info.get("gravity", GRAVITY),
-        held=filter.held(on, on.inputs["imu"]),
+        gravity=on.gravity,
+        held=filter.held(on, pose.inputs["imu"]),
         **filter.gating(),
         **settings,
     )

@@ -17,6 +17,7 @@ from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.scoring.start import from_first
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
 from flowgraph.blocks.signals import PointReading, Position
@@ -46,14 +47,15 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
     Raises:
         DataError: where the flight does not say its noise.
     """
-    held = filter.held(on, on.inputs["imu"])
+    place, inputs = from_first(on, inputs, on.inputs["vicon"], "position")
+    held = filter.held(on, on.inputs["imu"], inputs)
     if held is None and "reading" in inputs and np.isnan(inputs["reading"]["acceleration"]).any():
         held = Held(after=1.0, rate=0.0, force=0.0)  # a control is missing, none for long
     density = given(filter.accelerometer_noise, imu_noise_of(on.name, on.flight).accelerometer)
     return on.case(
         filter.score(on, point_errors, steps=partial(point_steps, model=point_model(density))),
         inputs=inputs,
-        start=start_point(on.inputs["vicon"]["position"][0]),
+        start=start_point(place),
         noise=density,
         position_noise=on.noise("position_noise", filter.position_noise),
         control=reading_of(on.flight),

@@ -57,8 +57,22 @@ def not_negative(graph: str, name: str, value: object) -> None:
     need_numbers(graph, not_negative={name: value})
 
 
+def share(graph: str, name: str, value: object) -> None:
+    """Refuse what is no number from 0 to 1; None passes."""
+    need_numbers(graph, not_negative={name: value})
+    if isinstance(value, (int, float)) and value > 1.0:
+        raise DeclarationError(
+            f"setting {name!r} is no part of a whole",
+            path=f"{graph}.{name}",
+            expected="a number from 0 to 1",
+            got=repr(value),
+            fix=f"write {name}=0.5",
+        )
+
+
 Positive = Annotated[float, positive]
 NotNegative = Annotated[float, not_negative]
+Share = Annotated[float, share]
 
 
 def count(least: int, most: int) -> Check:
