@@ -17,11 +17,12 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
 from flowgraph.blocks.scoring.streams import told_acceleration
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Position, Velocity, WorldAcceleration
 
 
@@ -52,8 +53,7 @@ def async_kalman(
     now = latest(acceleration, init=WorldAcceleration.at_rest(), at=ticks, name="control")
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
-    if held is not None:
-        prior = bridge(prior, acceleration, held=held, position=0, velocity=3)
+    prior = bridged(belief, prior, acceleration, held=held, position=0, velocity=3)
     posterior, innovation = update_linear(
         prior, position.map(lambda z: z.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
     )
@@ -75,7 +75,7 @@ def async_kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@on_flight(async_kalman, "imu", "vicon")
+@on_flight(async_kalman, "imu", "vicon", told=with_imu)
 def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 

@@ -88,7 +88,7 @@ _STREAMS = ("body_rate", "magnetic_attitude")
 _FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
 
 
-@on_flight(attitude_mekf, *_STREAMS, fix=_FIX)
+@on_flight(attitude_mekf, *_STREAMS, fix=_FIX, ranged=False)
 def for_flight(
     on: OnFlight,
     *,

@@ -23,12 +23,14 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.orientation.complementary import correct_by_pose, dead_reckon
 from flowgraph.blocks.orientation.fixed_gain import PoseNoise, pose_spread
 from flowgraph.blocks.scoring.cases import OnFlight, PoseNoises, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
-from flowgraph.blocks.scoring.tuning import imu_noise_of, reading_of
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of, with_imu
 from flowgraph.blocks.signals import Imu, Pose, PoseEstimate
 
 
@@ -44,6 +46,7 @@ def augmented_complementary(
     gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     covariance: PoseNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of pose and velocity: an IMU for what is fast, a motion capture for what is slow.
 
@@ -52,8 +55,10 @@ def augmented_complementary(
     Collected: `pose` at every tick; with the noise of a `covariance`, `belief` too.
     """
     previous = delay(start, name="previous")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = dead_reckon(previous, control, gravity=gravity, reading=reading, at=imu | vicon)
+    if longest is not None:
+        prior = stay(previous, prior, longest=longest)
     shares = {"alpha": alpha, "velocity_alpha": velocity_alpha, "attitude_alpha": attitude_alpha}
     corrected = correct_by_pose(latest(prior, at=vicon), vicon, **shares)
     pose = merge(corrected, prior, tie="left", name="now")
@@ -63,7 +68,7 @@ def augmented_complementary(
     return {"pose": pose}
 
 
-@on_flight(augmented_complementary, "imu", "vicon")
+@on_flight(augmented_complementary, "imu", "vicon", told=with_imu, measured=None)
 def for_flight(
     on: OnFlight,
     *,
@@ -73,27 +78,35 @@ def for_flight(
     covariance: bool = False,
     pose: PoseNoises,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with an IMU and a motion capture, at the first measured pose, at rest.
 
     Args:
-        flight: with the streams `imu` and `vicon` (Pose).
+        flight: with the streams `imu` and `vicon` (Pose). In place of `imu` it may have the thesis's unit:
+            `gyro` and `coordinate_acceleration`, with the same times.
         alpha, velocity_alpha, attitude_alpha: the IMU's shares at each pose, in (0, 1].
         covariance: whether to give one too, and score it.
         position_noise, attitude_noise: standard deviations in m and rad, for the covariance; the flight's own
             if left out.
     """
-    first, noise = on.inputs["vicon"][0], None
+    vicon, noise = on.inputs["vicon"], None
+    begin = started.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file", deviates=covariance)
     if covariance:
         place = on.noise("position_noise", pose.position_noise)
         turn = on.noise("attitude_noise", pose.attitude_noise)
-        noise = PoseNoise(imu_noise_of(on.name, on.flight), place, turn, start=(place, 0.7, turn))
+        noise = PoseNoise(
+            imu_noise_of(on.name, on.flight), place, turn, start=(place, 0.7, given(begin.heading, turn))
+        )
     return on.case(
         scored.score(on, pose_errors, estimate="belief" if covariance else "pose"),
-        start=PoseEstimate(position=first.position, velocity=np.zeros(3), attitude=first.attitude),
+        inputs=begin.inputs,
+        start=PoseEstimate(position=begin.position, velocity=np.zeros(3), attitude=begin.attitude),
         alpha=alpha,
         velocity_alpha=velocity_alpha,
         attitude_alpha=attitude_alpha,
+        gravity=on.gravity,
         covariance=noise,
+        longest=on.longest(),
         reading=reading_of(on.flight),
     )

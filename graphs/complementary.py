@@ -21,13 +21,15 @@ group", IEEE Trans. Automatic Control 53(5), 2008, sec. II (one axis) and III (r
 from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, high_pass, latest, low_pass
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import carry_to_world, level_near, turn_by_gyro
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spread
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative
-from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, Gyro, SpecificForce, WorldForce
 
@@ -41,6 +43,7 @@ def complementary(
     alpha: float = 0.98,
     reading: str = "instant",
     covariance: AttitudeNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of attitude: gyroscope high-passed, accelerometer low-passed.
 
@@ -56,6 +59,8 @@ def complementary(
     at_rest = WorldForce.at_rest()
     previous = delay(start, name="turned")
     turned = turn_by_gyro(previous, gyro, reading=reading, name="gyroscope")
+    if longest is not None:
+        turned = stay(previous, turned, longest=longest)
     previous.feed(turned)
 
     force = carry_to_world(latest(turned, init=start, name="by_gyro"), accelerometer, name="carried")
@@ -73,7 +78,9 @@ def complementary(
     return {"attitude": attitude, "gyroscope": turned}
 
 
-@on_flight(complementary, "gyro", "accelerometer", told=with_parts, fix="choose a flight with an imu")
+@on_flight(
+    complementary, "gyro", "accelerometer", told=with_parts, measured=None, fix="choose a flight with an imu"
+)
 def for_flight(
     on: OnFlight,
     *,
@@ -82,6 +89,7 @@ def for_flight(
     gyro_noise: NotNegative | None = None,
     accelerometer_noise: NotNegative | None = None,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with a gyroscope and an accelerometer, at the truth's first attitude.
 
@@ -93,15 +101,18 @@ def for_flight(
         gyro_noise, accelerometer_noise: densities in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), for the covariance;
             the flight's own if left out.
     """
-    flight, (gyro, push), noise = on.flight, on.inputs.values(), None
+    flight, push, noise = on.flight, on.inputs["accelerometer"], None
+    attitude, begin = started.levelled(on, "accelerometer", push["force"], deviates=covariance)
     if covariance:
         force = reading_deviation(flight, "accelerometer", push, accelerometer_noise)
-        start = 1e-3 if flight.truth is not None else 0.3
-        noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start)
+        start = 1e-3 if begin.told else 0.3
+        noise = AttitudeNoise(own_density(flight, "gyro", gyro_noise), (force,) * 3, start, begin.heading)
     return on.case(
         scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
-        start=first_attitude(flight, gyro, on.first_up("accelerometer", push["force"])),
+        inputs=begin.inputs,
+        start=Attitude(attitude=attitude),
         alpha=alpha,
         reading=reading_of(flight, "gyro"),
         covariance=noise,
+        longest=on.longest(),
     )

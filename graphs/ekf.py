@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.pose import (
     driving,
     pose_belief,
@@ -58,12 +58,11 @@ def ekf(
     the `innovation`.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | vicon, name="control")
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | vicon, name="control")
     drive = driving(last, control, reading)
     prior = predict_pose(belief, drive, noise=noise, gravity=gravity)
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=3, velocity=0, attitude=6)
+    prior = bridged(belief, prior, imu, held=held, position=3, velocity=0, attitude=6)
     posterior, innovation = update_pose(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from typing import Any
 
 from flowgraph import collect, delay, latest
-from flowgraph.blocks.kalman.lost import Held, bridge, find_back
+from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.signals import Gaussian, Imu
@@ -32,6 +33,7 @@ def euler_loop(
     gate: float | None,
     patience: int,
     held: Held | None,
+    gravity: tuple[float, float, float] = GRAVITY,
 ) -> dict[str, Any]:
     """Wire the loop, and name what a graph collects: `belief`, `angles` and the `innovation`.
 
@@ -44,13 +46,13 @@ def euler_loop(
         update: `(prior, control)`, the posterior and the innovation.
         gate, patience: whether `update` refuses measurements, and how many in a row are taken for outliers.
         held: from which age on a reading is old.
+        gravity: in the world, m/s^2, for what a unit at rest reads.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(), name="last_control")
-    control = latest(imu, init=Imu.at_rest(), at=imu | measured, name="control")
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | measured, name="control")
     prior = predict(belief, driving(last, control, reading))
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=6, attitude=3)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update(prior, control)
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9)

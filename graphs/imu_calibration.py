@@ -63,7 +63,7 @@ def imu_calibration(
     return {"gyro": gyro, "force": force, "equations": equations, "window": window}
 
 
-@on_flight(imu_calibration, "counts")
+@on_flight(imu_calibration, "counts", measured=None, ranged=False)
 def for_flight(
     on: OnFlight,
     *,

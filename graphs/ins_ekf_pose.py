@@ -13,11 +13,12 @@ from __future__ import annotations
 from typing import Any
 
 from flowgraph import Case, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.models.euler_ins import predict_extended, update_pose_angles
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.graphs.euler_loop import euler_loop
 from flowgraph.graphs.tag_pose import poses_of
@@ -34,6 +35,7 @@ def ins_ekf_pose(
     order: str = "zxy",
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -46,8 +48,9 @@ def ins_ekf_pose(
     """
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=lambda belief, drive: predict_extended(
-            belief, drive, order=order, noise=noise, name="predict"
+            belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
@@ -55,7 +58,7 @@ def ins_ekf_pose(
     )  # fmt: skip
 
 
-@on_flight(ins_ekf_pose, "imu")
+@on_flight(ins_ekf_pose, "imu", told=with_imu)
 def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 

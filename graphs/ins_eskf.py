@@ -6,23 +6,35 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowgraph import Case, Series, Stream, clocks_of, collect, delay, graph, latest, simulate
-from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, tilt_and_heading
 from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_flight
 from flowgraph.blocks.scoring.point import positions
+from flowgraph.blocks.scoring.start import StartPose
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
 
-SEARCHED, HEADINGS = 15.0, 12
-"""Over how many seconds a heading is sought of which nothing is known, and how many are tried."""
+SEARCHED, LONGEST, HEADINGS = 15.0, 60.0, 12
+"""For how many seconds a heading is sought of which nothing is known, for how many at most where these do not
+tell it, and how many are tried."""
+
+NEAR, APART = 0.5, 30.0
+"""How far off the nearest of them may be, rad, and how far apart two are that are not one, degrees."""
+
+SURE = 40.0
+"""By how much the best must foretell better than others, in -2 log of the likelihood."""
+
+MOVED = 0.1
+"""m: a body that has not come so far from where it was shows no heading."""
 
 
 @graph
@@ -49,10 +61,9 @@ def ins_eskf(
     """
     ticks = imu | position if attitude is None else imu | position | attitude
     belief = delay(start, name="belief")
-    control = latest(imu, init=Imu.at_rest(), name="control")
+    control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = predict(belief, control, noise=noise, gravity=gravity, at=ticks)
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=3, attitude=6)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = aid_position(
         prior, position, noise=position_noise, lever=lever, gate=gate, invariant=invariant
     )
@@ -70,7 +81,7 @@ def ins_eskf(
     return {"belief": posterior}
 
 
-@on_flight(ins_eskf)
+@on_flight(ins_eskf, told=with_imu)
 def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
     """Start and tune the filter for a flight with an IMU and a position: EuRoC, or the simulated one.
 
@@ -89,60 +100,108 @@ def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
         DeclarationError: for a setting that is out of range.
     """
     inputs, lever = _inputs(on)
-    imu, info = inputs["imu"], on.flight.info
-    seen = inputs["attitude"]["attitude"][0] if "attitude" in inputs else None
-    begin = filter.pose(on, int(imu.time[0]), inputs["position"]["position"][0], seen)
-    force = on.first_up("imu", imu["specific_force"])
+    attitude = inputs.get("attitude")
+    begin = filter.pose(on, inputs, position=inputs["position"], attitude=attitude)
+    inputs, info = begin.inputs, on.flight.info
     settings = {
         "noise": filter.imu_noise(on, (1.0, 1.0) if "position_noise" in info else (15.0, 20.0)),
         **filter.measured(on),
         "lever": info.get(lever, (0.0, 0.0, 0.0)),
-        "held": filter.held(on, imu),
-        "invariant": begin.heading is not None,
+        "gravity": on.gravity,
+        "held": filter.held(on, inputs["imu"], inputs),
         **filter.gating(),
     }
-    turn, spread = begin.attitude, StartSpread()
-    if begin.heading is not None:
-        spread = StartSpread(heading=0.5)
-        turn = _likeliest_heading(on, inputs, begin.position, turn, force, spread, settings)
+    force = None if on.weightless else on.first_up("imu", inputs["imu"]["specific_force"])
+    guess = Guess(begin.attitude) if begin.heading is None else Guess(begin.attitude, begin.heading, True)
+    if attitude is None and (guess.invariant or filter.start_heading is not None):
+        guess = _searched(on, inputs, begin, guess, force, settings)
     return on.case(
         filter.score(on, pose_errors),
         inputs=inputs,
-        start=start_belief(begin.position, turn, specific_force=force, spread=spread),
+        start=guess.belief(begin.position, force),
+        invariant=guess.invariant,
         **settings,
     )
 
 
-def _likeliest_heading(
+class Guess(NamedTuple):
+    """An attitude (4) to start from, the deviation of its heading in rad, and whether corrections are
+    invariant, since it is large."""
+
+    attitude: np.ndarray
+    heading: float = StartSpread().heading
+    invariant: bool = False
+
+    def belief(self, position: np.ndarray, force: np.ndarray | None) -> Belief:
+        """That to start from, levelled by a force."""
+        spread = StartSpread(heading=self.heading)
+        return start_belief(position, self.attitude, specific_force=force, spread=spread)
+
+
+def _searched(
     on: OnFlight,
     inputs: dict[str, Series],
-    position: np.ndarray,
-    attitude: np.ndarray,
-    force: np.ndarray,
-    spread: StartSpread,
+    begin: StartPose,
+    guess: Guess,
+    force: np.ndarray | None,
     settings: dict[str, Any],
-) -> np.ndarray:
-    """The attitude (4), turned about the vertical by the heading of a circle of them with which the filter
-    best foretells the first measurements, those of `SEARCHED` seconds.
+) -> Guess:
+    """That of a circle of guesses with which the filter best foretells the first measurements; the guess
+    itself, where it foretells them as well, or where they do not tell one heading from another.
 
     One Gaussian cannot hold a whole circle: from the wrong side of it the innovations look like errors of
-    velocity and bias, and the filter grows sure of a wrong heading. Each of `HEADINGS` is near enough.
+    velocity and bias, and the filter grows sure of a wrong heading. One of `HEADINGS` is near enough. Nothing
+    is told by a body that stays where it is, so the time of the search counts from when it has moved.
     """
-    end = inputs["imu"].time[0] + round(SEARCHED * 1e9)
-    first = {name: series[series.time <= end] for name, series in inputs.items()}
-    clocks = clocks_of(first)
-    best, found = math.inf, attitude
-    for k in range(HEADINGS):
-        about_z = from_rotation_vector(np.array([0.0, 0.0, 2.0 * math.pi * k / HEADINGS]), xp=np)
-        turn = np.asarray(multiply(about_z, attitude, xp=np))
-        start = start_belief(position, turn, specific_force=force, spread=spread)
-        result = simulate(ins_eskf.build(**clocks, start=start, **{**settings, "gate": None}), first)
-        seen = [result[name] for name in result.series if name.endswith("innovation")]
-        cost = sum(float(np.sum(s["nis"] + np.linalg.slogdet(s["covariance"])[1])) for s in seen)
-        if cost < best:
-            best, found = cost, turn
-    on.note("info", f"the heading at the start was sought in the first {SEARCHED:g} s of measurements")
-    return found
+    about_z = [np.array([0.0, 0.0, 2.0 * math.pi * k / HEADINGS]) for k in range(HEADINGS)]
+    turns = [np.asarray(multiply(from_rotation_vector(v, xp=np), begin.attitude, xp=np)) for v in about_z]
+    circle = [Guess(turn, NEAR, True) for turn in turns]
+    runs = circle if begin.unknown else [guess, *circle]
+    since, end = _moved(inputs["position"], settings["position_noise"]), inputs["imu"].time[-1]
+    seconds = SEARCHED
+    while since is not None:
+        until = since + round(seconds * 1e9)
+        first = {name: series[series.time <= until] for name, series in inputs.items()}
+        found = [_foretold(run.belief(begin.position, force), run.invariant, first, settings) for run in runs]
+        costs = np.array([cost for cost, _ in found])
+        best = int(np.argmin(costs))
+        ends = np.array([q for _, q in found])
+        others = costs[np.abs(tilt_and_heading(ends, ends[best])[1]) > APART]
+        if not len(others) or others.min() > costs[best] + SURE:
+            if not begin.unknown and costs[0] <= costs[best] + SURE:
+                return guess
+            span = f"the first {(until - inputs['imu'].time[0]) * 1e-9:.3g} s of measurements"
+            if begin.unknown:
+                on.note("info", f"the heading at the start was sought in {span}")
+            else:
+                on.note("warning", f"{span} speak against the heading at the start: another was taken")
+            return runs[best]
+        if until >= end or seconds >= LONGEST:
+            break
+        seconds *= 2.0
+    if begin.unknown:
+        on.note("warning", "the measurements do not tell the heading at the start: it stays unknown")
+    return guess
+
+
+def _foretold(
+    start: Belief, invariant: bool, inputs: dict[str, Series], settings: dict[str, Any]
+) -> tuple[float, np.ndarray]:
+    """How badly a start foretells what was measured, -2 log of its likelihood, and the attitude (4) that it
+    comes to."""
+    settings = {**settings, "gate": None, "invariant": invariant}
+    result = simulate(ins_eskf.build(**clocks_of(inputs), start=start, **settings), inputs)
+    seen = [result[name] for name in result.series if name.endswith("innovation")]
+    cost = sum(float(np.sum(s["nis"] + np.linalg.slogdet(s["covariance"])[1])) for s in seen)
+    return cost if math.isfinite(cost) else math.inf, result["belief"]["attitude"][-1]
+
+
+def _moved(position: Series, noise: float) -> int | None:
+    """When (ns) the body had left the place where it was first seen; None where it stays."""
+    place = position["position"]
+    here = place[int(np.argmax(np.isfinite(place).all(axis=-1)))]
+    away = np.linalg.norm(place - here, axis=-1) > max(MOVED, 6.0 * noise)
+    return int(position.time[int(np.argmax(away))]) if away.any() else None
 
 
 def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
@@ -152,5 +211,5 @@ def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
         return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
     streams = on.need("imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
     vicon = streams["vicon"]
-    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude")
+    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude", gaps=vicon.gaps)
     return {"imu": streams["imu"], "position": positions(vicon), "attitude": turns}, "vicon_lever"

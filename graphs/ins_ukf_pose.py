@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.models.euler_ins import STATE, increment_variances, update_pose_angles
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, FarPoints, on_measured_pose
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -44,6 +45,7 @@ def ins_ukf_pose(
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     points: SigmaPoints = FAR,
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -55,11 +57,12 @@ def ins_ukf_pose(
     Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
     """
     predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points, name="predict",
     )  # fmt: skip
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=predict,
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
@@ -67,7 +70,7 @@ def ins_ukf_pose(
     )  # fmt: skip
 
 
-@on_flight(ins_ukf_pose, "imu")
+@on_flight(ins_ukf_pose, "imu", told=with_imu)
 def for_flight(on: OnFlight, *, filter: EulerFilter, sigma: FarPoints) -> Case:
     """Start the filter at the first measured pose of a flight, at rest and without biases.
 

@@ -18,15 +18,16 @@ from typing import Annotated
 import numpy as np
 
 from flowgraph import Case, DataError, Stream, graph
-from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.geometry.rotations import level
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
-from flowgraph.blocks.metrics.errors import interpolate_pose
-from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian
+from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian, with_heading
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerKalman, FarPoints
 from flowgraph.blocks.scoring.settings import Positive, named
-from flowgraph.blocks.scoring.tuning import given
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, with_imu
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -52,6 +53,7 @@ def ins_ukf_velocity(
     rate: str = "gyro",
     order: str = "zyx",
     points: tuple[SigmaPoints, SigmaPoints] = FAR,
+    gravity: tuple[float, float, float] = GRAVITY,
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -63,11 +65,12 @@ def ins_ukf_velocity(
     Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
     """
     predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order), noise=np.diag(increment_variances(noise)), space=STATE,
+        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
         points=points[0], name="predict",
     )  # fmt: skip
     return euler_loop(
         imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        gravity=gravity,
         predict=predict,
         update=lambda prior, control: update_camera_velocity(
             prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
@@ -76,7 +79,7 @@ def ins_ukf_velocity(
     )  # fmt: skip
 
 
-@on_flight(ins_ukf_velocity, "imu", "motion")
+@on_flight(ins_ukf_velocity, "imu", "motion", told=with_imu)
 def for_flight(
     on: OnFlight,
     *,
@@ -85,34 +88,45 @@ def for_flight(
     rate_noise: Positive | None = None,
     filter: EulerKalman = _REPORTS,
     sigma: FarPoints,
+    started: Started,
 ) -> Case:
     """Start the filter at the truth's first pose, which nothing else would tell it, at rest.
 
     Args:
-        flight: with the streams `imu` and `motion`, a truth, and the `mount` of the camera in its info.
+        flight: with the streams `imu` and `motion`, and the `mount` of the camera in its info. In place of
+            `imu` it may have the thesis's unit: `gyro` and `coordinate_acceleration`, with the same times.
         rate: gyro (the report's eq. 10) or camera (eq. 9).
         velocity_noise: standard deviation of the camera's velocity, m/s.
         rate_noise: of the rate, rad/s; 0.02 for the gyroscope and 0.2 for the camera if left out.
+        start: must be said where there is neither a truth nor a measured attitude; the position is then the
+            origin, and the first force levels the body.
 
     Raises:
-        DataError: where the flight lacks a stream or the truth.
+        DataError: where the flight lacks a stream, or does not tell where to start.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    if on.flight.truth is None or not {"position", "attitude"} <= set(on.flight.truth.leaves):
+    seen, imu = on.flight.streams.get("vicon"), on.inputs["imu"]
+    begin = started.pose(on, on.inputs, position=seen, attitude=seen)
+    if started == Started() and begin.unknown:
+        truth = on.flight.truth
         raise DataError(
             "this flight does not tell where ins_ukf_velocity starts",
             path=on.flight.name,
             expected="a truth of position and attitude",
-            got="none" if on.flight.truth is None else ", ".join(on.flight.truth.leaves),
-            fix="build the graph with a start of your own: start_gaussian(position, attitude, order=...)",
+            got="none" if truth is None else ", ".join(truth.leaves),
+            fix="write --set start=unknown_yaw, or build the graph with a start of your own",
         )
-    first = np.array([min(int(s.time[0]) for s in on.inputs.values())])
-    position, attitude = interpolate_pose(on.flight.truth, first)
+    turn, tilt = begin.attitude, 0.01
+    if not begin.tilted:
+        tilt = 0.1
+        if not on.weightless:
+            force = on.first_up("imu", imu["specific_force"][imu.time >= begin.time])
+            turn = np.asarray(level(turn, force, xp=np))
+    first = start_gaussian(begin.position, turn, order=filter.order, deviations=(0.01, tilt, 0.3, 0.02, 0.05))
     return filter.case(
         on,
-        start_gaussian(
-            position[0], attitude[0], order=filter.order, deviations=(0.01, 0.01, 0.3, 0.02, 0.05)
-        ),
+        with_heading(first, begin.heading),
+        inputs=begin.inputs,
         mount=on.flight.info["mount"],
         velocity_noise=velocity_noise,
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),

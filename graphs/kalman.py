@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Stream, collect, delay, graph
+from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
-from flowgraph.blocks.models.point import between, point_belief, point_model
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.models.point import between, point_belief, point_model, whole
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, readings
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, PointReading, WorldAcceleration
 
 
@@ -48,11 +49,13 @@ def kalman(
     """
     belief = delay(start, name="belief")
     last = delay(WorldAcceleration.at_rest(), name="last_control")
-    now = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
+    fresh = now = reading.map(lambda r: WorldAcceleration(acceleration=r.acceleration))
+    if held is not None:  # a record without a control holds NaN in its place
+        fresh = whole(now, name="fresh")
+        now = latest(fresh, init=WorldAcceleration.at_rest(), at=reading, name="control")
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
-    if held is not None:
-        prior = bridge(prior, now, held=held, position=0, velocity=3)
+    prior = bridged(belief, prior, fresh, held=held, position=0, velocity=3)
     posterior, innovation = update_linear(
         prior, reading.map(lambda r: r.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
     )
@@ -64,7 +67,7 @@ def kalman(
     return {"belief": point_belief(posterior), "prior": prior, "posterior": posterior}
 
 
-@on_flight(kalman, "imu", "vicon")
+@on_flight(kalman, "imu", "vicon", told=with_imu)
 def for_flight(on: OnFlight, *, filter: PointFilter) -> Case:
     """Start the filter on a flight with an IMU, a motion capture and a truth, which tells it the attitude.
 

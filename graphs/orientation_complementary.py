@@ -30,6 +30,7 @@ import numpy as np
 from flowgraph import Case, DataError, Flight, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import level_attitude
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.lost import stay
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.complementary import (
     blend,
@@ -42,7 +43,8 @@ from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, attitude_spre
 from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.orientation import Share
 from flowgraph.blocks.scoring.settings import NotNegative, one_of
-from flowgraph.blocks.scoring.streams import first_attitude, own_density, reading_deviation, with_parts
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.streams import own_density, reading_deviation, with_parts
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, CoordinateAcceleration, Gyro, Thrust
 
@@ -64,6 +66,7 @@ def orientation_complementary(
     heading: str = "shortest_arc",
     reading: str = "instant",
     covariance: AttitudeNoise | None = None,
+    longest: float | None = None,
 ):
     """Complementary filter of a quadrotor's attitude: thrust is removed, and gravity remains.
 
@@ -77,6 +80,8 @@ def orientation_complementary(
     rate = latest(gyro, init=_STILL, name="rate")
     ticks = gyro | coordinate_acceleration
     turned = turn_by_gyro(previous, rate, reading=reading, at=ticks, name="gyroscope")
+    if longest is not None:
+        turned = stay(previous, turned, longest=longest)
     up = remove_thrust(coordinate_acceleration, latest(thrust, init=_HOVER, name="last_thrust"))
     if heading == "shortest_arc":
         seen = level_attitude(up, name="seen")
@@ -94,7 +99,7 @@ _STREAMS = ("gyro", "coordinate_acceleration", "thrust")
 _FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
 
 
-@on_flight(orientation_complementary, *_STREAMS, told=with_parts, fix=_FIX)
+@on_flight(orientation_complementary, *_STREAMS, told=with_parts, measured=None, fix=_FIX)
 def for_flight(
     on: OnFlight,
     *,
@@ -105,6 +110,7 @@ def for_flight(
     acceleration_noise: NotNegative | None = None,
     thrust_noise: NotNegative | None = None,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with thrust and coordinate acceleration, at the truth's first attitude.
 
@@ -124,23 +130,28 @@ def for_flight(
     Raises:
         DataError: where a stream is missing, or the vehicle is not carried by its thrust.
     """
-    flight, (gyro, acceleration, thrust), noise = on.flight, on.inputs.values(), None
+    flight, noise = on.flight, None
+    acceleration, thrust = on.inputs["coordinate_acceleration"], on.inputs["thrust"]
     need_carried(flight)
+    lift = thrust["thrust"]
+    up = np.array([0.0, 0.0, lift[int(np.argmax(np.isfinite(lift)))]]) - acceleration["acceleration"]
+    attitude, begin = started.levelled(on, "coordinate_acceleration", up, deviates=covariance)
     if covariance:
         push = reading_deviation(flight, "coordinate_acceleration", acceleration, acceleration_noise)
         own = flight.info.get("noise", {}).get("thrust", {}).get("noise")
-        lift = on.noise("thrust_noise", thrust_noise, own)
+        spread = on.noise("thrust_noise", thrust_noise, own)
         rate = own_density(flight, "gyro", gyro_noise)
-        start = 1e-3 if flight.truth is not None else 0.3
-        noise = AttitudeNoise(rate, (push, push, math.hypot(push, lift)), start)
-    up = np.array([0.0, 0.0, thrust["thrust"][0]])
+        start = 1e-3 if begin.told else 0.3
+        noise = AttitudeNoise(rate, (push, push, math.hypot(push, spread)), start, begin.heading)
     return on.case(
         scored.score(on, attitude_errors, estimate="belief" if covariance else "attitude"),
-        start=first_attitude(flight, gyro, up - acceleration["acceleration"][0]),
+        inputs=begin.inputs,
+        start=Attitude(attitude=attitude),
         alpha=alpha,
         heading=heading,
         reading=reading_of(flight, "gyro"),
         covariance=noise,
+        longest=on.longest(),
     )
 
 

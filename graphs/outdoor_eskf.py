@@ -17,6 +17,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.belief import (
@@ -33,7 +34,7 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.scoring.cases import OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -50,6 +51,9 @@ def outdoor_eskf(
     start: Gaussian,
     sensors: OutdoorSensors,
     reading: str = "instant",
+    gate: float | None = None,
+    patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
@@ -62,6 +66,14 @@ def outdoor_eskf(
     ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
     now = predict_clone(belief, driving(last, control, reading), noise=s.imu, name="predict")
+    now = bridged(belief, now, imu, held=held, position=0, velocity=3, attitude=6)
+
+    def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
+        collect(innovation, f"{name}_innovation")
+        if gate is None:
+            return now
+        return find_back(now, innovation, patience=patience, moving=9, name=f"find_back_{name}")
+
     readings: dict[str, tuple[Stream, Any, float]] = {
         "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),
         "gps2": (gps2.map(lambda z: z.position), PositionObserver(s.gps2_lever), s.gps2),
@@ -71,18 +83,20 @@ def outdoor_eskf(
     }  # fmt: skip
     for name, (seen, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
-        now, innovation = update_extended(now, seen, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}")
-        collect(innovation, f"{name}_innovation")
+        now, innovation = update_extended(
+            now, seen, observe=observe, R=R, space=OUTDOOR, gate=gate, name=f"fuse_{name}"
+        )
+        now = told(now, innovation, name)
     now, innovation = update_extended(
         now, altimeter.map(lambda z: z.distance[..., None]),
-        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, name="fuse_altimeter",
+        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, gate=gate, name="fuse_altimeter",
     )  # fmt: skip
-    collect(innovation, "altimeter_innovation")
+    now = told(now, innovation, "altimeter")
     now, innovation = update_extended(
-        now, optical_flow.map(flow_vector), observe=observe_flow, name="fuse_flow",
+        now, optical_flow.map(flow_vector), observe=observe_flow, gate=gate, name="fuse_flow",
         R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
     )  # fmt: skip
-    collect(innovation, "optical_flow_innovation")
+    now = told(now, innovation, "optical_flow")
     now = new_picture(now, optical_flow, name="picture")
     last.feed(control)
     belief.feed(now)
@@ -90,7 +104,7 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-def for_flight(on: OnFlight, *, scored: Scored) -> Case:
+def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
@@ -99,5 +113,11 @@ def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     inputs, sensors, first = outdoor_flight(on.flight, on.name)
     score = scored.score(on, pose_errors)
     return on.case(
-        score, inputs=inputs, start=start_outdoor(first), sensors=sensors, reading=reading_of(on.flight)
+        score,
+        inputs=inputs,
+        start=start_outdoor(first),
+        sensors=sensors,
+        reading=reading_of(on.flight),
+        held=control.held(on, inputs["imu"], inputs),
+        **gated.gating(),
     )

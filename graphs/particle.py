@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.plane import (
     average_plane,
@@ -27,7 +28,9 @@ from flowgraph.blocks.models.plane import (
     start_plane,
     weigh_plane,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.models.spread import spread_plane
+from flowgraph.blocks.particles.lost import depletion
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
 
@@ -43,29 +46,34 @@ def particle(
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "particle",
+    held: Held | None = None,
 ):
     """Bootstrap particle filter of a point in the plane.
 
     Every tick moves the cloud to now; a tick with a position also weighs it and may resample it. Collected:
-    `belief` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at every
-    position.
+    `belief` at every tick, averaged before resampling; `effective_sample_size`, `depleted` and `ancestors`
+    at every position.
     """
     cloud = delay(start, name="cloud")
     control = latest(velocity, init=PlaneVelocity(velocity=np.zeros(2)), name="control")
     moved = move_plane(
         cloud, control, noise=velocity_noise, draws=f"{draws}.move", at=velocity | position, name="move"
     )
+    if held is not None:
+        moved = moved if held.longest is None else stay(cloud, moved, longest=held.longest)
+        moved = spread_plane(moved, velocity, held=held, draws=f"{draws}.held")
     weighed = weigh_plane(moved, position, noise=position_noise, at=position, name="weigh")
     size = plane_sample_size(weighed, name="size")
     fresh, ancestors = resample_plane(
         weighed, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", name="resample"
     )
     cloud.feed(merge(fresh, moved, tie="left", name="next"))
+    collect(depletion(size, numbers=2), "depleted")
     belief = average_plane(merge(weighed, moved, tie="left", name="now"), name="average")
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(particle, "velocity", "position")
+@on_flight(particle, "velocity", "position", measured=None, ranged=False)
 def for_flight(
     on: OnFlight,
     *,
@@ -73,6 +81,7 @@ def for_flight(
     velocity_noise: Positive | None = None,
     position_noise: Positive | None = None,
     spread: Positive = 1.0,
+    control: HeldControl,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
@@ -91,5 +100,6 @@ def for_flight(
         start=start_plane(cloud.particles, seed=cloud.seed, spread=spread),
         velocity_noise=on.noise("velocity_noise", velocity_noise),
         position_noise=on.noise("position_noise", position_noise),
+        held=control.held(on, on.inputs["velocity"]),
         **cloud.resampling(),
     )

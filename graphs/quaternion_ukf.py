@@ -20,9 +20,9 @@ from __future__ import annotations
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph
-from flowgraph.blocks.inertial.alignment import orientation_start
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman.lost import PATIENCE, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, find_back, stay
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -34,6 +34,7 @@ from flowgraph.blocks.orientation.accelerometer import (
 )
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
+from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import Gaussian, Imu
 from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
@@ -58,6 +59,7 @@ def quaternion_ukf(
     frozen: float = 0.0,
     gate: float | None = None,
     patience: int = PATIENCE,
+    longest: float | None = None,
 ):
     """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
 
@@ -81,6 +83,8 @@ def quaternion_ukf(
         space=STATE,
         points=points,
     )
+    if longest is not None:
+        prior = stay(belief, prior, longest=longest)
     posterior, innovation = update_unscented(
         prior,
         stacked_imu(imu, name="reading"),
@@ -97,7 +101,7 @@ def quaternion_ukf(
     return {"belief": named_orientation(posterior)}
 
 
-@on_flight(quaternion_ukf, "imu")
+@on_flight(quaternion_ukf, "imu", measured=("imu",))
 def for_flight(
     on: OnFlight,
     *,
@@ -114,6 +118,7 @@ def for_flight(
     frozen: NotNegative | None = None,
     gated: Gated,
     scored: Scored,
+    started: Started,
 ) -> Case:
     """Start the filter on a flight with an inertial unit, level, with the heading of the truth if it has one.
 
@@ -135,10 +140,15 @@ def for_flight(
             "assumed", f"imu: a gyroscope that keeps one level for {after:g} s has frozen, and reads nothing"
         )
     brought = on.flight.info.get("orientation_noise", {})
-    begin = orientation_start(on.flight, on.inputs["imu"], still)
+    begin, pose = started.orientation(on, on.inputs["imu"], still)
+    start = start_orientation(begin.attitude)
+    if pose.heading is not None:
+        up = to_matrix(begin.attitude, xp=np)[2]  # the vertical, in the body
+        start.covariance[:3, :3] += np.outer(up, up) * (pose.heading**2 - up @ start.covariance[:3, :3] @ up)
     return on.case(
         scored.score(on, orientation_errors, innovations=False),
-        start=start_orientation(begin.attitude),
+        inputs=pose.inputs,
+        start=start,
         attitude_walk=attitude_walk,
         rate_walk=rate_walk,
         gyro_noise=given(gyro_noise, brought.get("gyro", 0.02)),
@@ -147,5 +157,6 @@ def for_flight(
         still=begin.still,
         up=begin.up,
         frozen=after,
+        longest=on.longest(),
         **gated.gating(),
     )

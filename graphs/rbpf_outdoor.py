@@ -14,15 +14,18 @@ q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
 
 from __future__ import annotations
 
-from flowgraph import Case, Stream, delay, graph, latest, merge
+from flowgraph import Case, Stream, collect, delay, graph, latest, merge
+from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
+from flowgraph.blocks.models.spread import spread_outdoor
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
     correct_distance,
     correct_field,
     correct_flow,
     correct_position,
+    outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
@@ -30,17 +33,19 @@ from flowgraph.blocks.outdoor.cloud import (
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
+from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.particles.resampling import draw_ancestors
-from flowgraph.blocks.scoring.cases import OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
 
 @graph
-def average(cloud: Stream[Cloud]):
-    """The weighted expectation of the pose."""
-    weight = weights(cloud)
-    return average_pose(cloud, weight, average_attitude(cloud, weight, name="attitude"), name="pose")
+def average(cloud: Stream[OutdoorCloud], plain: Stream[Cloud]):
+    """The weighted expectation of the pose, and its covariance."""
+    weight = weights(plain)
+    pose = average_pose(plain, weight, average_attitude(plain, weight, name="attitude"), name="pose")
+    return pose, outdoor_belief(cloud, plain, weight, pose, name="spread")
 
 
 @graph
@@ -58,14 +63,15 @@ def rbpf_outdoor(
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
+    held: Held | None = None,
 ):
     """Rao-Blackwellized particle filter of pose and velocity on asynchronous sensors.
 
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
     resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `pose` at every tick, averaged before resampling; `effective_sample_size` and `ancestors` at
-    every tick with a reading.
+    Collected: `pose` and `belief`, with its covariance, at every tick, averaged before resampling;
+    `effective_sample_size`, `depleted` and `ancestors` at every tick with a reading.
     """
     s = sensors
     cloud = delay(start, name="cloud")
@@ -73,6 +79,9 @@ def rbpf_outdoor(
     seen = gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
     now = predict_outdoor(cloud, driving(last, control, reading), noise=s.imu, name="predict")
+    if held is not None:
+        now = now if held.longest is None else stay(cloud, now, longest=held.longest)
+        now = spread_outdoor(now, imu, held=held)
     now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
     now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
     now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
@@ -88,11 +97,14 @@ def rbpf_outdoor(
     fresh = take_picture(fresh, optical_flow, draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
-    return {"pose": average(plain), "effective_sample_size": size, "ancestors": ancestors}
+    pose, belief = average(now, plain)
+    collect(belief, "belief")
+    collect(depletion(size, numbers=3), "depleted")
+    return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_outdoor)
-def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
+@on_flight(rbpf_outdoor, measured=None)
+def for_flight(on: OnFlight, *, cloud: Particles, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
@@ -106,10 +118,11 @@ def for_flight(on: OnFlight, *, cloud: Particles, scored: Scored) -> Case:
     """
     inputs, sensors, first = outdoor_flight(on.flight, on.name)
     return on.case(
-        scored.score(on, pose_errors, estimate="pose"),
+        scored.score(on, pose_errors, estimate="belief"),
         inputs=inputs,
         start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
         sensors=sensors,
+        held=control.held(on, inputs["imu"], inputs),
         reading=reading_of(on.flight),
         **cloud.resampling(),
     )

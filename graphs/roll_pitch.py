@@ -26,7 +26,7 @@ def roll_pitch(imu: Stream[Imu]):
     return {"attitude": roll_pitch_attitude(imu, name="attitude")}
 
 
-@on_flight(roll_pitch, "imu")
+@on_flight(roll_pitch, "imu", measured=None)
 def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     """Run it on a flight with an inertial unit.
 

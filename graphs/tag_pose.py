@@ -51,7 +51,7 @@ def tag_pose(
     return {"pose": pose}
 
 
-@on_flight(tag_pose, "tags")
+@on_flight(tag_pose, "tags", ranged=False)
 def for_flight(
     on: OnFlight,
     *,
@@ -131,7 +131,8 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
         return measured
     pose: Any = measured.values
     assert isinstance(pose, Pose)
-    return Series(measured.time, as_measurements(pose.position, pose.attitude), name="pose")
+    values = as_measurements(pose.position, pose.attitude)
+    return Series(measured.time, values, name="pose", gaps=measured.gaps)
 
 
 __all__ = ["PoseMeasurement", "poses_of", "tag_pose"]

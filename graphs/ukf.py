@@ -25,7 +25,7 @@ import numpy as np
 
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.pose import POSE, driving
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -72,8 +72,8 @@ def ukf(
     Collected: `belief` at every tick, and the `innovation` at every pose.
     """
     belief = delay(start, name="belief")
-    last = delay(Imu.at_rest(-gravity[2]), name="last_control")
-    control = latest(imu, init=Imu.at_rest(-gravity[2]), at=imu | vicon, name="control")
+    last = delay(Imu.at_rest(gravity), name="last_control")
+    control = latest(imu, init=Imu.at_rest(gravity), at=imu | vicon, name="control")
     drive = driving(last, control, reading)
     prior = predict_unscented(
         belief,
@@ -83,8 +83,7 @@ def ukf(
         space=STATE,
         points=points,
     )
-    if held is not None:
-        prior = bridge(prior, imu, held=held, position=0, velocity=3, attitude=6)
+    prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = update_unscented(
         prior,
         vicon.map(stacked_pose, name="pose"),

@@ -32,7 +32,7 @@ from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, MagneticField, Pose
 from flowgraph.errors import DataError
 
-__all__ = ["NOISE", "SETTINGS", "load"]
+__all__ = ["NOISE", "SETTINGS", "SPEED", "load"]
 
 SETTINGS: Mapping[str, str] = {
     "duration": "s, only the first; 0 is all",
@@ -41,8 +41,13 @@ SETTINGS: Mapping[str, str] = {
 }
 """The settings of `load` and what they mean. Samples come at the file's rate, so their order is given."""
 
-NOISE = ImuNoise(gyro=1e-3, accelerometer=5e-3, gyro_bias=1e-4, accelerometer_bias=1e-3)
-"""Densities of the unit, of the order of what its readings at rest show."""
+NOISE = ImuNoise(gyro=1.1e-4, accelerometer=3.3e-3, gyro_bias=1e-5, accelerometer_bias=1e-3)
+"""Densities of the unit: of rate and force as readings at rest show them (Allan deviation at 0.1 and 1 s), of
+the gyroscope's bias by the rests before and after a trial."""
+
+SPEED = 0.25
+"""m/s, how fast a hand moves the unit: root mean square an axis of the optical velocity, 0.03 to 0.46 by
+trial."""
 
 _FIELDS = {
     "imu_gyr": (None, 3),
@@ -65,7 +70,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
     Returns:
         A `Flight`. truth: `Pose`, east-north-up, where the optical system saw the unit. info: `imu_noise`,
-        `imu_period_ns`, `absent`, and `scored`, a `Series` of whether an error at that time counts.
+        `imu_period_ns`, `absent`, `speed` (m/s, how fast a hand moves the unit), and `scored`, a `Series` of
+        whether an error at that time counts.
 
     Raises:
         DataError: the file is missing or cut off, a field is missing, of another shape or of another unit.
@@ -111,5 +117,6 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     made.add("truth", f"{file}: opt_pos, opt_quat", time, pose, Pose)
     made.info["scored"] = Series(time, seen & (fields["movement"] != 0), name="scored")
     made.info["imu_noise"] = imu_noise(given, "broad", made.notes, NOISE)
+    made.info["speed"] = SPEED
     made.info["imu_period_ns"] = round(1e9 / rate)
     return made.flight()

@@ -226,7 +226,9 @@ class Start(NamedTuple):
     up: tuple[float, float, float]
 
 
-def orientation_start(flight: Flight, imu: Series, still: float | None = None) -> Start:
+def orientation_start(
+    flight: Flight, imu: Series, still: float | None = None, *, nearest: npt.ArrayLike | None = None
+) -> Start:
     """Level by the mean specific force at rest, or by the first reading, with the heading of the truth's
     first attitude; without a truth that of the world.
 
@@ -235,17 +237,19 @@ def orientation_start(flight: Flight, imu: Series, still: float | None = None) -
     Args:
         still: seconds of rest at the start; those that the flight tells, or that its readings show, if left
             out.
+        nearest: the attitude (4) whose heading it is, in place of the truth's.
 
     Raises:
         DataError: where no reading shows where up is.
     """
     found = flight.info.get("still") if still is None else still
     still = rest_seconds(imu) if found is None else float(found)
-    nearest = np.array([1.0, 0.0, 0.0, 0.0])
-    if flight.truth is not None and "attitude" in flight.truth.leaves:
-        q = flight.truth["attitude"]
-        q = q[np.isfinite(q).all(axis=-1)]
-        nearest = q[0] if len(q) else nearest
+    if nearest is None:
+        nearest = np.array([1.0, 0.0, 0.0, 0.0])
+        if flight.truth is not None and "attitude" in flight.truth.leaves:
+            q = flight.truth["attitude"]
+            q = q[np.isfinite(q).all(axis=-1)]
+            nearest = q[0] if len(q) else nearest
     push = imu["specific_force"]
     shown = need_usable(push, flight.name)
     first = int(np.argmax(shown))

@@ -34,7 +34,7 @@ def subtract_rest_bias(
         bias_gyro = mean(gyro)      bias_force = mean(specific_force) - gravity * up
 
     The means are over the first `seconds`, running while they last: only readings that have come are used.
-    Fires with each reading.
+    A reading with a NaN does not count. Fires with each reading.
 
     Args:
         imu: rad/s and m/s^2, body.
@@ -47,12 +47,12 @@ def subtract_rest_bias(
     """
     kind = imu.gyro.dtype
     first = xp.where(state["first"] == _NEVER, t, state["first"])
-    resting = t - first <= round(seconds * 1e9)
+    reading = xp.concat([imu.gyro, imu.specific_force])
+    resting = (t - first <= round(seconds * 1e9)) & ~xp.any(xp.isnan(reading))
     count = state["count"] + resting
     expected = np.concatenate([np.zeros(3), np.asarray(up) * gravity])
-    reading = xp.concat([imu.gyro, imu.specific_force])
     excess = reading - xp.asarray(expected, dtype=kind) - state["bias"]
-    bias = state["bias"] + excess * xp.where(resting, 1.0 / count, 0.0)
+    bias = state["bias"] + xp.where(resting, excess * (1.0 / xp.maximum(count, 1.0)), 0.0)
     corrected = reading - bias
     return (
         {"first": first, "count": count, "bias": bias},

@@ -18,7 +18,7 @@ from flowgraph.blocks.kalman.filters import (
     update_linear,
 )
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridge, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, aged, bridge, bridged, find_back, stay
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
@@ -30,7 +30,10 @@ __all__ = [
     "observation_matrix",
     "PATIENCE",
     "Held",
+    "aged",
     "bridge",
+    "bridged",
+    "stay",
     "find_back",
     "covariance_root",
     "LinearModel",

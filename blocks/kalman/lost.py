@@ -2,7 +2,8 @@
 
 `bridge` makes a prior less sure when the control that drove it is old. `find_back` makes a belief less sure
 when a gate has refused a run of measurements, until one passes: then the belief is all but that measurement.
-Both change the covariance alone, of any belief that has one, and both do nothing while all is well.
+Both change the covariance alone, of any belief that has one. `stay` leaves a belief of any kind where it was
+over a step that is no step but a jump of the stamps. All do nothing while all is well.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.metrics.consistency import IN_A_ROW
 
-__all__ = ["PATIENCE", "Held", "bridge", "find_back"]
+__all__ = ["PATIENCE", "Held", "aged", "bridge", "bridged", "find_back", "stay"]
 
 PATIENCE = IN_A_ROW
 """How many refusals in a row are taken for outliers."""
+
+PAUSE = 1.0
+"""s: a pause of all streams, or a jump of their stamps, makes as unsure as a gap of the control so long."""
 
 
 class Held(NamedTuple):
@@ -27,11 +31,41 @@ class Held(NamedTuple):
         after: s, how old a control may be before it is said to be held.
         rate: rad/s, by how much the rate of the body differs from a reading after one second.
         force: m/s^2, the same of its acceleration.
+        longest: s, the longest step over which anything is predicted; None: any is. A longer one counts as
+            `PAUSE`.
     """
 
     after: float
     rate: float = 1.0
     force: float = 5.0
+    longest: float | None = None
+
+
+def bridged(before: Any, prior: Any, control: Any, *, held: Held | None, **places: Any) -> Any:
+    """The streams of a prior after `stay` and `bridge`, as far as `held` asks for them; wires, and no block.
+
+    Args:
+        before: the belief that was predicted.
+        prior, control, held, places: as for `bridge`.
+    """
+    if held is None:
+        return prior
+    if held.longest is not None:
+        prior = stay(before, prior, longest=held.longest)
+    return bridge(prior, control, held=held, **places)
+
+
+@block
+def stay(before: Any, prior: Any, *, longest: float, dt: float, xp: Any):  # type: ignore[no-untyped-def]
+    """What was predicted, or what was there before where the step is longer than `longest` (s).
+
+    Any signal of arrays: a belief, a cloud of particles, an attitude.
+
+    So after a pause of all streams, or a jump of their stamps, a belief is where it was.
+    """
+    still = dt > longest
+    kept = {name: xp.where(still, getattr(before, name), getattr(prior, name)) for name in prior._fields}
+    return type(prior)(**kept)
 
 
 @block
@@ -41,7 +75,7 @@ def bridge(  # type: ignore[no-untyped-def]
     control: Any | None,
     *,
     held: Held,
-    position: int,
+    position: int | None = None,
     velocity: int,
     attitude: int | None = None,
     dt: float,
@@ -63,19 +97,21 @@ def bridge(  # type: ignore[no-untyped-def]
         control: where there is a fresh one; the age of the one before counts in the step that ends with it.
         held: from which age on, and how fast, it becomes worthless.
         position, velocity, attitude: where these stand in the covariance. An attitude of three numbers is an
-            error in the body or angles; of a belief with ten, it is the quaternion.
+            error in the body or angles; of a belief with ten, it is the quaternion. A position or attitude
+            may be left out.
 
     State: the age of the control, s.
     """
     P = prior.covariance
-    age = state + dt
-    part = xp.minimum(xp.maximum(age - held.after, 0.0 * age), 0.0 * age + dt)
-    w = 2.0 * (age - 0.5 * part) * part
+    rest, part, w = aged(state, control, held, dt, xp)
     n = P.shape[-1]
     table = np.zeros((3, n, n))
     one = np.eye(3)
-    p, v = slice(position, position + 3), slice(velocity, velocity + 3)
-    table[0, v, v] = table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
+    v = slice(velocity, velocity + 3)
+    table[0, v, v] = one * held.force**2
+    if position is not None:
+        p = slice(position, position + 3)
+        table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
     push = [xp.asarray(part_, dtype=P.dtype) for part_ in table]
     more = push[0] * w + push[1] * (0.5 * part * w) + push[2] * (part * part * w / 3.0)
     if attitude is not None:
@@ -89,8 +125,23 @@ def bridge(  # type: ignore[no-untyped-def]
             where = np.zeros((n, n))
             where[attitude : attitude + 3, attitude : attitude + 3] = one
             more = more + xp.asarray(where, dtype=P.dtype) * turn
-    rest = age if control is None else 0.0 * age
     return rest, _with(prior, P + more)
+
+
+def aged(
+    age: Array, control: Any | None, held: Held, dt: Any, xp: Any, *, pause: float = PAUSE
+) -> tuple[Array, Array, Array]:
+    """The age of a control (s) after this step, which part s of the step it was old, and w of `bridge`.
+
+    Args:
+        pause: s, as how long a step counts that is longer than `held.longest`.
+    """
+    age = age + dt
+    part = xp.minimum(xp.maximum(age - held.after, 0.0 * age), 0.0 * age + dt)
+    if held.longest is not None:
+        jumped = dt > held.longest
+        age, part = (xp.where(jumped, pause, x) for x in (age, part))
+    return (age if control is None else 0.0 * age), part, 2.0 * (age - 0.5 * part) * part
 
 
 def _with(belief: Any, covariance: Array) -> Any:

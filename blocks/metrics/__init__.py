@@ -29,6 +29,7 @@ from flowgraph.blocks.metrics.errors import (
     plane_errors,
     pose_errors,
     state_error,
+    tilt_and_heading_nees,
     within_truth,
 )
 from flowgraph.blocks.metrics.truth import known, truth_remarks
@@ -50,6 +51,7 @@ __all__ = [
     "plane_errors",
     "pose_errors",
     "state_error",
+    "tilt_and_heading_nees",
     "within_truth",
     "known",
     "truth_remarks",

@@ -67,7 +67,16 @@ def increments(x: Array, imu: Imu, dt: Any) -> tuple[Array, Array]:
     return (imu.gyro - x[..., 9:12]) * dt, (imu.specific_force - x[..., 12:15]) * dt
 
 
-def move(x: Array, turn: Array, push: Array, dt: Any, *, order: str, xp: Any) -> Array:
+def move(
+    x: Array,
+    turn: Array,
+    push: Array,
+    dt: Any,
+    *,
+    order: str,
+    gravity: tuple[float, float, float] = GRAVITY,
+    xp: Any,
+) -> Array:
     """The state (..., 15) after dt seconds in which the body turned and was pushed by these increments.
 
         e_m = e + G(e)^-1 turn/2      e' = e + G(e_m)^-1 turn
@@ -79,7 +88,7 @@ def move(x: Array, turn: Array, push: Array, dt: Any, *, order: str, xp: Any) ->
     middle = e + 0.5 * (inverse_rate_matrix(e, order=order, xp=xp) @ turn[..., None])[..., 0]
     after = e + (inverse_rate_matrix(middle, order=order, xp=xp) @ turn[..., None])[..., 0]
     gained = (matrix_from_angles(middle, order=order, xp=xp) @ push[..., None])[..., 0]
-    gained = gained + xp.asarray(GRAVITY, dtype=x.dtype) * dt
+    gained = gained + xp.asarray(gravity, dtype=x.dtype) * dt
     return xp.concat([p + (v + 0.5 * gained) * dt, after, v + gained, x[..., 9:15]], axis=-1)
 
 
@@ -134,7 +143,14 @@ def increment_variances(noise: ImuNoise) -> np.ndarray:
 
 @block
 def predict_extended(
-    belief: Gaussian, imu: Imu, *, order: str, noise: ImuNoise, dt: float, xp: Any
+    belief: Gaussian,
+    imu: Imu,
+    *,
+    order: str,
+    noise: ImuNoise,
+    gravity: tuple[float, float, float] = GRAVITY,
+    dt: float,
+    xp: Any,
 ) -> Gaussian:
     """Predict over `dt` seconds with one IMU reading: the extended Kalman filter.
 
@@ -147,13 +163,14 @@ def predict_extended(
         imu: the reading that holds over the step.
         order: "zxy" or "zyx".
         noise: continuous densities.
+        gravity: in the world, m/s^2.
     """
     x = belief.mean
     turn, push = increments(x, imu, dt)
     F, L = move_jacobians(x, turn, push, dt, order=order, xp=xp)
     Q = xp.asarray(increment_variances(noise), dtype=x.dtype) * dt
     P = F @ belief.covariance @ F.mT + (L * Q) @ L.mT
-    moved = move(x, turn, push, dt, order=order, xp=xp)
+    moved = move(x, turn, push, dt, order=order, gravity=gravity, xp=xp)
     return Gaussian(mean=STATE.plus(moved, xp.zeros_like(x), xp), covariance=0.5 * (P + P.mT))
 
 
@@ -314,3 +331,10 @@ def start_gaussian(
     e = angles_from_matrix(R, order=order, xp=np)
     mean = np.concatenate([np.asarray(position, float), e, np.asarray(velocity, float), np.zeros(6)])
     return Gaussian(mean=mean, covariance=np.diag(np.repeat(np.square(deviations), 3)))
+
+
+def with_heading(start: Gaussian, deviation: float | None) -> Gaussian:
+    """The belief, whose yaw has such a deviation, rad; as it is for None."""
+    P = np.array(start.covariance)
+    P[5, 5] = P[5, 5] if deviation is None else deviation**2
+    return Gaussian(mean=start.mean, covariance=P)

@@ -11,10 +11,12 @@ sec. 6.2.2 (white noise acceleration).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Result, Series, block
+from flowgraph import Result, Series, block, when
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.signals import Gaussian, PointBelief, WorldAcceleration
@@ -25,6 +27,7 @@ __all__ = [
     "point_model",
     "point_steps",
     "start_point",
+    "whole",
 ]
 
 
@@ -42,6 +45,12 @@ def between(before: WorldAcceleration, now: WorldAcceleration) -> WorldAccelerat
     Holding either alone lags or leads by half a step. Where no new control came, both are the last one.
     """
     return WorldAcceleration(acceleration=0.5 * (before.acceleration + now.acceleration))
+
+
+@block
+def whole(control: WorldAcceleration, *, xp: Any) -> WorldAcceleration | None:
+    """The control, absent where a part of it is NaN."""
+    return when(~xp.any(xp.isnan(control.acceleration)), control)
 
 
 def point_model(density: float) -> LinearModel:

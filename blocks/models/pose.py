@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, Result, Series, block
+from flowgraph import Array, Held, Result, Series, Stream, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
@@ -65,7 +65,10 @@ def between_imu(before: Imu, now: Imu) -> Imu:
     )
 
 
-def driving(last: Any, control: Any, reading: str) -> Any:
+Reading = Stream[Imu] | Held[Imu]
+
+
+def driving(last: Reading, control: Reading, reading: str) -> Any:
     """What drives the step to now, of the last control and this one.
 
     Args:

@@ -21,6 +21,7 @@ import numpy as np
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
+from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
@@ -37,13 +38,13 @@ RATES = ("gyro", "camera")
 """Whose rate the body's is taken for: the gyroscope's minus its bias (eq. 10), or the camera's (eq. 9)."""
 
 
-def carried(order: str) -> Callable[..., Array]:
+def carried(order: str, gravity: tuple[float, float, float] = GRAVITY) -> Callable[..., Array]:
     """`move` of `predict_unscented`: `euler_ins.move` over the IMU's readings, each point with its own noise
     (..., 12) of (increments of angle and velocity, steps of the two biases)."""
 
     def moved(x: Array, imu: Imu, w: Array, dt: Any, xp: Any) -> Array:
         turn, push = increments(x, imu, dt)
-        after = move(x, turn + w[..., 0:3], push + w[..., 3:6], dt, order=order, xp=xp)
+        after = move(x, turn + w[..., 0:3], push + w[..., 3:6], dt, order=order, gravity=gravity, xp=xp)
         return after + xp.concat([xp.zeros_like(after[..., 0:9]), w[..., 6:12]], axis=-1)
 
     return moved

@@ -183,8 +183,8 @@ def dead_reckon(
 
 
 @dead_reckon.init
-def _(estimate: Any, imu: Any, **_: Any) -> Any:
-    return Imu.at_rest()
+def _(estimate: Any, imu: Any, *, gravity: tuple[float, float, float] = GRAVITY, **_: Any) -> Any:
+    return Imu.at_rest(gravity)
 
 
 @block

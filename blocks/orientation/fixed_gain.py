@@ -47,11 +47,13 @@ class AttitudeNoise:
         gyro: rad/s/sqrt(Hz).
         force: m/s^2, the standard deviation of one reading on each body axis, independent of the one before.
         start: rad, of the first attitude about each axis.
+        heading: rad, about the vertical in its place.
     """
 
     gyro: float
     force: tuple[float, float, float]
     start: float
+    heading: float | None = None
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def attitude_spread(
 
 @attitude_spread.init
 def _(attitude: Any, up: Any, *, noise: AttitudeNoise, **_: Any) -> Any:
-    return np.eye(3) * noise.start**2
+    heading = noise.start if noise.heading is None else noise.heading
+    return np.eye(3) * np.square([noise.start, noise.start, heading])
 
 
 def _arc_jacobian(n: Array, xp: Any) -> Array:

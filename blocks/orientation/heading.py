@@ -3,7 +3,8 @@
 The level frame of `marg` has z up and a heading that drifts. Here is the angle from it to the world, a filter
 of one number, beside what is known of the field where nothing disturbs it. A reading is judged by the field's
 strength and dip, which the heading does not change: the farther they are from the undisturbed field's, the
-larger the variance of the heading that it shows.
+larger the variance of the heading that it shows. Beside a magnet both pass through normal for an instant, so
+the doubt of a reading fades only slowly.
 
 Source: D. Laidig and T. Seel, "VQF: highly accurate IMU orientation estimation with bias estimation and
 magnetic disturbance rejection", Information Fusion 91, 2023 (a heading apart from an inclination, and the
@@ -18,7 +19,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph import block
+from flowgraph.blocks.geometry.manifold import angle
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, normalize, rotate, to_matrix
+from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.lost import Held, aged
 from flowgraph.blocks.signals import (
     Alignment,
     AttitudeBiasBelief,
@@ -32,6 +36,7 @@ from flowgraph.blocks.signals import (
 __all__ = [
     "FieldTrust",
     "OrientationBelief",
+    "doubt_heading",
     "join_orientation",
     "predict_heading",
     "start_heading",
@@ -41,25 +46,32 @@ __all__ = [
 OrientationBelief = AttitudeBiasBelief
 """The older name of the belief over attitude and gyroscope bias."""
 
+ANGLE = angle()
+
 
 @dataclass(frozen=True)
 class FieldTrust:
     """How a reading of the field is judged.
 
+    A disturbance that points anywhere changes the relative strength by as much as the dip, so both have one
+    limit; 0.06 is twice what they change by in rooms.
+
     Args:
-        density: rad/sqrt(Hz), of the heading that an undisturbed field shows; disturbances change slowly, so
-            much more than the noise of a sample.
+        density: rad/sqrt(Hz), of the heading that an undisturbed field shows. It is that of the field, which
+            differs by degrees from place to place; the noise of a sensor is a hundredth of it.
         strength: relative deviation of the field's strength at which the variance is doubled.
         dip: rad, deviation of the dip at which it is doubled.
         memory: s, in which strength and dip of the undisturbed field are learned.
         power: of the deviation; the more, the sharper a disturbed field is refused.
+        hold: s, the time constant with which the doubt of a reading fades; 0 forgets it at once.
     """
 
-    density: float = 0.2
-    strength: float = 0.05
-    dip: float = 0.1
+    density: float = 0.085
+    strength: float = 0.06
+    dip: float = 0.06
     memory: float = 30.0
     power: int = 2
+    hold: float = 0.3
 
 
 def start_heading(found: Alignment, field: np.ndarray) -> HeadingBelief:
@@ -104,6 +116,23 @@ def predict_heading(
 
 
 @block
+def doubt_heading(  # type: ignore[no-untyped-def]
+    state, belief: HeadingBelief, imu: Imu | None, *, held: Held, dt: float, xp: Any
+) -> tuple[Any, HeadingBelief]:
+    """Make a heading less sure by the age of the reading of the gyroscope: rate^2 w, as `bridge` has it.
+
+    State: that age, s.
+    """
+    rest, _, w = aged(state, imu, held, dt, xp)
+    return rest, belief.replace(variance=belief.variance + held.rate**2 * w)
+
+
+@doubt_heading.init
+def _fresh(*_: Any, **__: Any) -> Any:
+    return np.float64(0.0)
+
+
+@block
 def update_heading(  # type: ignore[no-untyped-def]
     state,
     prior: HeadingBelief,
@@ -118,7 +147,8 @@ def update_heading(  # type: ignore[no-untyped-def]
     """Correct the heading with the field, where there is a reading.
 
         m = R(q) field        z = north - atan2(m_y, m_x)          residual = z - a, in (-pi, pi]
-        variance = (density^2 / dt) (1 + ((|m| / strength - 1) / s)^p + ((dip_m - dip) / d)^p)
+        doubt = ((|m| / strength - 1) / s)^p + ((dip_m - dip) / d)^p
+        held = max(doubt, held hold / (hold + dt))        variance = (density^2 / dt) (1 + held)
 
     with dt the time since the last reading. Strength and dip follow the field with the time constant
     `memory`, the slower the more it is off.
@@ -130,12 +160,12 @@ def update_heading(  # type: ignore[no-untyped-def]
         trust: how a reading is judged.
         north: rad, from the world's x axis to the field's horizontal part; pi/2 where y is north.
 
-    State: time of the last reading (int64 ns).
+    State: time of the last reading (int64 ns), and the doubt that is held.
     """
     if field is None:
         return state, prior
     kind = prior.angle.dtype
-    dt = xp.astype(t - state, kind) * 1e-9
+    dt = xp.astype(t - state["time"], kind) * 1e-9
     dt = xp.where(dt > 1e4, 0.0 * dt, dt)  # the first reading comes after no time
     m = rotate(level.attitude, field.field, xp=xp)
     flat = xp.sqrt(m[..., 0] ** 2 + m[..., 1] ** 2)
@@ -143,16 +173,21 @@ def update_heading(  # type: ignore[no-untyped-def]
     dip = xp.atan2(-m[..., 2], flat)
     off_strength = (strength / prior.strength - 1.0) / trust.strength
     off_dip = (dip - prior.dip) / trust.dip
-    doubt = 1.0 + xp.abs(off_strength) ** trust.power + xp.abs(off_dip) ** trust.power
-    R = doubt * trust.density**2 / xp.maximum(dt, 1e-6)
+    doubt = xp.abs(off_strength) ** trust.power + xp.abs(off_dip) ** trust.power
+    held = xp.maximum(doubt, state["held"] * (trust.hold / xp.maximum(trust.hold + dt, 1e-6)))
+    variance = (1.0 + held) * trust.density**2 / xp.maximum(dt, 1e-6)
     z = north - xp.atan2(m[..., 1], m[..., 0])
-    residual = np.pi - xp.remainder(np.pi - (z - prior.angle), 2.0 * np.pi)
-    gain = prior.variance / (prior.variance + R)
-    learn = dt / (trust.memory * doubt + dt)
-    angle = prior.angle + gain * residual
-    return t, HeadingBelief(
-        angle=np.pi - xp.remainder(np.pi - angle, 2.0 * np.pi),
-        variance=(1.0 - gain) ** 2 * prior.variance + gain**2 * R,
+    found = correct(
+        prior.variance[..., None, None],
+        ANGLE.minus(z, prior.angle, xp)[..., None],
+        xp.ones((1, 1), dtype=kind),
+        variance[..., None, None],
+        xp=xp,
+    )
+    learn = dt / (trust.memory * (1.0 + held) + dt)
+    return {"time": t, "held": held}, HeadingBelief(
+        angle=ANGLE.plus(prior.angle, found.shift[..., 0], xp),
+        variance=found.covariance[..., 0, 0],
         strength=prior.strength + learn * (strength - prior.strength),
         dip=prior.dip + learn * (dip - prior.dip),
     )
@@ -160,7 +195,7 @@ def update_heading(  # type: ignore[no-untyped-def]
 
 @update_heading.init
 def _(*_: Any, **__: Any) -> Any:
-    return np.int64(-(2**62))
+    return {"time": np.int64(-(2**62)), "held": np.float64(0.0)}
 
 
 @block

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import block
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     multiply,
@@ -40,6 +41,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
 )
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.signals import Alignment, Imu, LevelBelief, Rest
 
 __all__ = [
@@ -184,6 +186,9 @@ def predict_level(
     )
 
 
+LEVEL = StateSpace(euclidean(3), quaternion(), euclidean(3))
+"""Velocity, attitude and gyroscope bias, as `LevelBelief` has them."""
+
 _H = np.hstack([np.vstack([np.eye(3), np.zeros((3, 3))]), np.zeros((6, 3)), np.eye(6, 3, -3)])
 
 
@@ -206,47 +211,36 @@ def hold_velocity(
         gyro = b + e        only at rest
 
     A disturbance that lasts as long as its memory has the density 2 speed^2 memory, which per tick is a
-    variance of density / dt. H = [I 0 0; 0 0 I], in Joseph form, with the reset of the attitude error.
+    variance of density / dt. H = [I 0 0; 0 0 I], by `correct`, with the reset of the attitude error.
 
     Args:
         speed: m/s, how fast the body usually moves. speed_memory: s, for how long.
         rest_speed: m/s, how sure the velocity is zero at rest.
     """
     kind = prior.attitude.dtype
-    P = prior.covariance
     step = xp.maximum(xp.asarray(dt, dtype=kind) + 0.0 * rest.still, 1e-6)
     moving = 2.0 * speed**2 * speed_memory / step
     resting = 2.0 * rest_speed**2 * speed_memory / step
     still = rest.still
-    loose = 1e3  # a variance that says nothing of a bias
-    variance_v = moving + (resting - moving) * still
-    variance_b = loose + (noise.gyro**2 / step - loose) * still
-    R = xp.eye(6, dtype=kind) * xp.concat(
-        [xp.ones((3,), dtype=kind) * variance_v, xp.ones((3,), dtype=kind) * variance_b]
+    three = xp.ones((3,), dtype=kind)
+    variances = xp.concat(
+        [three * (moving + (resting - moving) * still), three * (noise.gyro**2 / step)], axis=-1
     )
-    residual = xp.concat([-prior.velocity, (imu.gyro - prior.gyro_bias) * still], axis=-1)
-    H = xp.asarray(_H, dtype=kind)
-    HP = H @ P
-    K = xp.linalg.solve(HP @ H.mT + R, HP).mT
-    d = (K @ residual[..., None])[..., 0]
-    turn = d[..., 3:6]
-    reset = xp.eye(3, dtype=kind) - 0.5 * skew(turn, xp=xp)
-    zero = 0.0 * reset
-    one = zero + xp.eye(3, dtype=kind)
-    G = xp.concat(
-        [
-            xp.concat([one, zero, zero], axis=-1),
-            xp.concat([zero, reset, zero], axis=-1),
-            xp.concat([zero, zero, one], axis=-1),
-        ],
-        axis=-2,
+    present = xp.concat([three > 0.0, three * still > 0.5], axis=-1)
+    found = correct(
+        prior.covariance,
+        xp.concat([-prior.velocity, (imu.gyro - prior.gyro_bias) * still], axis=-1),
+        xp.asarray(_H, dtype=kind),
+        xp.eye(6, dtype=kind) * variances,
+        present=present,
+        space=LEVEL,
+        xp=xp,
     )
-    A = G @ (xp.asarray(_ONE, dtype=kind) - K @ H)
-    gain = G @ K
-    P = A @ P @ A.mT + gain @ R @ gain.mT
+    state = xp.concat([prior.velocity, prior.attitude, prior.gyro_bias], axis=-1)
+    moved = LEVEL.plus(state, found.shift, xp)
     return LevelBelief(
-        velocity=prior.velocity + d[..., 0:3],
-        attitude=normalize(multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp), xp=xp),
-        gyro_bias=prior.gyro_bias + d[..., 6:9],
-        covariance=0.5 * (P + P.mT),
+        velocity=moved[..., 0:3],
+        attitude=moved[..., 3:7],
+        gyro_bias=moved[..., 7:10],
+        covariance=found.covariance,
     )

@@ -31,9 +31,10 @@ import numpy as np
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry import lanes
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor.flight import OutdoorStart
-from flowgraph.blocks.particles.cloud import log_sum_exp, start_cloud
+from flowgraph.blocks.particles.cloud import cloud_belief, log_sum_exp, start_cloud
 from flowgraph.blocks.signals import (
     Ancestors,
     Cloud,
@@ -41,8 +42,11 @@ from flowgraph.blocks.signals import (
     MagneticField,
     OpticalFlow,
     OutdoorCloud,
+    PoseBelief,
+    PoseEstimate,
     Position,
     Range,
+    Weights,
 )
 
 __all__ = [
@@ -51,6 +55,7 @@ __all__ = [
     "correct_field",
     "correct_flow",
     "correct_position",
+    "outdoor_belief",
     "predict_outdoor",
     "start_outdoor_cloud",
     "take_outdoor_ancestors",
@@ -83,6 +88,12 @@ _WHITE_TURN = _blocks({(3, 3): 1.0})
 
 _KEPT = np.repeat([1.0, 1.0, 0.0, 0.0], 3)
 """What of the state outlives a picture."""
+
+_MOTION_OF_POSE = np.eye(9, 12, 0)[[3, 4, 5, 0, 1, 2, 6, 7, 8]] * (np.arange(9) < 6)[:, None]
+"""(9, 12): position and velocity of (v, p, s, e), in the order of `PoseBelief`."""
+
+_TURN_OF_POSE = np.eye(9, 3, -6)
+"""(9, 3): the place of a rotation vector in `PoseBelief`."""
 
 _LEAST_VARIANCE = 1e-20
 """Below it (rad^2) a turn is taken for certain when it is drawn; in float32 too it is not zero."""
@@ -334,6 +345,31 @@ def as_cloud(cloud: OutdoorCloud) -> Cloud:
         cross_covariance=P[_POSITION, _VELOCITY, :],
         position_covariance=P[_POSITION, _POSITION, :],
     )
+
+
+@block
+def outdoor_belief(
+    cloud: OutdoorCloud, plain: Cloud, weights: Weights, pose: PoseEstimate, *, xp: Any
+) -> PoseBelief:
+    """The pose with its covariance (9, 9): `cloud_belief`, and what each particle does not know of its turn.
+
+    e, in the world, is R(q)^T e in the body; the mean of the particles' covariances is turned with the mean
+    attitude.
+
+    Args:
+        cloud, plain: with and without what `as_cloud` leaves out.
+        weights, pose: of it.
+    """
+    found = cloud_belief.step(plain, weights, pose, xp=xp)
+    kind = pose.attitude.dtype
+    own = xp.sum(cloud.covariance * weights.weight, axis=-1)
+    R = to_matrix(pose.attitude, xp=xp)
+    lift = xp.asarray(_TURN_OF_POSE, dtype=kind)
+    turn = lift @ R.mT @ xp.asarray(np.eye(3, 12, 9), dtype=kind)  # (9, 12)
+    motion = xp.asarray(_MOTION_OF_POSE, dtype=kind)
+    across = turn @ own @ motion.mT
+    total = found.covariance + turn @ own @ turn.mT + across + across.mT
+    return found.replace(covariance=0.5 * (total + total.mT))
 
 
 @block

@@ -1,8 +1,10 @@
 """Particles: beliefs that no Gaussian can hold, as weighted samples.
 
 `cloud` draws, weighs and averages particles of attitude; `resampling` draws a cloud anew when few particles
-have the weight, and decides alike on every engine; `rao_blackwell` gives each particle a Kalman filter of its
-own for position and velocity, which need no sampling once the attitude is given.
+have the weight, and decides alike on every engine; `guided` lets particles of any state look at a measurement
+before they are drawn; `lost` judges what a cloud should believe, and says when it is depleted;
+`rao_blackwell` gives each particle a Kalman filter of its own for position and velocity, which need no
+sampling once the attitude is given.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from flowgraph.blocks.particles.cloud import (
     attitude_likelihood,
     average_attitude,
     average_pose,
+    cloud_belief,
     dominant_eigenvector,
     effective_sample_size,
     log_sum_exp,
@@ -19,6 +22,15 @@ from flowgraph.blocks.particles.cloud import (
     start_cloud,
     weights,
 )
+from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.lost import (
+    believe_pose,
+    depletion,
+    depletion_remarks,
+    judge_pose,
+    mixture,
+    verdict,
+)
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.particles.resampling import (
     MOST_PARTICLES,
@@ -26,6 +38,7 @@ from flowgraph.blocks.particles.resampling import (
     ancestor_index,
     draw_ancestors,
     quantised,
+    roughening,
     take_ancestors,
 )
 
@@ -36,6 +49,7 @@ __all__ = [
     "dominant_eigenvector",
     "effective_sample_size",
     "log_sum_exp",
+    "cloud_belief",
     "propagate_attitude",
     "reweight",
     "start_cloud",
@@ -45,6 +59,17 @@ __all__ = [
     "ancestor_index",
     "draw_ancestors",
     "quantised",
+    "roughening",
+    "corrected",
+    "drawn",
+    "silverman",
+    "spread_of",
+    "believe_pose",
+    "depletion",
+    "depletion_remarks",
+    "judge_pose",
+    "mixture",
+    "verdict",
     "take_ancestors",
     "correct_motion",
     "predict_motion",

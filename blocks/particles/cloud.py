@@ -20,7 +20,16 @@ import numpy.typing as npt
 from flowgraph import Array, Scalar, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.inertial.alignment import StartSpread
-from flowgraph.blocks.signals import Attitude, Cloud, Imu, LogLikelihood, Pose, PoseEstimate, Weights
+from flowgraph.blocks.signals import (
+    Attitude,
+    Cloud,
+    Imu,
+    LogLikelihood,
+    Pose,
+    PoseBelief,
+    PoseEstimate,
+    Weights,
+)
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 __all__ = [
@@ -30,6 +39,7 @@ __all__ = [
     "dominant_eigenvector",
     "effective_sample_size",
     "log_sum_exp",
+    "cloud_belief",
     "propagate_attitude",
     "reweight",
     "start_cloud",
@@ -141,6 +151,32 @@ def average_pose(cloud: Cloud, weights: Weights, attitude: Attitude) -> PoseEsti
     )
 
 
+@block
+def cloud_belief(cloud: Cloud, weights: Weights, pose: PoseEstimate, *, xp: Any) -> PoseBelief:
+    """The pose with its covariance (9, 9): that of the particles' means, and the mean of their covariances.
+
+        cov = sum(w_i (d_i d_i^T + P_i)),   d_i = (p_i - p, v_i - v, Log(q^-1 q_i))
+
+    in the order of `PoseBelief`. P_i, of position and velocity, is the particle's own; an attitude that is
+    drawn has none.
+    """
+    q, w = pose.attitude, weights.weight
+    turn = -lanes.rotation_vectors_to(cloud.attitude, q, xp=xp)  # Log(q^-1 q_i) = -Log(q_i^-1 q)
+    apart = xp.concat(
+        [cloud.position - pose.position[:, None], cloud.velocity - pose.velocity[:, None], turn], axis=0
+    )
+    P, C, V = (
+        xp.sum(part * w, axis=-1)
+        for part in (cloud.position_covariance, cloud.cross_covariance, cloud.velocity_covariance)
+    )
+    own = xp.concat([xp.concat([P, C], axis=-1), xp.concat([C.mT, V], axis=-1)], axis=-2)
+    wide = xp.asarray(np.eye(6, 9), dtype=q.dtype)
+    total = (apart * w) @ apart.mT + wide.mT @ own @ wide
+    return PoseBelief(
+        position=pose.position, velocity=pose.velocity, attitude=q, covariance=0.5 * (total + total.mT)
+    )
+
+
 def start_cloud(
     particles: int,
     *,
@@ -159,16 +195,19 @@ def start_cloud(
         attitude: (4,) unit quaternion, body to world, about which the particles are drawn with the spread's
             tilt and heading. Left out: roll and pitch zero, and the yaw uniform over the circle, one drawn in
             each of as many equal arcs.
-        spread: standard deviations.
+        spread: standard deviations. A heading of infinity is uniform over the circle in the same way.
     """
     draw = NumpyDraw("start_cloud", seed_words(seed), 0)
     n = particles
     if attitude is None:
-        half = math.pi * (np.arange(n) + draw.uniform("yaw", (n,))) / n
-        q = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)])
+        q = _about_the_vertical(n, draw)
     else:
         sigma = np.array([[spread.tilt], [spread.tilt], [spread.heading]])  # about world axes: on the left
+        even = math.isinf(spread.heading)
+        sigma[2] = 0.0 if even else sigma[2]
         turn = lanes.exponential(sigma * draw.normal("attitude", (3, n)), xp=np)
+        if even:
+            turn = lanes.multiply(_about_the_vertical(n, draw), turn, xp=np)
         q = lanes.multiply(turn, np.repeat(np.asarray(attitude, dtype=float)[:, None], n, axis=1), xp=np)
     covariance = lambda deviation: np.repeat(np.eye(3)[:, :, None] * deviation**2, n, axis=2)
     return Cloud(
@@ -180,3 +219,9 @@ def start_cloud(
         cross_covariance=np.zeros((3, 3, n)),
         position_covariance=covariance(spread.position),
     )
+
+
+def _about_the_vertical(n: int, draw: NumpyDraw) -> np.ndarray:
+    """Turns (4, n), one drawn in each of n equal arcs of the circle."""
+    half = math.pi * (np.arange(n) + draw.uniform("yaw", (n,))) / n
+    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)])

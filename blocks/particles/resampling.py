@@ -26,7 +26,15 @@ from flowgraph import Array, Scalar, block
 from flowgraph.blocks.signals import Ancestors, Cloud
 from flowgraph.errors import UnknownNameError
 
-__all__ = ["MOST_PARTICLES", "SCHEMES", "ancestor_index", "draw_ancestors", "quantised", "take_ancestors"]
+__all__ = [
+    "MOST_PARTICLES",
+    "SCHEMES",
+    "ancestor_index",
+    "draw_ancestors",
+    "quantised",
+    "roughening",
+    "take_ancestors",
+]
 
 WEIGHT_BITS = 38
 """A weight is a multiple of 2^-38: n times the sum of all then fits int64, for n up to 2^24."""
@@ -110,6 +118,19 @@ def ancestor_index(weight: Array, *, scheme: str, draw: Any, xp: Any) -> Array:
         raise UnknownNameError("resampling scheme", scheme, SCHEMES)
     index = SCHEMES[scheme](quantised(weight, xp=xp), draw=draw, xp=xp)
     return xp.minimum(index, weight.shape[-1] - 1)  # of use only where the weights are not numbers
+
+
+def roughening(apart: Array, spread: float, *, xp: Any) -> Array:
+    """The deviations (t) by which copies are shaken apart: spread n^(-1/t) times the range of the sample.
+
+    Args:
+        apart: (n, t), the points before resampling, from anywhere among them.
+        spread: 0.2 in the source.
+
+    Source: N. Gordon, D. Salmond and A. Smith, IEE Proc. F 140, 1993, sec. 3.
+    """
+    n, t = apart.shape
+    return (xp.max(apart, axis=0) - xp.min(apart, axis=0)) * (spread * n ** (-1.0 / t))
 
 
 @block

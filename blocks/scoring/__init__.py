@@ -27,11 +27,10 @@ from flowgraph.blocks.scoring.cases import (
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
-from flowgraph.blocks.scoring.orientation import Share, counted_errors, scored_errors
+from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
-from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, StartPose
+from flowgraph.blocks.scoring.start import MAGNETIC_HEADING, UNKNOWN_HEADING, Started, StartPose
 from flowgraph.blocks.scoring.streams import (
-    first_attitude,
     own_density,
     reading_deviation,
     told_acceleration,
@@ -68,6 +67,7 @@ __all__ = [
     "Smoothed",
     "SmoothedPoseFilter",
     "SMOOTHED",
+    "MAGNETIC_HEADING",
     "UNKNOWN_HEADING",
     "Started",
     "StartPose",
@@ -79,12 +79,12 @@ __all__ = [
     "reading_of",
     "unbiased_factors",
     "with_imu",
-    "first_attitude",
     "own_density",
     "reading_deviation",
     "told_acceleration",
     "with_parts",
     "Share",
+    "counted",
     "counted_errors",
     "scored_errors",
 ]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -26,6 +26,7 @@ from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
 from flowgraph.blocks.scoring.start import Started, StartPose
@@ -49,9 +50,6 @@ __all__ = [
     "on_capture",
     "on_flight",
 ]
-
-GAP = 4.0
-"""A control is old after so many of its median steps."""
 
 Score = Callable[[Result], dict[str, float]]
 
@@ -77,6 +75,16 @@ class OnFlight:
         """The graph's."""
         return self.graph.name
 
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """In the world, m/s^2: zero for a unit that reads the coordinate acceleration."""
+        return tuple(self.flight.info.get("gravity", GRAVITY))
+
+    @property
+    def weightless(self) -> bool:
+        """Whether the unit's readings know no gravity, and so show no vertical."""
+        return not any(self.gravity)
+
     def need(self, *streams: str, fix: str = "choose another flight") -> dict[str, Series]:
         """`Flight.need` of the graph."""
         return self.flight.need(self.name, *streams, fix=fix)
@@ -98,14 +106,23 @@ class OnFlight:
 
     def usual_step(self, control: Series) -> float | None:
         """The median step of a control in s; None where none of its steps is a gap. Gaps are a note."""
-        steps = np.diff(control.time) * 1e-9
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        wide = steps[steps > GAP * usual]
+        wide, usual = gaps(control)
         if not len(wide):
             return None
-        many = "a gap of" if len(wide) == 1 else f"{len(wide)} gaps, the longest of"
-        self.note("bridged", f"{control.name}: {many} {wide.max():.3g} s (median step {usual:.3g} s)")
+        self.notes.append(gap_note(control.name, wide, usual))
         return usual
+
+    def longest(self, inputs: Mapping[str, Series] | None = None) -> float | None:
+        """The step in s over which nothing is predicted, `pause`; None where no step is as long.
+
+        Args:
+            inputs: those that were needed if left out. A pause of all of them is a note.
+        """
+        found = pause(self.inputs if inputs is None else inputs)
+        if found is None:
+            return None
+        self.notes.append(found[1])
+        return found[0]
 
     def noise(self, name: str, setting: float | None, otherwise: float | None = None) -> float:
         """A standard deviation or density: `noise_of` of the graph."""
@@ -129,8 +146,10 @@ class OnFlight:
             sizes, settings: as for `build`.
         """
         inputs = dict(self.inputs if inputs is None else inputs)
-        if "imu" in inputs:
-            self.usual_step(inputs["imu"])
+        noted = ["imu"] if "imu" in inputs else []
+        for name in noted:
+            self.usual_step(inputs[name])
+        self.notes.extend(gap_notes(inputs, noted))
         built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
         return Case(
             built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
@@ -142,6 +161,8 @@ def on_flight(
     *needs: str,
     fix: str = "choose another flight",
     told: Callable[[Flight], Flight] | None = None,
+    measured: Collection[str] | None = (),
+    ranged: bool = True,
 ) -> Callable[[Callable[..., Case]], Callable[..., Case]]:
     """Decorator: registers `function(on, *, settings) -> Case` as that which makes a case of a flight.
 
@@ -152,6 +173,9 @@ def on_flight(
         needs: streams without which it is not, put into `on.inputs`.
         fix: what to do where one is missing.
         told: completes the flight by what follows from it.
+        measured: streams of controls that the graph takes as measurements, which correct by their finite
+            entries; None where it takes whole measurements only.
+        ranged: whether it takes what inertial sensors read, so that it has the settings of `Ranges`.
 
     Raises:
         DataError: by what is registered, where a stream is missing or empty.
@@ -159,7 +183,7 @@ def on_flight(
     """
 
     def register(function: Callable[..., Case]) -> Callable[..., Case]:
-        known = spliced(function)
+        known = spliced(function, **({"ranges": Ranges} if ranged else {}))
         flown = inspect.Parameter("flight", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Flight)
         signature = inspect.Signature([flown, *known.parameters], return_annotation=Case)
 
@@ -174,8 +198,10 @@ def on_flight(
             flight = values.pop("flight")
             known.check(graph.name, values)
             flight = flight if told is None else told(flight)
+            groups = known.grouped(values)
+            flight, notes = taken(flight, groups.pop("ranges", Ranges()), graph.name, measured)
             inputs = flight.need(graph.name, *needs, fix=fix)
-            return function(OnFlight(graph, flight, inputs), **known.grouped(values))
+            return function(OnFlight(graph, flight, inputs, notes), **groups)
 
         prepare.__signature__ = signature  # type: ignore[attr-defined]
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
@@ -262,13 +288,16 @@ class HeldControl(Settings):
 
     held_noise: Annotated[str, one_of("keep", "grow")] = "grow"
 
-    def held(self, on: OnFlight, control: Series) -> Held | None:
+    def held(self, on: OnFlight, control: Series, inputs: Mapping[str, Series] | None = None) -> Held | None:
         """From which age on the control of a flight is old; None where it never is, or that is kept.
 
-        A gap is a note of the case.
+        A gap is a note of the case; over a pause of all `inputs` nothing is predicted (`OnFlight.longest`).
         """
-        usual = on.usual_step(control)
-        return None if usual is None or self.held_noise == "keep" else Held(after=GAP * usual)
+        usual, longest = on.usual_step(control), on.longest(inputs)
+        if usual is None or (self.held_noise == "keep" and longest is None):
+            return None
+        more = {"rate": 0.0, "force": 0.0} if self.held_noise == "keep" else {}
+        return Held(after=GAP * usual, longest=longest, **more)
 
 
 @dataclass(frozen=True)
@@ -317,12 +346,12 @@ class PoseNoises(Settings):
 
 
 @dataclass(frozen=True)
-class PoseAided(Factors, PoseNoises, Scored):
+class PoseAided(Factors, PoseNoises, Scored, Started):
     """What every filter has that is driven by an IMU and corrected by poses."""
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, HeldControl, Gated, Started):
+class PoseFilter(PoseAided, HeldControl, Gated):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 
@@ -373,17 +402,17 @@ def on_capture(
         settings: of the graph itself.
     """
     vicon, info = on.inputs["vicon"], on.flight.info
-    first = vicon[0]
-    pose = filter.pose(on, int(vicon.time[0]), first.position, first.attitude, usual="file")
+    pose = filter.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file")
     return on.case(
         filter.score(on, pose_errors, steps=steps),
+        inputs=pose.inputs,
         start=_started(start, pose),
         noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
         **filter.measured(on),
         lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
         reading=reading_of(on.flight),
-        gravity=info.get("gravity", GRAVITY),
-        held=filter.held(on, on.inputs["imu"]),
+        gravity=on.gravity,
+        held=filter.held(on, pose.inputs["imu"]),
         **filter.gating(),
         **settings,
     )

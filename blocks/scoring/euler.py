@@ -17,7 +17,7 @@ from flowgraph.blocks.geometry.euler import ORDERS
 from flowgraph.blocks.geometry.rotations import rotate
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian
+from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian, with_heading
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
     Factors,
@@ -31,7 +31,6 @@ from flowgraph.blocks.scoring.cases import (
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.scorer import Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, named
-from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, reading_of
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
@@ -111,6 +110,7 @@ class EulerModel(ScaledFactors, Scored):
             noise=self.imu_noise(on),
             order=self.order,
             reading=reading_of(on.flight),
+            gravity=on.gravity,
             **settings,
         )
 
@@ -123,7 +123,7 @@ class EulerKalman(EulerModel, HeldControl, Gated):
         self, on: OnFlight, start: Any, *, inputs: Mapping[str, Series] | None = None, **settings: Any
     ) -> Case:
         """As of `EulerModel`, with a gate, and with what the age of the IMU's readings does."""
-        held = self.held(on, on.inputs["imu"])
+        held = self.held(on, (on.inputs if inputs is None else inputs)["imu"], inputs)
         return super().case(on, start, inputs=inputs, held=held, **self.gating(), **settings)
 
 
@@ -216,18 +216,17 @@ def on_measured_pose(
         start: makes the graph's start of a belief around the first measured pose.
         settings: of the graph itself.
     """
-    place, turn, more = pose["position"][0], pose["attitude"][0], {}
+    begin = filter.pose(on, {**on.inputs, "pose": pose}, position=pose, attitude=pose, usual="file")
+    place = begin.position
     source = next((name for name in MEASURED if name in on.flight.streams), "pose")
     lever = tuple(float(x) for x in on.flight.info.get(f"{source}_lever", (0.0, 0.0, 0.0)))
-    if any(lever):
-        place = place - rotate(turn, np.asarray(lever), xp=np)
-    if isinstance(filter, Started):
-        place, turn, heading = filter.pose(on, int(pose.time[0]), place, turn, usual="file")
-        more = {} if heading is None else {"deviations": (0.05, heading, 0.3, 0.03, 0.15)}
+    if any(lever) and not begin.told:
+        place = place - rotate(begin.attitude, np.asarray(lever), xp=np)
+    first = start_gaussian(place, begin.attitude, order=filter.order)
     return filter.case(
         on,
-        start(start_gaussian(place, turn, order=filter.order, **more)),
-        inputs={**on.inputs, "pose": pose},
+        start(with_heading(first, begin.heading)),
+        inputs=begin.inputs,
         R=filter.covariance(on) * inflate**2,
         lever=lever,
         **settings,

@@ -14,7 +14,7 @@ from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.scoring.scorer import Errors
 from flowgraph.errors import DeclarationError
 
-__all__ = ["Share", "counted_errors", "scored_errors"]
+__all__ = ["Share", "counted", "counted_errors", "scored_errors"]
 
 
 def check_alpha(graph: str, name: str, alpha: float) -> None:
@@ -43,11 +43,15 @@ def scored_errors(estimate: Series, flight: Flight, *, settle: float = 1.0) -> d
     """
     if flight.truth is None:
         return {}
-    scored = flight.info.get("scored")
-    if scored is None:
+    if "scored" not in flight.info:
         return orientation_errors(estimate, flight.truth, settle=settle)
-    counted = scored.time[scored["value"]]
-    return orientation_errors(estimate[np.isin(estimate.time, counted)], flight.truth, settle=0.0)
+    return orientation_errors(counted(estimate, flight), flight.truth, settle=0.0)
+
+
+def counted(estimate: Series, flight: Flight) -> Series:
+    """The estimate at the times whose error counts, where the flight's info has `scored`; else all of it."""
+    scored = flight.info.get("scored")
+    return estimate if scored is None else estimate[np.isin(estimate.time, scored.time[scored["value"]])]
 
 
 def counted_errors(flight: Flight) -> Errors:

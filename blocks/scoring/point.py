@@ -12,10 +12,12 @@ from functools import partial
 import numpy as np
 
 from flowgraph import Case, DataError, Flight, Series, arrays
+from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
+from flowgraph.blocks.scoring.start import from_first
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
 from flowgraph.blocks.signals import PointReading, Position
@@ -45,35 +47,41 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
     Raises:
         DataError: where the flight does not say its noise.
     """
+    place, inputs = from_first(on, inputs, on.inputs["vicon"], "position")
+    held = filter.held(on, on.inputs["imu"], inputs)
+    if held is None and "reading" in inputs and np.isnan(inputs["reading"]["acceleration"]).any():
+        held = Held(after=1.0, rate=0.0, force=0.0)  # a control is missing, none for long
     density = given(filter.accelerometer_noise, imu_noise_of(on.name, on.flight).accelerometer)
     return on.case(
         filter.score(on, point_errors, steps=partial(point_steps, model=point_model(density))),
         inputs=inputs,
-        start=start_point(on.inputs["vicon"]["position"][0]),
+        start=start_point(place),
         noise=density,
         position_noise=on.noise("position_noise", filter.position_noise),
         control=reading_of(on.flight),
-        held=filter.held(on, on.inputs["imu"]),
+        held=held,
         **filter.gating(),
     )
 
 
 def positions(vicon: Series) -> Series:
     """The positions of a motion capture."""
-    return Series(vicon.time, Position(position=vicon["position"]), name="position")
+    return Series(vicon.time, Position(position=vicon["position"]), name="position", gaps=vicon.gaps)
 
 
 def readings(flight: Flight) -> Series:
-    """The flight's accelerations, each with the position of its time, NaN where there was none.
+    """The flight's accelerations, each with the position of its time, NaN where there was none; and the
+    positions of a gap of the controls, with NaN for these.
 
     Args:
         flight: with the stream `vicon`, and what `told_acceleration` asks for.
 
     Raises:
-        DataError: without an IMU or truth, or where a position comes between two IMU readings.
+        DataError: without an IMU or truth, or where a position comes between two IMU readings that follow on
+            each other.
     """
     vicon, control = flight.streams["vicon"], told_acceleration(flight)
-    if not np.isin(vicon.time, control.time).all():
+    if not (np.isin(vicon.time, control.time) | _in_gap(vicon.time, control.time)).all():
         raise DataError(
             "the positions do not come with the controls",
             path=flight.name,
@@ -81,7 +89,18 @@ def readings(flight: Flight) -> Series:
             got="positions between two readings of the imu",
             fix="use async_kalman, which takes each when it comes",
         )
-    position = np.full((len(control), 3), np.nan)
-    position[np.searchsorted(control.time, vicon.time)] = vicon["position"]
-    values = PointReading(acceleration=control["acceleration"], position=position)
-    return arrays(control.time, values, not_finite="keep", name="reading")
+    time = np.union1d(control.time, vicon.time)
+    position, acceleration = np.full((2, len(time), 3), np.nan)
+    position[np.searchsorted(time, vicon.time)] = vicon["position"]
+    acceleration[np.searchsorted(time, control.time)] = control["acceleration"]
+    values = PointReading(acceleration=acceleration, position=position)
+    return arrays(time, values, not_finite="keep", name="reading")
+
+
+def _in_gap(time: np.ndarray, control: np.ndarray) -> np.ndarray:
+    """Which times lie between two controls that others should have come between."""
+    steps = np.diff(control)
+    if not len(steps):
+        return np.zeros(len(time), dtype=bool)
+    wide = np.concatenate([[False], steps > 1.5 * np.median(steps), [False]])
+    return wide[np.searchsorted(control, time)]

@@ -16,6 +16,7 @@ from flowgraph import Graph, Result, Series
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
 from flowgraph.blocks.metrics.truth import truth_remarks
+from flowgraph.blocks.particles.lost import depletion_remarks
 from flowgraph.types import leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
@@ -36,7 +37,8 @@ SMOOTHED = (
 @dataclass(frozen=True)
 class Scorer:
     """The `score` of a `Case`, which says what streams it reads, so that a run of many need not keep others,
-    and has `remarks` on a result: what was not compared, and what a gate refused in a row.
+    and has `remarks` on a result: what was not compared, what a gate refused in a row, and where a cloud was
+    depleted.
 
     Args:
         truth: with which the estimate is compared; without one there are innovations only.
@@ -98,6 +100,8 @@ class Scorer:
         for name, series in result.series.items():
             if self._sums_up(series.leaves):
                 found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+            if "depleted" in series.leaves:
+                found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
 
     def _sums_up(self, leaves: Mapping[str, object]) -> bool:

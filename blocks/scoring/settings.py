@@ -57,8 +57,22 @@ def not_negative(graph: str, name: str, value: object) -> None:
     need_numbers(graph, not_negative={name: value})
 
 
+def share(graph: str, name: str, value: object) -> None:
+    """Refuse what is no number from 0 to 1; None passes."""
+    need_numbers(graph, not_negative={name: value})
+    if isinstance(value, (int, float)) and value > 1.0:
+        raise DeclarationError(
+            f"setting {name!r} is no part of a whole",
+            path=f"{graph}.{name}",
+            expected="a number from 0 to 1",
+            got=repr(value),
+            fix=f"write {name}=0.5",
+        )
+
+
 Positive = Annotated[float, positive]
 NotNegative = Annotated[float, not_negative]
+Share = Annotated[float, share]
 
 
 def count(least: int, most: int) -> Check:
@@ -161,16 +175,21 @@ class Spliced:
         return left | made
 
 
-def spliced(function: Callable[..., Any]) -> Spliced:
+def spliced(function: Callable[..., Any], **more: type[Settings]) -> Spliced:
     """What a function of keyword-only settings and groups of settings takes, all told.
+
+    Args:
+        function: with keyword-only settings.
+        more: groups that are settings, too, and no parameters of the function.
 
     Raises:
         DeclarationError: where a setting is declared twice.
     """
-    kinds = typing.get_type_hints(function, include_extras=True)
+    kinds = typing.get_type_hints(function, include_extras=True) | more
+    added = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in more]
     found: dict[str, tuple[Any, Any, str]] = {}
     groups: dict[str, type[Settings]] = {}
-    for p in inspect.signature(function).parameters.values():
+    for p in [*inspect.signature(function).parameters.values(), *added]:
         if p.kind is not p.KEYWORD_ONLY:
             continue
         kind = kinds[p.name]

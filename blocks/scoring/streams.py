@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.geometry.rotations import level, to_matrix
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.metrics.truth import interpolate
 from flowgraph.blocks.scoring.tuning import reading_of
-from flowgraph.blocks.signals import GRAVITY, Attitude, Gyro, SpecificForce, WorldAcceleration
+from flowgraph.blocks.signals import GRAVITY, Gyro, SpecificForce, WorldAcceleration
 from flowgraph.errors import DataError
 
-__all__ = ["first_attitude", "own_density", "reading_deviation", "told_acceleration", "with_parts"]
+__all__ = ["own_density", "reading_deviation", "told_acceleration", "with_parts"]
 
 
 def told_acceleration(flight: Flight) -> Series:
@@ -43,7 +43,7 @@ def told_acceleration(flight: Flight) -> Series:
         last = np.maximum(np.searchsorted(truth.time, imu.time, side="right") - 1, 0)
         force = force - truth["accelerometer_bias"][last]
     turned = (to_matrix(attitude, xp=np) @ force[..., None])[..., 0]
-    found = WorldAcceleration(acceleration=turned + np.array(GRAVITY))
+    found = WorldAcceleration(acceleration=turned + np.array(flight.info.get("gravity", GRAVITY)))
     return Series(imu.time, found, name="acceleration")
 
 
@@ -54,9 +54,9 @@ def with_parts(flight: Flight) -> Flight:
         imu = streams["imu"]
         if "gyro" not in streams:
             info.update(gyro_oversample=info.get("imu_oversample", 1), gyro_turn=info.get("imu_turn", False))
-        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro"))
+        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro", gaps=imu.gaps))
         force = SpecificForce(force=imu["specific_force"])
-        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer"))
+        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer", gaps=imu.gaps))
     return replace(flight, streams=streams, info=info)
 
 
@@ -89,14 +89,3 @@ def own_density(flight: Flight, part: str, density: float | None) -> float:
             fix="give it as a setting, or leave the covariance out",
         )
     return float(own if density is None else density)
-
-
-def first_attitude(flight: Flight, gyro: Series, force: np.ndarray) -> Attitude:
-    """The truth's attitude at the gyroscope's first reading; without a truth, that which `force` (3,) shows.
-
-    Args:
-        force: m/s^2, body: the direction that is up at the start. Its heading is taken as zero.
-    """
-    if flight.truth is not None and "attitude" in flight.truth.leaves:
-        return Attitude(attitude=interpolate(flight.truth, "attitude", gyro.time[:1])[0])
-    return Attitude(attitude=np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np)))

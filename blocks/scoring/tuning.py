@@ -118,10 +118,11 @@ def with_imu(flight: Flight) -> Flight:
         for values, row, mean in zip((gyro["rate"], push["acceleration"]), rows, means, strict=True)
     ]
     values = Imu(gyro=columns[0], specific_force=columns[1])
-    streams = {"imu": Series(kept, values, name="imu"), **flight.streams}
-    told = [flight.info["noise"][name] for name in parts]
-    noise = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
-    info = {**flight.info, "imu_noise": noise, "gravity": WEIGHTLESS}
+    streams = {"imu": Series(kept, values, name="imu", gaps=gyro.gaps or push.gaps), **flight.streams}
+    info = {**flight.info, "gravity": WEIGHTLESS}
+    if set(parts) <= set(flight.info.get("noise", ())):
+        told = [flight.info["noise"][name] for name in parts]
+        info["imu_noise"] = ImuNoise(*(n["noise"] for n in told), *(n["walk"] for n in told))
     info |= {"imu_oversample": max(looks), "imu_turn": turn}
     if len(kept) > 1:
         info["imu_period_ns"] = int(np.median(np.diff(kept)))

@@ -49,11 +49,13 @@ from flowgraph.blocks.signals.motion import (
 from flowgraph.blocks.signals.particles import (
     Ancestors,
     Cloud,
+    Depletion,
     LogLikelihood,
     OutdoorCloud,
     PlaneBelief,
     PlaneCloud,
     StateCloud,
+    StateKernels,
     Weights,
 )
 from flowgraph.blocks.signals.sensors import (
@@ -125,7 +127,9 @@ __all__ = [
     "Weights",
     "LogLikelihood",
     "Ancestors",
+    "Depletion",
     "StateCloud",
+    "StateKernels",
     "OutdoorCloud",
     "PlaneCloud",
     "PlaneBelief",

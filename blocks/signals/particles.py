@@ -12,7 +12,9 @@ __all__ = [
     "Weights",
     "LogLikelihood",
     "Ancestors",
+    "Depletion",
     "StateCloud",
+    "StateKernels",
     "OutdoorCloud",
     "PlaneCloud",
     "PlaneBelief",
@@ -58,11 +60,25 @@ class Ancestors(Signal):
     resampled: Array = boolean()
 
 
+class Depletion(Signal):
+    """Whether too few particles have the weight for the cloud to stand for a belief."""
+
+    depleted: Array = boolean()
+
+
 class StateCloud(Signal):
     """Weighted states. log_weight: natural logarithm, the weights add up to 1. state: one a particle."""
 
     log_weight: Array = real("particles")
     state: Array = real("particles", "size")
+
+
+class StateKernels(Signal):
+    """Weighted Gaussians over the states of a `StateCloud`: their means, and the covariance that all have."""
+
+    log_weight: Array = real("particles")
+    state: Array = real("particles", 15)
+    covariance: Array = real(15, 15)
 
 
 class OutdoorCloud(Signal):

@@ -31,9 +31,14 @@ class Imu(Signal):
     specific_force: Array = real(3, unit="m/s^2", frame="body")
 
     @classmethod
-    def at_rest(cls, gravity: float = 9.81) -> Self:
-        """The reading of a level unit that does not move: no rate, and `gravity` m/s^2 upwards."""
-        return cls(gyro=np.zeros(3), specific_force=np.array([0.0, 0.0, gravity]))
+    def at_rest(cls, gravity: float | tuple[float, float, float] = 9.81) -> Self:
+        """The reading of a level unit that does not move: no rate, and a force that holds it up.
+
+        Args:
+            gravity: m/s^2, downwards; or the vector of it in the world.
+        """
+        down = np.asarray((0.0, 0.0, -gravity) if np.ndim(gravity) == 0 else gravity, dtype=float)  # type: ignore[operator]
+        return cls(gyro=np.zeros(3), specific_force=0.0 - down)
 
 
 class ImuCounts(Signal):
@@ -104,7 +109,7 @@ class BodyRate(Signal):
 class PointReading(Signal):
     """A control and what was measured with it: acceleration (m/s^2) and position (m), both world.
 
-    A coordinate that was not measured is NaN.
+    A coordinate that was not measured is NaN; an acceleration too, where there was no control.
     """
 
     acceleration: Array = real(3, unit="m/s^2", frame="world")

@@ -91,7 +91,7 @@ def run(
         np.empty((len(poses), n), np.int32),
     )
     bias, count, first = np.zeros(6), 0, None
-    reading = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81])
+    reading = last = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81])
     before = int(time[0])
     k = 0
     for tick in range(len(time)):
@@ -108,7 +108,8 @@ def run(
                 reading = reading - bias
 
         errors = gyro_site.numbers(now, words, xp=NUMPY)
-        predict(cloud, reading, errors, dt, gyro_noise, accelerometer_noise, g)
+        drive, last = 0.5 * (last + reading), reading
+        predict(cloud, drive, errors, dt, gyro_noise, accelerometer_noise, g)
         if pose_index[tick] >= 0:
             update(cloud, poses[pose_index[tick]], position_noise, attitude_noise)
         weight = np.exp(cloud.log_weight)

@@ -77,7 +77,7 @@ def test_it_reaches_the_bound_and_knows_it():
         cases[0].graph, [c.inputs for c in cases], range(20), engine="c",
         init=[{"belief": start_turn(f.streams["magnetic_attitude"]["attitude"][0])} for f in flights],
     )  # fmt: skip
-    found, truth = many["belief"], [f.truth for f in flights]
+    found, truth = many["belief"], [f.truth for f in flights if f.truth is not None]
     q = np.stack([t["attitude"] for t in truth])
     settled = found.time >= 1_000_000_000
     error = to_rotation_vector(multiply(conjugate(found.attitude, xp=np), q, xp=np), xp=np)[:, settled]
@@ -85,7 +85,7 @@ def test_it_reaches_the_bound_and_knows_it():
     F = np.stack([jacobian(r) for r in to_rotation_vector(turn, xp=np)])
     bound = posterior_bound(
         F, np.eye(3) * 0.1 * 0.005**2, np.eye(3), np.eye(3) * 0.1, start=np.eye(3),
-        measured=np.isin(found.time, cases[0].inputs["magnetic_attitude"].time),
+        measured=np.isin(found.time, flights[0].streams["magnetic_attitude"].time),
     )  # fmt: skip
     least = np.trace(bound[settled], axis1=1, axis2=2).mean()  # it is turned only: the same for each flight
     assert 0.97 < np.sqrt(np.mean(np.sum(error**2, axis=-1)) / least) < 1.03

@@ -52,6 +52,10 @@ def test_broad_has_a_row_a_trial_and_filter_and_their_means(trials):
     for figure in ("total_rmse_deg", "heading_rmse_deg", "inclination_rmse_deg"):
         assert ours[2][figure] == pytest.approx((ours[0][figure] + ours[1][figure]) / 2)
         assert 0.0 < ours[2][figure] < 2.0
+    for figure in ("tilt_nees_median", "heading_nees_median"):
+        one, two, all_of_them = (row[figure] for row in ours)
+        assert 0.0 < min(one, two) <= all_of_them <= max(one, two)
+        assert not any(figure in row for row in report.rows if row["filter"] != "marg")
 
 
 @pytest.mark.parametrize("peer", ["vqf", "madgwick"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,8 +18,9 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.blocks.inertial.alignment import static_alignment
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.orientation.marg import RestRule, detect_rest
-from flowgraph.blocks.signals import Attitude, Imu, MagneticField
+from flowgraph.blocks.orientation.heading import FieldTrust, update_heading
+from flowgraph.blocks.orientation.marg import RestRule, detect_rest, hold_velocity
+from flowgraph.blocks.signals import Attitude, HeadingBelief, Imu, LevelBelief, MagneticField, Rest
 from flowgraph.graphs import marg
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 from tests.recordings import recordings
@@ -123,6 +125,85 @@ def test_a_field_of_wrong_strength_is_refused():
     _, result = ran(with_field(flight, field))
     _, heading = tilt_and_heading(result["belief"]["attitude"], flight.truth["attitude"])  # type: ignore[index]
     assert np.abs(heading[800:1300]).max() < 3.0
+
+
+def beside_a_magnet(field: np.ndarray, hold: float) -> float:
+    """By how many degrees a field (n, 3), level and at 100 Hz, moves a heading that was sure to 1 degree."""
+    level = LevelBelief(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.eye(9) * 1e-4)
+    strength, dip = np.linalg.norm(EARTH), np.arctan2(-EARTH[2], EARTH[1])
+    belief = HeadingBelief(np.float64(0.0), np.float64(np.radians(1.0) ** 2), strength, dip)
+    state = {"time": np.int64(0), "held": np.float64(0.0)}
+    moved = 0.0
+    for k, m in enumerate(field, start=1):
+        settings = {"trust": FieldTrust(hold=hold), "north": np.pi / 2.0, "t": np.int64(k * 10**7), "xp": np}
+        state, belief = update_heading.step(state, belief, level, MagneticField(m), **settings)
+        moved = max(moved, abs(float(np.degrees(belief.angle))))
+    return moved
+
+
+TIME = np.arange(500) / RATE
+TURN = 2.0 * np.pi * 0.8 * TIME
+STILL = 0.0 * TIME
+MAGNETS = {
+    "one that turns about the vertical": [40e-6 * np.sin(TURN), 40e-6 * np.cos(TURN), STILL],
+    "one that tilts": [20e-6 + STILL, -20e-6 + STILL, 40e-6 * np.sin(TURN)],
+    "one that comes and goes": [20e-6 * np.sin(TURN), 15e-6 * np.sin(1.3 * TURN) - 20e-6, STILL],
+    "one that swings": [15e-6 * (1.0 + np.sin(TURN)), STILL, 12e-6 * np.sin(1.7 * TURN)],
+}
+
+
+@pytest.mark.parametrize("magnet", MAGNETS)
+def test_a_field_that_is_normal_for_an_instant_is_not_trusted(magnet):
+    """Strength and dip pass through those of the Earth while the heading is off."""
+    field = EARTH + np.stack(MAGNETS[magnet], axis=-1)
+    at_once, held = beside_a_magnet(field, 0.0), beside_a_magnet(field, 0.3)
+    assert held < 0.6 * at_once
+    assert held < 0.6
+
+
+def test_a_doubt_fades_and_a_clean_field_is_followed():
+    """With no magnet the held doubt changes nothing; seconds after one the heading is corrected again."""
+    turned = np.tile([-20e-6 * np.sin(0.1), 20e-6 * np.cos(0.1), -40e-6], (500, 1))
+    assert beside_a_magnet(turned, 0.3) == pytest.approx(beside_a_magnet(turned, 0.0), rel=1e-9)
+    after = turned + 0.0
+    after[:100] += [0.0, 0.0, -60e-6]
+    assert 0.5 * beside_a_magnet(turned[100:], 0.3) < beside_a_magnet(after, 0.3)
+    assert beside_a_magnet(after, 0.3) < 0.9 * beside_a_magnet(turned, 0.3)
+
+
+@pytest.mark.parametrize("still", [0.0, 1.0])
+def test_the_level_is_corrected_as_the_equations_say(still):
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(9, 9))
+    prior = LevelBelief(
+        rng.normal(size=3), np.array([0.5, 0.5, -0.5, 0.5]), rng.normal(size=3), root @ root.T
+    )
+    reading = Imu(gyro=rng.normal(size=3), specific_force=np.array([0.0, 0.0, 9.81]))
+    settings = {"noise": QUIET, "speed": 0.4, "speed_memory": 0.5, "dt": 0.01, "xp": np}
+    found = hold_velocity.step(prior, reading, Rest(still=np.float64(still)), **settings)
+    sigma = 0.005 if still else 0.4
+    H = np.eye(9)[[0, 1, 2, 6, 7, 8]] if still else np.eye(9)[:3]
+    R = np.diag([2.0 * sigma**2 * 0.5 / 0.01] * 3 + [QUIET.gyro**2 / 0.01] * 3)[: len(H), : len(H)]
+    residual = np.concatenate([-prior.velocity, reading.gyro - prior.gyro_bias])[: len(H)]
+    P = prior.covariance
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    d = K @ residual
+    G = np.eye(9)
+    G[3:6, 3:6] -= 0.5 * np.cross(np.eye(3), -d[3:6]).T
+    np.testing.assert_allclose(found.velocity, prior.velocity + d[:3], rtol=1e-9)
+    np.testing.assert_allclose(found.gyro_bias, prior.gyro_bias + d[6:], rtol=1e-9)
+    turned = multiply(prior.attitude, from_rotation_vector(d[3:6], xp=np), xp=np)
+    np.testing.assert_allclose(found.attitude, turned, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, G @ (P - K @ H @ P) @ G.T, rtol=1e-6, atol=1e-9)
+
+
+def test_the_usual_speed_is_that_of_the_flight():
+    flight = made(seconds=5.0)
+    slow = replace(flight, info={**flight.info, "speed": 0.25})
+    told, by_hand = ran(slow)[1]["belief"], marg.case(flight, speed=0.25)
+    asked = simulate(by_hand.graph, by_hand.inputs)["belief"]
+    np.testing.assert_array_equal(told["attitude"], asked["attitude"])
+    assert np.abs(told["attitude"] - ran(flight)[1]["belief"]["attitude"]).max() > 1e-6
 
 
 def test_a_shake_is_no_tilt():

@@ -145,8 +145,16 @@ def test_all_that_it_collects():
     case = a_case(particles=50)
     result = simulate(case.graph, case.inputs)
     poses = len(a_flight().streams["vicon"])
-    assert list(result.series) == ["pose", "effective_sample_size", "ancestors"]
-    assert [len(result[name]) for name in result.series] == [result.ticks, poses, poses]
+    at_poses = {"innovation", "effective_sample_size", "depleted", "ancestors"}
+    assert set(result.series) == {"pose", "belief"} | at_poses
+    for name, series in result.series.items():
+        assert len(series) == (poses if name in at_poses else result.ticks)
+    for leaf in ("position", "velocity", "attitude"):
+        np.testing.assert_array_equal(result["pose"][leaf], result["belief"][leaf])
+    plain = a_case(particles=50, covariance=False)
+    bare = simulate(plain.graph, plain.inputs)
+    assert set(bare.series) == {"pose"} | at_poses
+    np.testing.assert_array_equal(bare["pose"]["attitude"], result["pose"]["attitude"])
     size = result["effective_sample_size"]["value"]
     assert np.all((size >= 1.0) & (size <= 50.0 + 1e-9))
     np.testing.assert_array_equal(result["ancestors"]["resampled"], size < 0.5 * 50)

@@ -214,6 +214,7 @@ extern "C" void floor_rbpf(int64_t ticks, const int64_t *time, const int64_t *im
                            double *out, double *sizes, bool *resampled, int32_t *index) {
     std::memcpy(&cloud, start, sizeof cloud);
     double reading[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 9.81}, bias[6] = {};
+    double last[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 9.81}, drive[6];
     int64_t count = 0, first = 0;
     for (int64_t t = 0, k = 0; t < ticks; t++) {
         const double dt = double(time[t] - time[t ? t - 1 : 0]) * 1e-9;
@@ -231,7 +232,9 @@ extern "C" void floor_rbpf(int64_t ticks, const int64_t *time, const int64_t *im
         }
         philox(names[0], time[t], seed, COUNTERS);
         draw_normals(nodes, slope);
-        predict(reading, dt, *set);
+        for (int i = 0; i < 6; i++) drive[i] = 0.5 * (last[i] + reading[i]);
+        std::memcpy(last, reading, sizeof last);
+        predict(drive, dt, *set);
         const bool seen = pose_index[t] >= 0;
         if (seen) update(poses + 7 * pose_index[t], *set);
         average(out + 10 * t);
