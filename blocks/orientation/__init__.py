@@ -40,6 +40,7 @@ from flowgraph.blocks.orientation.complementary import (
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, PoseNoise, attitude_spread, pose_spread
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
+    doubt_heading,
     join_orientation,
     predict_heading,
     start_heading,
@@ -55,6 +56,7 @@ from flowgraph.blocks.orientation.marg import (
 )
 
 __all__ = [
+    "doubt_heading",
     "TURN",
     "attitude_belief",
     "attitude_vector",

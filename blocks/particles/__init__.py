@@ -22,14 +22,18 @@ from flowgraph.blocks.particles.cloud import (
     start_cloud,
     weights,
 )
-from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, silverman, spread_of
 from flowgraph.blocks.particles.lost import (
+    BELIEVED,
+    FARTHEST,
     believe_pose,
     depletion,
     depletion_remarks,
     judge_pose,
     mixture,
+    pose_within_reach,
     verdict,
+    within_reach,
 )
 from flowgraph.blocks.particles.rao_blackwell import correct_motion, predict_motion
 from flowgraph.blocks.particles.resampling import (
@@ -43,6 +47,12 @@ from flowgraph.blocks.particles.resampling import (
 )
 
 __all__ = [
+    "within_reach",
+    "pose_within_reach",
+    "FARTHEST",
+    "BELIEVED",
+    "Spread",
+    "Kernels",
     "attitude_likelihood",
     "average_attitude",
     "average_pose",

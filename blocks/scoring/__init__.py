@@ -28,8 +28,16 @@ from flowgraph.blocks.scoring.cases import (
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
+from flowgraph.blocks.scoring.readings import Ranges, gap_notes, pause, taken
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
-from flowgraph.blocks.scoring.start import MAGNETIC_HEADING, UNKNOWN_HEADING, Started, StartPose
+from flowgraph.blocks.scoring.start import (
+    MAGNETIC_HEADING,
+    UNKNOWN_HEADING,
+    Started,
+    StartPose,
+    from_first,
+    turned,
+)
 from flowgraph.blocks.scoring.streams import (
     own_density,
     reading_deviation,
@@ -47,6 +55,12 @@ from flowgraph.blocks.scoring.tuning import (
 )
 
 __all__ = [
+    "turned",
+    "from_first",
+    "taken",
+    "pause",
+    "gap_notes",
+    "Ranges",
     "settings",
     "point",
     "euler",
