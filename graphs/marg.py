@@ -25,7 +25,7 @@ import numpy as np
 from flowgraph import Case, Stream, delay, graph, latest
 from flowgraph.blocks.inertial.alignment import static_alignment, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import Held, bridged
+from flowgraph.blocks.kalman.lost import Held, bridged, stay
 from flowgraph.blocks.orientation.heading import (
     FieldTrust,
     doubt_heading,
@@ -85,6 +85,9 @@ def marg(
     if held is not None:
         wandered = doubt_heading(wandered, imu, held=held)
     found = update_heading(wandered, level, magnetometer, trust=trust, north=north, name="heading")
+    if held is not None and held.longest is not None:  # nor is anything corrected by its length
+        level = stay(moved, level, longest=held.longest, name="stay_level")
+        found = stay(wandered, found, longest=held.longest, name="stay_heading")
     tilt.feed(level)
     angle.feed(found)
     return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}

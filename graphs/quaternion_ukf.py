@@ -107,8 +107,8 @@ def for_flight(
     *,
     attitude_walk: Positive = 0.02,
     rate_walk: Positive = 10.0,
-    gyro_noise: Positive = 0.02,
-    force_noise: Positive = 2.0,
+    gyro_noise: Positive | None = None,
+    force_noise: Positive | None = None,
     weighted: bool = False,
     alpha: Positive = 1.0,
     beta: float = 2.0,
@@ -125,7 +125,8 @@ def for_flight(
     Args:
         flight: with the stream `imu`.
         attitude_walk, rate_walk: densities of the random walks, rad/sqrt(s) and rad/s/sqrt(s).
-        gyro_noise, force_noise: standard deviations of one reading, rad/s and m/s^2.
+        gyro_noise, force_noise: standard deviations of one reading, rad/s and m/s^2; those that the flight
+            brings, or 0.02 and 2, if left out.
         weighted: whether the sigma points are the scaled set of alpha, beta and kappa.
         alpha, beta, kappa: of that set.
         mean: of quaternions, "kraft" or "markley".
@@ -138,6 +139,7 @@ def for_flight(
         on.note(
             "assumed", f"imu: a gyroscope that keeps one level for {after:g} s has frozen, and reads nothing"
         )
+    brought = on.flight.info.get("orientation_noise", {})
     begin, pose = started.orientation(on, on.inputs["imu"], still)
     start = start_orientation(begin.attitude)
     if pose.heading is not None:
@@ -149,8 +151,8 @@ def for_flight(
         start=start,
         attitude_walk=attitude_walk,
         rate_walk=rate_walk,
-        gyro_noise=gyro_noise,
-        force_noise=force_noise,
+        gyro_noise=given(gyro_noise, brought.get("gyro", 0.02)),
+        force_noise=given(force_noise, brought.get("force", 2.0)),
         points=SigmaPoints(alpha, beta, kappa, mean) if weighted else SigmaPoints(1.0, 0.0, 0.0, mean),
         still=begin.still,
         up=begin.up,

@@ -65,7 +65,7 @@ def tracker(
     return {"belief": seen_in_plane(belief), "posterior": belief}
 
 
-@on_flight(tracker, "position")
+@on_flight(tracker, "position", ranged=False)
 def for_flight(
     on: OnFlight,
     *,

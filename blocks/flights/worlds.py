@@ -41,7 +41,7 @@ _LEVER = {"lever_x": 0.0, "lever_y": 0.0, "lever_z": 0.0}
 
 SENSORS: Mapping[str, Mapping[str, float]] = {
     "imu": {"rate": 200.0, **_CLOCK, **_LOOKS},
-    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN, "noise": _THESIS, **_DRIFT},
+    "gyro": {"rate": 200.0, **_CLOCK, **_LOOKS, **_TURN, "noise": _THESIS, **_DRIFT, "step": 0.0},
     "accelerometer": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "coordinate_acceleration": {"rate": 200.0, **_CLOCK, **_LOOKS, "noise": _THESIS, **_DRIFT},
     "position": {"rate": 4.0, **_CLOCK, "noise": 0.1, **_DRIFT, **_LEVER},
@@ -64,10 +64,10 @@ SENSORS: Mapping[str, Mapping[str, float]] = {
 """What each sensor can be set to, and what it is when left out, in SI units and radians. `noise` is a
 continuous density for gyro, accelerometer and coordinate_acceleration (the imu has theirs), and for all
 others a standard deviation per sample; `bias` is the standard deviation of a constant, `walk` the density of
-its random walk; `oversample` is how many looks a reading is the mean of, and with `turn` 1 a rate is that of
-the turn since the last reading. A GPS with geodetic=1 gives
-latitude, longitude and height, of a world whose origin is at `latitude`, `longitude` (rad) and `height`
-(m)."""
+its random walk, and `step` the deviation of the walk's steps from reading to reading, which adds to it;
+`oversample` is how many looks a reading is the mean of, and with `turn` 1 a rate is that of the turn since
+the last reading. A GPS with geodetic=1 gives latitude, longitude and height, of a world whose origin is at
+`latitude`, `longitude` (rad) and `height` (m)."""
 
 WORLDS: Mapping[str, Mapping[str, float]] = {
     "thesis": {"duration": 20.0, "least_thrust": 5.0, "most_thrust": 20.0, "most_rate": 20.0},
@@ -134,6 +134,8 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
     given = dict(settings or {})
     chosen = _chosen(str(given.pop("sensors", SETTINGS["sensors"])), path)
     numbers = _numbers(kind, chosen, given, path)
+    steps = numbers["gyro.step"] * math.sqrt(numbers["imu.rate" if "imu" in chosen else "gyro.rate"])
+    numbers["gyro.walk"] = math.hypot(numbers["gyro.walk"], steps) if steps else numbers["gyro.walk"]
     check_samples(numbers, [f"{name}.rate" for name in chosen], path)
     world, still = _world(kind, numbers, seed, path)
     end = round(numbers["duration"] * 1e9)
@@ -167,10 +169,23 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
         gyro_bias=_bias("gyro", made, time, numbers, seed),
         accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
     )
+    if kind == "roundtrip" and "imu" in chosen and steps:
+        info["orientation_noise"] = _orientation_noise(numbers)
     info["across"] = float(np.sqrt(np.mean(np.square(motion.specific_force[:, :2]).sum(-1))))
     notes = [note("info", f"simulated with seed {seed}: {figures(world)}")]
     notes += [_late(name, streams[name], stamp, world) for name, stamp in stamps.items() if len(stamp)]
     return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, tuple(notes))
+
+
+def _orientation_noise(n: Numbers) -> dict[str, float]:
+    """What one reading is worth to a filter of the attitude alone, rad/s and m/s^2, of a body in its place:
+    the gyroscope's with its drift (root mean square), the accelerometer's white noise."""
+    rate = n["imu.rate"]
+    drift = math.hypot(n["gyro.bias"], n["gyro.walk"] * math.sqrt(0.5 * n["duration"]))
+    return {
+        "gyro": math.hypot(n["gyro.noise"] * math.sqrt(rate), drift),
+        "force": max(n["accelerometer.noise"] * math.sqrt(rate), 1e-3),
+    }
 
 
 def _late(name: str, series: Series, stamp: np.ndarray, world: World) -> str:

@@ -83,9 +83,10 @@ def solve(
     if worst < _DOUBTFUL * pixel_noise or not reject:
         return found
     agreed = _agreed(z, X, camera, near, pixel_noise)
-    better = None if agreed is None else _fit(z[agreed], X[agreed], camera, near, pixel_noise)
-    if better is not None:
-        return better._replace(used=agreed)
+    if agreed is not None:
+        better = _fit(z[agreed], X[agreed], camera, near, pixel_noise)
+        if better is not None:
+            return better._replace(used=agreed)
     if found is not None and worst >= _WRONG * pixel_noise:
         return found._replace(covariance=found.covariance * _CONTRADICTED * len(z))
     return found

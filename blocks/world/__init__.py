@@ -12,7 +12,7 @@ from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover
-from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join
+from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join, primitive
 from flowgraph.blocks.world.motion import Motion, World
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
@@ -24,6 +24,7 @@ __all__ = [
     "KeyPoint",
     "Primitives",
     "join",
+    "primitive",
     "Quadrotor",
     "carried_by_thrust",
     "Limits",

@@ -177,7 +177,10 @@ def _attitude(
     axis: Axes, estimate: Series, truth: Series | None, observed: Series | None, k: int, order: str
 ) -> None:
     """Roll, pitch or yaw, degrees, without jumps of a turn, in the band that the filter claims for it."""
-    drawn = lambda series: euler_angles(series["attitude"], order)[:, k]
+
+    def drawn(series: Series) -> np.ndarray:
+        return euler_angles(series["attitude"], order)[:, k]
+
     value, at = drawn(estimate), STATES["attitude"]
     spread = estimate["covariance"][:, at : at + 3, at : at + 3]
     variance = np.minimum(euler_variances(estimate["attitude"], spread, order)[:, k], 180.0**2)

@@ -6,6 +6,7 @@ What each is given is written out by hand: the matrices of a step, and where it 
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -75,8 +76,6 @@ def _each(one: Any, problem: Problem, run: Drawn, update: Callable[[np.ndarray],
 def _stone_soup(updater: str, **settings: Any) -> Callable[[Problem, Drawn], Found]:
     def run_it(problem: Problem, run: Drawn) -> Found:
         # a peer, which is there with the extra `bench` alone
-        from datetime import datetime, timedelta
-
         from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
         from stonesoup.types.array import StateVector, StateVectors
         from stonesoup.types.detection import Detection

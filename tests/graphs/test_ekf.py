@@ -236,7 +236,6 @@ def start(truth: Series | None, seed: int) -> dict[str, QuaternionBelief]:
 @cache
 def nees_of_50(make: Callable[[int], Flight], base: int, factor: float) -> tuple[np.ndarray, np.ndarray]:
     """The time of each tick in s, and the mean NEES of 50 runs at it, with R times `factor`."""
-    pytest.importorskip("jax")
     noise = 0.1 * factor**0.5
     case = ekf.case(make(base), position_noise=noise, attitude_noise=noise)
     seeds = range(base, base + RUNS)
@@ -246,6 +245,7 @@ def nees_of_50(make: Callable[[int], Flight], base: int, factor: float) -> tuple
         seeds,
         init=lambda seed: start(make(seed).truth, seed),
         keep=["belief"],
+        engine="c",
     )
     return batch["belief"].time * 1e-9, mean_nees(batch["belief"], [make(seed) for seed in seeds])
 

@@ -36,8 +36,8 @@ from tests.graphs.library import OWN
 BEGINS, OVER, LASTS, HOUR = 2.0, 6.0, 9.0, 3600.0
 """s after the first reading: the fault, from when on errors count, the end; and by how much stamps jump."""
 
-NOT_INERTIAL = {"tag_pose", "particle", "imu_calibration", "attitude_mekf"}
-"""They take images, velocities in the plane, counts of converters, and commanded rates."""
+NOT_INERTIAL = {"tag_pose", "particle", "imu_calibration", "attitude_mekf", "tracker"}
+"""They take images, velocities in the plane, counts of converters, and commanded rates, ranges."""
 
 QUICK = {
     "async_kalman", "augmented_complementary", "ekf", "gyro_integration", "ins_eskf", "kalman",

@@ -13,7 +13,7 @@ from flowgraph import DataError, DeclarationError, Flight, LoweringError, Series
 from flowgraph.blocks.geometry.euler import matrix_from_angles, quaternion_from_angles
 from flowgraph.blocks.geometry.rotations import rotate
 from flowgraph.blocks.models.euler_ins import seen_place, sees_pose, update_pose_angles
-from flowgraph.blocks.models.particle_ins import weigh_states
+from flowgraph.blocks.models.particle_ins import correct_states
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.covariances import Covariance
 from flowgraph.blocks.signals import Gaussian, PoseMeasurement, StateCloud
@@ -70,9 +70,9 @@ def test_particles_are_weighed_where_the_marker_is():
     states[:, 3:6] = states[:1, 3:6]
     cloud = StateCloud(log_weight=np.full(50, -np.log(50.0)), state=states)
     q = np.asarray(quaternion_from_angles(states[0, 3:6], order="zxy", xp=np))
-    weigh = lambda z, **more: weigh_states.step(
-        cloud, as_pose(z, q), order="zxy", R=np.eye(6) * 1e-4, xp=np, **more
-    )
+    weigh = lambda z, **more: correct_states.step(
+        np.float64(0.0), cloud, as_pose(z, q), order="zxy", R=np.eye(6) * 1e-4, bandwidth=0.0, xp=np, **more
+    )[1][0]
     for k in (0, 7, 23):
         marker = np.asarray(seen_place(states[k], LEVER, order="zxy", xp=np))
         found = weigh(marker, lever=LEVER)

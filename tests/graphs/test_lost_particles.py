@@ -21,7 +21,7 @@ GRAPHS = [rbpf_indoor, ins_particle]
 
 @functools.cache
 def sim(seed: int = 0, seconds: float = 8.0, imu: float = 50.0, vicon: float = 4.0) -> Flight:
-    settings = {"duration": seconds, "imu.rate": imu, "vicon.rate": vicon}
+    settings = {"duration": f"{seconds:g}", "imu.rate": f"{imu:g}", "vicon.rate": f"{vicon:g}"}
     return load_flight("sim", seed=seed, settings=settings)
 
 
@@ -108,7 +108,7 @@ def test_every_cloud_says_whether_it_is_depleted():
     outdoor = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
     flights = {
         particle: load_flight("sim:plane", seed=0),
-        rbpf_outdoor: load_flight("sim:thesis", seed=0, settings={"duration": 1.0, "sensors": outdoor}),
+        rbpf_outdoor: load_flight("sim:thesis", seed=0, settings={"duration": "1", "sensors": outdoor}),
         rbpf_indoor: sim(),
     }
     for graph, flight in flights.items():

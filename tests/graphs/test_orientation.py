@@ -69,6 +69,21 @@ def test_the_filter_keeps_below_the_published_errors_and_both_baselines(seed):
         assert 0.1 < drift[f"{axis}_rmse_rad"] < 0.6
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_with_the_brownian_drift_of_the_project_roll_and_pitch_keep_below_what_was_published(seed):
+    """Its gyroscope drifts by the cumulative sum of 0.002 rad/s a sample. The flight brings what a reading is
+    worth; the yaw, which nothing measures, drifts with the gyroscope's."""
+    made = trip(seed, "10", gyro_step="0.002", gyro_bias="0", imu_rate="100")
+    found, drift = score(quaternion_ukf, made), score(gyro_integration, made)
+    assert found["roll_rmse_rad"] <= 0.001
+    assert found["pitch_rmse_rad"] <= 0.002
+    assert drift["roll_rmse_rad"] > 20 * found["roll_rmse_rad"]
+    untold = score(quaternion_ukf, made, gyro_noise=0.02, force_noise=2.0)
+    assert untold["roll_rmse_rad"] > 2 * found["roll_rmse_rad"]
+    steps = np.diff(made.truth["gyro_bias"], axis=0)
+    assert np.std(steps) == pytest.approx(0.002, rel=0.1)
+
+
 def below_the_published_errors(n: int) -> None:
     """Raw counts, calibrated by the other sets: roll, pitch and yaw of the original project."""
     folder = recordings("ese650")

@@ -89,7 +89,8 @@ def test_it_is_that_of_filterpy_on_the_example_of_crassidis():
     assert error < 90.0, "a measurement is 141 m off"
 
 
-@pytest.mark.parametrize("method", [linear(), pytest.param(unscented(), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [linear(), unscented()])
 def test_it_is_equal_in_all_engines_and_lowered(method):
     _, z = crassidis(30)
     inputs = {"spot": Series(np.arange(len(z)) * SECOND, Spot(position=z))}
