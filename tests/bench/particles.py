@@ -40,7 +40,7 @@ LIMIT_MS = 0.6
 def case(particles: int, duration: float, **settings: float) -> tuple[Case, dict[str, Any]]:
     """The filter on a simulated flight, and the arguments of the hand-written loop."""
     flight = simulated.load(settings={"duration": duration, **settings})
-    built = rbpf_indoor.case(flight, particles=particles, covariance=False)
+    built = rbpf_indoor.case(flight, particles=particles, covariance=False, still=1.0)
     imu, vicon = flight.streams["imu"], flight.streams["vicon"]
     start = start_cloud(particles, position=vicon.position[0])
     noise = flight.info["imu_noise"].scaled(gyro=3.0, accelerometer=2.0)  # as the case does

@@ -186,3 +186,14 @@ def test_five_seconds_without_tags_are_made_good(seed):
     error = np.linalg.norm(belief["position"] - interpolate_pose(flight.truth, belief.time)[0], axis=1)
     late = belief.seconds - belief.seconds[0] > 7.5
     assert error[late].max() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("particles", [60, 64])
+def test_c_gives_the_same_particles(particles):
+    """Few enough that arrays of particles are taken apart beside small ones."""
+    case = ins_particle.case(sim(seconds=1.0), particles=particles)
+    python, c = (simulate(case.graph, case.inputs, engine=e) for e in ("python", "c"))
+    for leaf, values in python["belief"].leaves.items():
+        np.testing.assert_allclose(c["belief"][leaf], values, atol=1e-9, err_msg=leaf)
+    np.testing.assert_array_equal(python["ancestors"]["index"], c["ancestors"]["index"])

@@ -90,7 +90,7 @@ def test_the_engines_agree_with_a_thousand_particles_over_twenty_seconds():
 
 def test_it_gives_the_numbers_of_the_same_filter_written_by_hand():
     n, flight = 200, a_flight()
-    case = a_case(particles=n)
+    case = a_case(particles=n, still=1.0)
     imu, vicon = flight.streams["imu"], flight.streams["vicon"]
     time, imu_index, pose_index = direct_eskf.ticks(imu.time, vicon.time)
     start = start_cloud(n, position=vicon["position"][0])

@@ -99,7 +99,9 @@ class Elements:
             return None
         if i.op in ("concat", "stack"):
             axis = i.attrs["axis"] % len(i.spec.shape)
-            if wide and axis == len(i.spec.shape) - 1:
+            if (wide and axis == len(i.spec.shape) - 1) or any(
+                self.laned(self.specs[a]) != wide for a in i.args
+            ):
                 return None
             join = np.concatenate if i.op == "concat" else np.stack
             return join(tables, axis=axis)
