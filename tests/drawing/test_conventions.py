@@ -77,15 +77,17 @@ def test_other_graphs_are_drawn_as_before():
 def test_the_command_draws_in_the_graphs_convention(tmp_path, monkeypatch):
     from typer.testing import CliRunner
 
-    from flowgraph.cli import filters
+    from flowgraph.cli import app
 
     seen = []
-    drawn = plot_navigation
-    monkeypatch.setattr(
-        "flowgraph.drawing.plot.plot_navigation", lambda *a, **k: (seen.append(k["order"]), drawn(*a, **k))[1]
-    )
+
+    def drawn(*arguments, **options):
+        seen.append(options["order"])
+        return plot_navigation(*arguments, **options)
+
+    monkeypatch.setattr("flowgraph.drawing.plot.plot_navigation", drawn)
     words = ["run", "ins_ekf_pose", "--data", "sim", "--set", "duration=1", "--out", str(tmp_path), "--json"]
-    found = CliRunner().invoke(filters.app, words)
+    found = CliRunner().invoke(app, words)
     assert found.exit_code == 0, found.output
     assert seen == ["zxy"]
     assert json.loads((tmp_path / "metrics.json").read_text())["graph"] == "ins_ekf_pose"
