@@ -80,6 +80,7 @@ def test_with_the_brownian_drift_of_the_project_roll_and_pitch_keep_below_what_w
     assert drift["roll_rmse_rad"] > 20 * found["roll_rmse_rad"]
     untold = score(quaternion_ukf, made, gyro_noise=0.02, force_noise=2.0)
     assert untold["roll_rmse_rad"] > 2 * found["roll_rmse_rad"]
+    assert made.truth is not None
     steps = np.diff(made.truth["gyro_bias"], axis=0)
     assert np.std(steps) == pytest.approx(0.002, rel=0.1)
 

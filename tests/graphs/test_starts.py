@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import DataError, Flight, Series, find_graph, load_flight, simulate
+from flowgraph import Case, DataError, Flight, Series, find_graph, load_flight, simulate
 from flowgraph.blocks.geometry import from_rotation_vector, multiply, rotate, to_matrix
 from flowgraph.blocks.geometry.rotations import tilt_and_heading
 from flowgraph.blocks.scoring import UNKNOWN_HEADING
@@ -138,6 +138,7 @@ def test_the_heading_of_a_recording_is_found(angle):
     )
     turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, np.radians(angle)]), xp=np))
     leica, truth = made.streams["leica"], made.truth
+    assert truth is not None
     place = np.asarray(rotate(turn, leica["position"], xp=np))
     leica = Series(leica.time, Position(position=place), name="leica")
     values = truth.values.replace(
@@ -155,12 +156,17 @@ def test_the_heading_of_a_recording_is_found(angle):
 # What is taken, and when it is of
 
 
+def streams_of(case: Case) -> dict[str, Series]:
+    assert isinstance(case.inputs, dict)
+    return case.inputs
+
+
 @pytest.mark.parametrize("name", [*MEASURE_POSES, "rbpf_indoor"])
 @pytest.mark.parametrize("first", [0.0, 0.3, 1.55])
 def test_a_filter_starts_at_its_first_pose(name, first):
     base = late(flight(), "vicon", first)
     case = find_graph(name).case(base, start="file", **moving(name), **few(name))
-    begins = min(int(series.time[0]) for series in case.inputs.values())
+    begins = min(int(series.time[0]) for series in streams_of(case).values())
     assert begins == base.streams["vicon"].time[0]
     assert any(note.startswith("skipped: imu") for note in case.notes) == (first > 0.0)
 
@@ -168,12 +174,13 @@ def test_a_filter_starts_at_its_first_pose(name, first):
 def test_a_start_at_the_truth_is_not_of_its_future():
     base = flight()
     truth = base.truth
+    assert truth is not None
     cut = replace(base, truth=truth[truth.time >= 1_600_000_000])
     for name in ("ins_eskf", "complementary", "ekf"):
         case = find_graph(name).case(cut, start="truth")
-        assert min(int(s.time[0]) for s in case.inputs.values()) >= cut.truth.time[0]
+        assert min(int(s.time[0]) for s in streams_of(case).values()) >= cut.truth.time[0]  # type: ignore[union-attr]
     rests = find_graph("gyro_integration").case(cut, still=2.0)  # the pose of later is that of now
-    assert rests.inputs["imu"].time[0] == base.streams["imu"].time[0]
+    assert streams_of(rests)["imu"].time[0] == base.streams["imu"].time[0]
 
 
 @pytest.mark.parametrize("name", [*MEASURE_POSES, "rbpf_indoor", *BY_IMU, "ins_eskf"])
@@ -199,6 +206,7 @@ def test_a_heading_that_is_set_is_that_of_the_start(name, heading):
 def test_a_magnetometer_shows_the_heading_where_nothing_else_does():
     base = flight()
     imu, truth = base.streams["imu"], base.truth
+    assert truth is not None
     q = truth["attitude"][np.minimum(np.searchsorted(truth.time, imu.time), len(truth) - 1)]
     turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, 2.0]), xp=np))
     q = np.asarray(multiply(turn, q, xp=np))
@@ -225,7 +233,7 @@ def test_a_first_pose_that_was_not_measured_starts_nothing(name, field):
     case = find_graph(name).case(
         replace(base, streams={**base.streams, "vicon": series}), start="file", **moving(name), **few(name)
     )
-    assert case.inputs["imu"].time[0] >= vicon.time[3]
+    assert streams_of(case)["imu"].time[0] >= vicon.time[3]
     assert np.isfinite(first_attitude(name, case)).all()
 
 
