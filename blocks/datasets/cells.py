@@ -201,9 +201,10 @@ def stamps(
             else:
                 if not _NUMBER.fullmatch(plain) or ("," in plain and decimal != ","):
                     raise ValueError
-                stamp = int(
-                    (Decimal(re.sub("[dD]", "e", plain.replace(",", "."))) * size).to_integral_value()
-                )
+                exact = Decimal(re.sub("[dD]", "e", plain.replace(",", "."))) * size
+                if not -(2**63) <= exact < 2**63:  # an int of 1e560001 would take its time
+                    raise ValueError
+                stamp = int(exact.to_integral_value())
             if not -(2**63) <= stamp < 2**63:
                 raise ValueError
         except (InvalidOperation, OverflowError, ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
@@ -179,6 +180,15 @@ def test_a_malformed_row_is_named_by_file_and_line(folder, row, problem):
     lines.insert(3, row.format(t=START + 7_000_000))
     file.write_text("\n".join(lines))
     refused(folder, f"{file}, line 4", problem)
+
+
+@pytest.mark.parametrize("stamp", ["1.5e560001", "1.5D99999999", "-1e400000", "1" * 40])
+def test_a_stamp_of_any_size_is_refused_before_it_is_written_out(folder, stamp):
+    """An integer of a million digits takes ten seconds to make."""
+    (folder / "groundtruth.tum").write_text(f"# t p q\n{stamp} 0 0 0 0 0 0 1\n")
+    start = process_time()
+    refused(folder, "groundtruth.tum, line 2", "the stamp is not a time")
+    assert process_time() - start < 2.0
 
 
 def test_an_empty_table_and_a_bad_quaternion_are_refused(folder):
