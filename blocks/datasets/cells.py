@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta, timezone
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 
 import numpy as np
 
@@ -207,7 +207,7 @@ def stamps(
                 stamp = int(exact.to_integral_value())
             if not -(2**63) <= stamp < 2**63:
                 raise ValueError
-        except (InvalidOperation, OverflowError, ValueError):
+        except (DecimalException, OverflowError, ValueError):
             raise _no_time(where(k), cell, unit) from None
         found.append(stamp)
     return np.array(found, dtype=np.int64), ""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 from pathlib import Path
 from typing import NoReturn
 
@@ -92,7 +92,7 @@ def as_nanoseconds(stamp: str, unit: str) -> int:
         if "_" in stamp or not -most < number < most:
             raise ValueError
         return int((number * UNITS[unit]).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
+    except (DecimalException, OverflowError, ValueError) as error:
         raise ValueError(f"not a finite number of {unit} below 9.2e9 s: {stamp!r}") from error
 
 
@@ -100,7 +100,7 @@ def likely_unit(stamp: str) -> str | None:
     """The unit that makes a stamp too large for its own a time from 2001 to 2096, or None."""
     try:
         number = Decimal(stamp)
-    except InvalidOperation:
+    except DecimalException:
         return None
     fits = [u for u in _WORDS if 10**18 <= number * UNITS[u] < _LAST * 10**9]
     return fits[0] if fits else None
