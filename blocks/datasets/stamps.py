@@ -100,9 +100,9 @@ def likely_unit(stamp: str) -> str | None:
     """The unit that makes a stamp too large for its own a time from 2001 to 2096, or None."""
     try:
         number = Decimal(stamp)
+        fits = [u for u in _WORDS if 10**18 <= number * UNITS[u] < _LAST * 10**9]
     except DecimalException:
         return None
-    fits = [u for u in _WORDS if 10**18 <= number * UNITS[u] < _LAST * 10**9]
     return fits[0] if fits else None
 
 
