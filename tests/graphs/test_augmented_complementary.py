@@ -47,6 +47,7 @@ def test_it_is_lowered_and_drawn():
     is_lowered_and_drawn(case, "dead_reckon", "correct_by_pose", "now")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_about_as_good_at_all_times_as_a_measured_pose_at_its_own(seed):
     found = played(flight(seed))

@@ -132,6 +132,7 @@ def test_5000_particles_are_better_than_pnp():
     assert score["position_rmse_m"] < raw_error(made)
 
 
+@pytest.mark.slow
 def test_a_camera_velocity_bounds_the_drift():
     """The same flight without it goes astray by an order of magnitude."""
     made = flight(8.0)
@@ -268,6 +269,7 @@ def test_the_shift_between_the_worlds_may_come_from_the_other_flight(number, oth
     assert run(ins_ukf_pose, used, order="zyx")["position_rmse_m"] <= 0.7 * raw_error(made)
 
 
+@pytest.mark.slow
 @VICON
 @pytest.mark.parametrize("number", [1, 4])
 def test_recorded_velocities_do_not_diverge(number):

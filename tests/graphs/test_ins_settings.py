@@ -49,6 +49,7 @@ def score(graph: Any, made: Flight, **settings: Any) -> dict[str, float]:
     return dict(case.score(simulate(case.graph, case.inputs)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["zxy", "zyx"])
 @pytest.mark.parametrize("graph", [ins_ekf_pose, ins_ukf_pose], ids=lambda g: g.name)
 @pytest.mark.parametrize("lever", [LEVER, (0.0, 0.0, 0.4)], ids=str)

@@ -45,6 +45,7 @@ def refused(score: dict[str, float]) -> float:
     return sum(value for key, value in score.items() if key.endswith("nis_rejected"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GATED)
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_the_count_of_refusals_is_that_of_the_run(name, wrong):
@@ -234,6 +235,7 @@ def test_after_a_gap_of_the_imu_a_filter_is_where_it_was(name, gap, gate):
     assert f"{longest:g} s (median step 0.005 s)" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GATED)
 def test_the_noise_of_a_held_control_can_be_kept(name):
     made = without(flight(), 2.0, 2.9)

@@ -69,6 +69,7 @@ def test_the_filter_keeps_below_the_published_errors_and_both_baselines(seed):
         assert 0.1 < drift[f"{axis}_rmse_rad"] < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_with_the_brownian_drift_of_the_project_roll_and_pitch_keep_below_what_was_published(seed):
     """Its gyroscope drifts by the cumulative sum of 0.002 rad/s a sample. The flight brings what a reading is
@@ -93,6 +94,7 @@ def below_the_published_errors(n: int) -> None:
         assert found[f"{axis}_rmse_rad"] <= most, axis
 
 
+@pytest.mark.slow
 def test_raw_counts_beside_the_published_errors():
     below_the_published_errors(2)
 
@@ -258,6 +260,7 @@ def turntable(rate: np.ndarray, seconds: float = 8.0) -> Flight:
     return Flight("turntable", {"imu": imu}, Series(time, Attitude(attitude=q), name="truth"), {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [(0.5, 0.5, 0.5), (0.2, -0.3, 0.15), (-1.0, 0.4, 0.8)], ids=str)
 def test_a_gyroscope_that_turns_evenly_is_not_frozen(rate):
     """At 0.5 rad/s an axis it ended a hundred degrees off."""

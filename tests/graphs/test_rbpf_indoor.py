@@ -65,6 +65,7 @@ def agree(a: Result, b: Result) -> None:
         assert np.all(np.abs(other - values) <= 1e-9 * np.maximum(1.0, np.abs(values))), leaf
 
 
+@pytest.mark.slow
 def test_the_engines_agree():
     pytest.importorskip("jax")
     case = a_case()
@@ -126,6 +127,7 @@ def test_it_follows_the_flight_with_every_scheme(scheme):
     assert score["attitude_rmse_deg"] < 1.0
 
 
+@pytest.mark.slow
 def test_half_the_precision_is_enough():
     pytest.importorskip("jax")
     case = a_case()

@@ -106,6 +106,7 @@ def errors(setting: str, particles: int, seeds: range, duration: float = 20.0) -
     return rmse(ours, setting, seeds, duration), rmse(theirs, setting, seeds, duration)
 
 
+@pytest.mark.slow
 def test_in_one_setting_it_is_nearly_as_good_as_an_error_state_filter():
     ours, theirs = errors("HHH", 300, range(3), duration=8.0)
     assert ours < 1.25 * theirs

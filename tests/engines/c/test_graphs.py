@@ -36,7 +36,21 @@ SINGLE = {
 """Largest difference of the estimate in single precision, in its own units, over a second of flight."""
 
 
-@pytest.mark.parametrize("name", LIBRARY)
+LONG = {
+    "ukf",
+    "ins_ukf_pose",
+    "ins_ukf_velocity",
+    "ins_particle",
+    "quaternion_ukf",
+    "rbpf_indoor",
+    "rbpf_outdoor",
+}
+"""They take 5 to 20 s to compile."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in LIBRARY]
+)
 def test_c_agrees_with_python_and_with_the_interpreter(name):
     """XLA is compared in `tests/graphs/test_optimised.py`, and in each graph's own tests."""
     given = library_case(name)
@@ -45,9 +59,8 @@ def test_c_agrees_with_python_and_with_the_interpreter(name):
         same(wanted, simulate(given.graph, given.inputs, engine=engine), exact=False)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "rbpf_outdoor" else n for n in LIBRARY]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LIBRARY)
 def test_single_precision_stays_near(name):
     given = library_case(name)
     double = simulate(given.graph, given.inputs, engine="c")[given.estimate]
