@@ -181,8 +181,9 @@ def for_flight(
         rests=still,
     )
     still = max(still - (begin.time - int(imu.time[0])) * 1e-9, 0.0)
-    attitude, spread = begin.attitude, StartSpread()
-    if begin.unknown and to_matrix(attitude, xp=np)[2, 2] > math.cos(LEVEL):
+    attitude: np.ndarray | None = begin.attitude
+    spread = StartSpread()
+    if begin.unknown and to_matrix(begin.attitude, xp=np)[2, 2] > math.cos(LEVEL):
         attitude = None
     elif begin.unknown:
         spread = StartSpread(tilt=filter.measured(on)["attitude_noise"], heading=math.inf)
