@@ -44,15 +44,26 @@ def moving(name: str) -> dict[str, Any]:
     return {"still": 0.0} if name == "rbpf_indoor" else {}
 
 
+def inputs_of(case: Case) -> dict[str, Series]:
+    """The inputs of a case, which are no flight."""
+    assert not isinstance(case.inputs, Flight)
+    return dict(case.inputs)
+
+
+def truth_of(made: Flight) -> Series:
+    assert made.truth is not None
+    return made.truth
+
+
 def heading_of(q: np.ndarray) -> float:
     R = to_matrix(q, xp=np)
     return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
-def first_attitude(name: str, case: Any) -> np.ndarray:
+def first_attitude(name: str, case: Case) -> np.ndarray:
     """The attitude (4) in the first tick of a run."""
-    head = {n: s[: max(int(np.searchsorted(s.time, min(x.time[0] for x in case.inputs.values()))) + 1, 2)]
-            for n, s in case.inputs.items()}  # fmt: skip
+    head = {n: s[: max(int(np.searchsorted(s.time, min(x.time[0] for x in inputs_of(case).values()))) + 1, 2)]
+            for n, s in inputs_of(case).items()}  # fmt: skip
     result = simulate(case.graph, head)
     return np.asarray(result[case.estimate]["attitude"][0])
 
@@ -61,7 +72,7 @@ def write_euroc(folder: Path, base: Flight, angle: float) -> Path:
     """A EuRoC folder of the flight's IMU, positions and truth, turned by `angle` degrees about the
     vertical."""
     turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, np.radians(angle)]), xp=np))
-    imu, vicon, truth = base.streams["imu"], base.streams["vicon"], base.truth
+    imu, vicon, truth = base.streams["imu"], base.streams["vicon"], truth_of(base)
     assert truth is not None
     first = 1_400_000_000_000_000_000
     here = "T_BS:\n  cols: 4\n  rows: 4\n  data: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
@@ -91,7 +102,7 @@ def write_euroc(folder: Path, base: Flight, angle: float) -> Path:
     return folder
 
 
-def scored(made: Flight, **settings: Any) -> tuple[float, Any]:
+def scored(made: Flight, **settings: Any) -> tuple[float, Case]:
     """The attitude RMSE of `ins_eskf` in degrees, and its case."""
     case = find_graph("ins_eskf").case(made, gyro_factor=1.0, accelerometer_factor=1.0, **settings)
     return case.score(simulate(case.graph, case.inputs))["attitude_rmse_deg"], case
@@ -137,8 +148,7 @@ def test_the_heading_of_a_recording_is_found(angle):
         f"euroc:{recordings('euroc') / 'MH_01_easy'}", settings={"leica.time_offset": "-0.135"}
     )
     turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, np.radians(angle)]), xp=np))
-    leica, truth = made.streams["leica"], made.truth
-    assert truth is not None
+    leica, truth = made.streams["leica"], truth_of(made)
     place = np.asarray(rotate(turn, leica["position"], xp=np))
     leica = Series(leica.time, Position(position=place), name="leica")
     values = truth.values.replace(
@@ -156,31 +166,25 @@ def test_the_heading_of_a_recording_is_found(angle):
 # What is taken, and when it is of
 
 
-def streams_of(case: Case) -> dict[str, Series]:
-    assert isinstance(case.inputs, dict)
-    return case.inputs
-
-
 @pytest.mark.parametrize("name", [*MEASURE_POSES, "rbpf_indoor"])
 @pytest.mark.parametrize("first", [0.0, 0.3, 1.55])
 def test_a_filter_starts_at_its_first_pose(name, first):
     base = late(flight(), "vicon", first)
     case = find_graph(name).case(base, start="file", **moving(name), **few(name))
-    begins = min(int(series.time[0]) for series in streams_of(case).values())
+    begins = min(int(series.time[0]) for series in inputs_of(case).values())
     assert begins == base.streams["vicon"].time[0]
     assert any(note.startswith("skipped: imu") for note in case.notes) == (first > 0.0)
 
 
 def test_a_start_at_the_truth_is_not_of_its_future():
     base = flight()
-    truth = base.truth
-    assert truth is not None
+    truth = truth_of(base)
     cut = replace(base, truth=truth[truth.time >= 1_600_000_000])
     for name in ("ins_eskf", "complementary", "ekf"):
         case = find_graph(name).case(cut, start="truth")
-        assert min(int(s.time[0]) for s in streams_of(case).values()) >= cut.truth.time[0]  # type: ignore[union-attr]
+        assert min(int(s.time[0]) for s in inputs_of(case).values()) >= truth_of(cut).time[0]
     rests = find_graph("gyro_integration").case(cut, still=2.0)  # the pose of later is that of now
-    assert streams_of(rests)["imu"].time[0] == base.streams["imu"].time[0]
+    assert inputs_of(rests)["imu"].time[0] == base.streams["imu"].time[0]
 
 
 @pytest.mark.parametrize("name", [*MEASURE_POSES, "rbpf_indoor", *BY_IMU, "ins_eskf"])
@@ -205,8 +209,7 @@ def test_a_heading_that_is_set_is_that_of_the_start(name, heading):
 
 def test_a_magnetometer_shows_the_heading_where_nothing_else_does():
     base = flight()
-    imu, truth = base.streams["imu"], base.truth
-    assert truth is not None
+    imu, truth = base.streams["imu"], truth_of(base)
     q = truth["attitude"][np.minimum(np.searchsorted(truth.time, imu.time), len(truth) - 1)]
     turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, 2.0]), xp=np))
     q = np.asarray(multiply(turn, q, xp=np))
@@ -233,7 +236,7 @@ def test_a_first_pose_that_was_not_measured_starts_nothing(name, field):
     case = find_graph(name).case(
         replace(base, streams={**base.streams, "vicon": series}), start="file", **moving(name), **few(name)
     )
-    assert streams_of(case)["imu"].time[0] >= vicon.time[3]
+    assert inputs_of(case)["imu"].time[0] >= vicon.time[3]
     assert np.isfinite(first_attitude(name, case)).all()
 
 
