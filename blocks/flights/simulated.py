@@ -122,6 +122,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
             "attitude_noise": s["attitude.noise"],
             "imu_period_ns": imu_period,
             "vicon_period_ns": vicon_period,
+            "still": _AT_REST,
         },
         notes=(note("info", f"simulated with seed {seed}: 1 s at rest, then a smooth figure"),),
     )

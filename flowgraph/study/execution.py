@@ -246,6 +246,7 @@ def _run(
                 watcher.row(one.row)
     except KeyboardInterrupt as error:
         interrupted, by = True, type(error)
+        rows = {**_there(study, store, planned, retry=False), **rows}  # one may have been written just now
     finally:
         if own:
             runner.close()

@@ -186,8 +186,8 @@ def test_what_cannot_be_tuned_is_refused(wrong, said):
 def test_a_graph_without_innovations_is_refused():
     with pytest.raises(DataError, match="no innovations"):
         tune(
-            "rbpf_indoor", [Fit("position_noise", 0.01, 0.1)], [Recording("sim")],
-            settings={"duration": 1.2, "particles": 5}, most=1,
+            "augmented_complementary", [Fit("alpha", 0.1, 0.9)], [Recording("sim")],
+            settings={"duration": 1.2}, most=1,
         )  # fmt: skip
 
 
