@@ -62,8 +62,9 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
 
     Returns:
-        Of the figure, a `Flight`: truth is a `NavigationState` at the IMU's times; info has `imu_noise`
-        (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and `vicon_period_ns`.
+        Of the figure, a `Flight`: truth is a `NavigationState` at the IMU's times; info has `still` (s),
+        `imu_noise` (`ImuNoise`), `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and
+        `vicon_period_ns`.
 
     Raises:
         UnknownNameError: for another shape or an unknown setting.
