@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from flowgraph.recorder.refusals import refuse
+from flowgraph.recorder.refusals import refuse, refuse_in_place
 from flowgraph.recorder.tangents import Tangent
 
 
@@ -182,29 +182,4 @@ for _name, _op in _COMPARED.items():
     setattr(Dual, f"__{_name}__", _operator(_op))
 for _name, _op in {"neg": "negative", "pos": "positive", "abs": "abs"}.items():
     setattr(Dual, f"__{_name}__", lambda self, _op=_op: getattr(self.xp, _op)(self))
-
-
-def _augmented(name: str) -> Callable[..., NoReturn]:
-    def method(self: Dual, other: Any) -> NoReturn:
-        refuse(
-            "in-place write",
-            "a new array",
-            f"x {name}= y",
-            f"write x = x {name} y: NumPy would change x itself",
-            in_every_engine=True,
-        )
-
-    return method
-
-
-for _name, _op in {
-    "add": "+",
-    "sub": "-",
-    "mul": "*",
-    "truediv": "/",
-    "floordiv": "//",
-    "mod": "%",
-    "pow": "**",
-    "matmul": "@",
-}.items():
-    setattr(Dual, f"__i{_name}__", _augmented(_op))
+refuse_in_place(Dual)

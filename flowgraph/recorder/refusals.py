@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import NoReturn
+from functools import partialmethod
+from typing import Any, NoReturn
 
 from flowgraph.errors import LoweringError, place
 
@@ -33,3 +34,25 @@ def refuse(what: str, expected: str, got: str, fix: str, *, in_every_engine: boo
     error = LoweringError(what, path=caller(), expected=expected, got=got, fix=fix)
     error.in_every_engine = in_every_engine
     raise error
+
+
+_IN_PLACE = {
+    "add": "+", "sub": "-", "mul": "*", "truediv": "/", "floordiv": "//", "mod": "%", "pow": "**",
+    "matmul": "@", "and": "&", "or": "|", "xor": "^", "lshift": "<<", "rshift": ">>",
+}  # fmt: skip
+
+
+def refuse_in_place(kind: type) -> None:
+    """Let a class of arrays refuse `x += y` and its like, which change x itself in NumPy alone."""
+    for name, sign in _IN_PLACE.items():
+        setattr(kind, f"__i{name}__", partialmethod(_written, sign))
+
+
+def _written(array: Any, sign: str, other: Any) -> NoReturn:
+    refuse(
+        "in-place write",
+        "a new array",
+        f"x {sign}= y",
+        f"write x = x {sign} y: NumPy would change x itself",
+        in_every_engine=True,
+    )

@@ -14,7 +14,7 @@ import numpy as np
 
 from flowgraph.recorder import ranges
 from flowgraph.recorder.ops import Spec
-from flowgraph.recorder.refusals import refuse
+from flowgraph.recorder.refusals import refuse, refuse_in_place
 from flowgraph.types import DTYPES
 
 if TYPE_CHECKING:
@@ -239,34 +239,4 @@ for _name, _op in {
     setattr(Symbolic, f"__{_name}__", _operator(_op))
 for _name, _op in {"neg": "negative", "pos": "positive", "abs": "abs", "invert": "bitwise_invert"}.items():
     setattr(Symbolic, f"__{_name}__", lambda self, _op=_op: self.trace.apply(_op, self))
-
-
-def _augmented(name: str) -> Callable[..., NoReturn]:
-    def method(self: Symbolic, other: Any) -> NoReturn:
-        refuse(
-            "in-place write",
-            "a new array",
-            f"x {name}= y",
-            f"write x = x {name} y: NumPy would change x itself",
-            in_every_engine=True,
-        )
-
-    return method
-
-
-for _name, _op in {
-    "add": "+",
-    "sub": "-",
-    "mul": "*",
-    "truediv": "/",
-    "floordiv": "//",
-    "mod": "%",
-    "pow": "**",
-    "matmul": "@",
-    "and": "&",
-    "or": "|",
-    "xor": "^",
-    "lshift": "<<",
-    "rshift": ">>",
-}.items():
-    setattr(Symbolic, f"__i{_name}__", _augmented(_op))
+refuse_in_place(Symbolic)
