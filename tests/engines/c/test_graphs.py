@@ -26,6 +26,7 @@ SINGLE = {
     "roll_pitch": 1e-3,
     "gyro_integration": 1e-3,
     "marg": 1e-3,
+    "attitude_mekf": 1e-3,
     "particle": 5e-2,
     "tracker": 1e-4,
     "ins_particle": 0.2,  # of 60 particles; one that is drawn in place of another moves the mean
