@@ -77,7 +77,7 @@ def attitude_mekf(
         name="update",
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=3)
+        posterior = find_back(posterior, innovation, patience=patience, moving=3, attitude=0)
     belief.feed(posterior)
     last.feed(rate)
     collect(innovation, "innovation")

@@ -1,24 +1,51 @@
 """A filter that has lost track: what it is told when its control is old, and how its gate opens again.
 
 `bridge` makes a prior less sure when the control that drove it is old. `find_back` makes a belief less sure
-when a gate has refused a run of measurements, until one passes: then the belief is all but that measurement.
-Both change the covariance alone, of any belief that has one. `stay` leaves a belief of any kind where it was
-over a step that is no step but a jump of the stamps. All do nothing while all is well.
+when a gate has refused a run of measurements, so that the next one passes. Both change the covariance alone,
+of any belief that has one. `stay` leaves a belief of any kind where it was over a step that is no step but a
+jump of the stamps. All do nothing while all is well. Whether track is lost is told by `in_doubt`, of Gaussian
+beliefs and of clouds alike.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowgraph import Array, block
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.metrics.consistency import IN_A_ROW
 
-__all__ = ["PATIENCE", "Held", "aged", "bridge", "bridged", "find_back", "stay"]
+__all__ = [
+    "FARTHEST",
+    "GROWN",
+    "PATIENCE",
+    "UNKNOWN_TURN",
+    "Held",
+    "aged",
+    "bridge",
+    "bridged",
+    "find_back",
+    "in_doubt",
+    "stay",
+]
 
 PATIENCE = IN_A_ROW
 """How many refusals in a row are taken for outliers."""
+
+GROWN = 4.0
+"""How many times as large, at least, the deviations of a lost belief become."""
+
+FARTHEST = 1e14
+"""The nis of a measurement of which nothing can be made: it would leave no digit of the covariance."""
+
+REACH = 1e6
+"""m, m/s: the deviation from which on a number of the motion does not grow."""
+
+UNKNOWN_TURN = math.pi / math.sqrt(3.0)
+"""rad: the deviation of an angle of which nothing is known: that of a uniform one."""
 
 PAUSE = 1.0
 """s: a pause of all streams, or a jump of their stamps, makes as unsure as a gap of the control so long."""
@@ -155,36 +182,95 @@ def _fresh(*_: Any, **__: Any) -> Any:
     return np.float64(0.0)
 
 
+def in_doubt(
+    state: Array, near: Array, nis: Array, parts: Array, *, patience: float, xp: Any
+) -> tuple[Array, Array, Array]:
+    """Whether a belief has lost track, of how it foretold a measurement and those before.
+
+    The first `patience` measurements in a row that are too far off are taken for outliers. The next shows
+    that track is lost, and so on until one is near; and as one correction may not mend an error so large, the
+    next one after it that is far shows it again: only two in a row are trusted.
+
+    Args:
+        state: how many were too far off in a row; `patience` after one that was near in doubt.
+        near: whether this one is as near as expected.
+        nis, parts: of its innovation.
+        patience: how many in a row are taken for outliers.
+
+    Returns:
+        The next state; whether track is lost, which a nis beyond `FARTHEST` does not tell; and by what the
+        variances must then grow, nis over parts and at least `GROWN` squared, else 1.
+    """
+    wait = 0.0 * state + patience
+    count = xp.where(near, xp.where(state > wait, wait, 0.0 * state), state + 1.0)
+    usable = nis < FARTHEST
+    lost = (count > wait) & usable
+    ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
+    return count, lost, xp.where(lost, xp.maximum(ratio, 0.0 * ratio + GROWN**2), 1.0)
+
+
 @block
-def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, moving: int, xp: Any):  # type: ignore[no-untyped-def]
+def find_back(  # type: ignore[no-untyped-def]
+    state,
+    posterior: Any,
+    innovation: Any | None,
+    *,
+    patience: int,
+    moving: int | tuple[int, int],
+    attitude: int | None = None,
+    shown: bool = True,
+    xp: Any,
+):
     """Doubt a belief whose gate refuses one measurement after the other.
 
-    The first `patience` refusals in a row change nothing: they may be outliers. From then on each makes the
-    deviations of the first `moving` numbers, those of the motion, four times as large and keeps their
-    correlations, while biases keep what they know. The covariance so grows until a measurement passes, and
-    the motion is then that which was measured. A measurement that passes ends the run.
+    After `patience` refusals in a row the motion is lost (`in_doubt`). The deviations of its numbers then
+    become as many times as large as the residual was than expected, so that a like measurement passes,
+
+        s' = s max(4, sqrt(nis / m))        for a measurement of m numbers
+
+    and they are correlated with nothing any more: what they told of each other was of another error. Numbers
+    that do not move, such as biases, keep what they know. An attitude becomes at most as unsure as one of
+    which nothing is known, everything else as `REACH`.
 
     Args:
         posterior: any belief with a `covariance`, or its `root`, after the correction.
         innovation: of that correction, where there was one.
         patience: how many refusals in a row are taken for outliers.
-        moving: how many numbers of the covariance, from the first on, may have lost track.
+        moving: how many numbers of the covariance, from the first on, may have lost track; or from which on
+            to before which.
+        attitude: where an attitude stands in the covariance, as in `bridge`.
+        shown: whether the measurement shows that attitude. Where it does not, the others are blamed first,
+            and the attitude's deviations become only four times as large.
 
-    State: how many measurements were refused in a row.
+    State: that of `in_doubt`.
     """
     if innovation is None:
         return state, posterior
     on_root = "root" in posterior._fields
-    P = posterior.root if on_root else posterior.covariance
-    refused = 1.0 - xp.astype(innovation.accepted, P.dtype)
-    count = (state + refused) * refused
-    lost = xp.astype(count > float(patience), P.dtype)
-    moved = np.zeros(P.shape[-1])
-    moved[:moving] = 1.0
-    scale = 1.0 + 3.0 * xp.asarray(moved, dtype=P.dtype) * lost
+    kept = posterior.root if on_root else posterior.covariance
+    kind, n = kept.dtype, kept.shape[-1]
+    count, lost, grow = in_doubt(
+        state, innovation.accepted, innovation.nis, innovation.parts, patience=float(patience), xp=xp
+    )
+    first, last = moving if isinstance(moving, tuple) else (0, moving)
+    at = np.arange(n)
+    inside = (at >= first) & (at < last)
+    most, blamed = np.where(inside, REACH**2, 0.0), np.ones(n)
+    if attitude is not None:
+        turn = slice(attitude, attitude + (4 if n == 10 else 3))  # a quaternion is of half angles
+        most[turn] = UNKNOWN_TURN**2 * (0.25 if n == 10 else 1.0) * inside[turn]
+        blamed[turn] = float(shown)
+    P = kept @ kept.mT if on_root else kept
+    one = xp.eye(n, dtype=kind)
+    variance = xp.sum(P * one, axis=-1)
+    grow = xp.asarray(blamed, dtype=kind) * (grow - GROWN**2)[..., None] + GROWN**2
+    wide = xp.minimum(grow * variance, xp.maximum(xp.asarray(most, dtype=kind), variance))
+    apart = xp.asarray(np.where(inside[:, None] | inside, np.eye(n), 1.0), dtype=kind)
+    doubted = P * apart + one * (wide - variance)[..., :, None]
+    lost = lost[..., None, None]
     if on_root:
-        return count, posterior.replace(root=P * scale[..., :, None])
-    return count, _with(posterior, P * scale[..., :, None] * scale[..., None, :])
+        return count, posterior.replace(root=xp.where(lost, covariance_root(doubted, xp=xp), kept))
+    return count, _with(posterior, xp.where(lost, doubted, P))
 
 
 @find_back.init

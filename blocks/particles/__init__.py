@@ -25,7 +25,6 @@ from flowgraph.blocks.particles.cloud import (
 from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, silverman, spread_of
 from flowgraph.blocks.particles.lost import (
     BELIEVED,
-    FARTHEST,
     believe_pose,
     depletion,
     depletion_remarks,
@@ -49,7 +48,6 @@ from flowgraph.blocks.particles.resampling import (
 __all__ = [
     "within_reach",
     "pose_within_reach",
-    "FARTHEST",
     "BELIEVED",
     "Spread",
     "Kernels",

@@ -16,12 +16,12 @@ import numpy as np
 from flowgraph import Array, Scalar, Series, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.kalman.filters import accepts
+from flowgraph.blocks.kalman.lost import FARTHEST, in_doubt
 from flowgraph.blocks.signals import Cloud, Depletion, KalmanInnovation, Pose
 from flowgraph.data.notes import note
 
 __all__ = [
     "BELIEVED",
-    "FARTHEST",
     "believe_pose",
     "depletion",
     "depletion_remarks",
@@ -34,12 +34,6 @@ __all__ = [
 
 BELIEVED = 1.0 - 1e-6
 """The probability with which a measurement is as near as an honest cloud expects; beyond, a cloud is lost."""
-
-FARTHEST = 1e14
-"""The nis of a measurement of which nothing can be made: it would leave no digit of the covariance."""
-
-GROWN = 16.0
-"""By how much, at least, the variances of a lost cloud grow at a measurement."""
 
 _REACH = 1e12
 
@@ -77,10 +71,8 @@ def verdict(
 ) -> tuple[Array, KalmanInnovation, Array]:
     """Whether a cloud, taken for the Gaussian of its mean and covariance, believes a measurement.
 
-    The first `patience` measurements in a row that are too far off are taken for outliers: with a gate they
-    are refused, without one they are believed all the same. The next one shows that the cloud has lost track,
-    and so on until one is near.
-    Such a cloud must grow, or start anew, before it is corrected.
+    Whether it has lost track is as in `kalman.lost.in_doubt`; such a cloud must grow, or start anew, before
+    it is corrected. What is too far off before is refused with a gate, and believed all the same without one.
 
     Args:
         state: how many measurements were too far off in a row.
@@ -104,12 +96,9 @@ def verdict(
     parts = xp.sum(xp.astype(present, S.dtype))
     usable = nis < FARTHEST
     near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable
-    far = xp.where(near, 0.0, state + 1.0)
     wait = 0.0 if gate is None and at_once else float(patience)
-    lost = usable & (far > wait)
+    far, lost, grow = in_doubt(state, near, nis, parts, patience=wait, xp=xp)
     accepted = usable if gate is None else near | lost
-    ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
-    grow = xp.where(lost, xp.maximum(ratio, 0.0 * ratio + GROWN), 1.0)
     innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
     return far, innovation, grow
 
