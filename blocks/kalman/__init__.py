@@ -28,6 +28,7 @@ from flowgraph.blocks.kalman.lost import (
     bridged,
     find_back,
     in_doubt,
+    lost_variances,
     stay,
 )
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
@@ -49,6 +50,7 @@ __all__ = [
     "stay",
     "find_back",
     "in_doubt",
+    "lost_variances",
     "covariance_root",
     "LinearModel",
     "Correction",

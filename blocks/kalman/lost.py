@@ -29,6 +29,7 @@ __all__ = [
     "bridged",
     "find_back",
     "in_doubt",
+    "lost_variances",
     "stay",
 ]
 
@@ -252,25 +253,48 @@ def find_back(  # type: ignore[no-untyped-def]
     count, lost, grow = in_doubt(
         state, innovation.accepted, innovation.nis, innovation.parts, patience=float(patience), xp=xp
     )
-    first, last = moving if isinstance(moving, tuple) else (0, moving)
-    at = np.arange(n)
-    inside = (at >= first) & (at < last)
-    most, blamed = np.where(inside, REACH**2, 0.0), np.ones(n)
-    if attitude is not None:
-        turn = slice(attitude, attitude + (4 if n == 10 else 3))  # a quaternion is of half angles
-        most[turn] = UNKNOWN_TURN**2 * (0.25 if n == 10 else 1.0) * inside[turn]
-        blamed[turn] = float(shown)
     P = kept @ kept.mT if on_root else kept
     one = xp.eye(n, dtype=kind)
     variance = xp.sum(P * one, axis=-1)
-    grow = xp.asarray(blamed, dtype=kind) * (grow - GROWN**2)[..., None] + GROWN**2
-    wide = xp.minimum(grow * variance, xp.maximum(xp.asarray(most, dtype=kind), variance))
+    wide = lost_variances(variance, grow, moving=moving, attitude=attitude, shown=shown, xp=xp)
+    inside = _inside(n, moving)
     apart = xp.asarray(np.where(inside[:, None] | inside, np.eye(n), 1.0), dtype=kind)
     doubted = P * apart + one * (wide - variance)[..., :, None]
     lost = lost[..., None, None]
     if on_root:
         return count, posterior.replace(root=xp.where(lost, covariance_root(doubted, xp=xp), kept))
     return count, _with(posterior, xp.where(lost, doubted, P))
+
+
+def lost_variances(
+    variance: Array,
+    grow: Array,
+    *,
+    moving: int | tuple[int, int],
+    attitude: int | None = None,
+    shown: bool = True,
+    xp: Any,
+) -> Array:
+    """The variances (n) of a belief by what they are, and what `in_doubt` says they must grow by.
+
+    Args:
+        moving, attitude, shown: as in `find_back`.
+    """
+    n = variance.shape[-1]
+    inside = _inside(n, moving)
+    most, blamed = np.where(inside, REACH**2, 0.0), np.ones(n)
+    if attitude is not None:
+        turn = slice(attitude, attitude + (4 if n == 10 else 3))  # a quaternion is of half angles
+        most[turn] = UNKNOWN_TURN**2 * (0.25 if n == 10 else 1.0) * inside[turn]
+        blamed[turn] = float(shown)
+    grow, least = grow[..., None], xp.minimum(grow, 0.0 * grow + GROWN**2)[..., None]
+    grow = xp.asarray(blamed, dtype=variance.dtype) * (grow - least) + least
+    return xp.minimum(grow * variance, xp.maximum(xp.asarray(most, dtype=variance.dtype), variance))
+
+
+def _inside(n: int, moving: int | tuple[int, int]) -> np.ndarray:
+    first, last = moving if isinstance(moving, tuple) else (0, moving)
+    return (np.arange(n) >= first) & (np.arange(n) < last)
 
 
 @find_back.init

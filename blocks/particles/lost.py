@@ -98,6 +98,7 @@ def verdict(
     near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable
     wait = 0.0 if gate is None and at_once else float(patience)
     far, lost, grow = in_doubt(state, near, nis, parts, patience=wait, xp=xp)
+    far = xp.where(parts > 0.0, far, state)  # of what was not measured nothing is learned
     accepted = usable if gate is None else near | lost
     innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
     return far, innovation, grow
