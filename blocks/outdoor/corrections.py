@@ -22,7 +22,7 @@ from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.kalman.lost import PATIENCE, lost_variances
 from flowgraph.blocks.outdoor.cloud import MOVED, POSITION, TURN, as_cloud, turned
 from flowgraph.blocks.particles.cloud import average_attitude, log_sum_exp
-from flowgraph.blocks.particles.lost import mixture, verdict, within_reach
+from flowgraph.blocks.particles.lost import judged, mixture, within_reach
 from flowgraph.blocks.signals import (
     KalmanInnovation,
     MagneticField,
@@ -244,16 +244,11 @@ def _judged(
     own = seen(lanes.transpose(seen(cloud.covariance), xp=xp))
     mean, S = mixture(weight, residual, xp=xp)
     S = S + xp.sum(own * weight, axis=-1) + xp.eye(m, dtype=kind) * variance
-    present = ~xp.isnan(mean)
-    both = present[:, None] & present[None, :]
-    S = xp.where(both, 0.5 * (S + S.mT), xp.eye(m, dtype=kind))
-    mean = xp.where(present, mean, 0.0)
-    count, innovation, grow = verdict(
-        state, mean, S, present, gate=gated.gate, patience=gated.patience, xp=xp
-    )
+    S = 0.5 * (S + S.mT)
+    count, innovation, grow = judged(state, mean, S, gate=gated.gate, patience=gated.patience, xp=xp)
     if gated.gate is not None:
         cloud = _widened(cloud, weight, grow, gated, xp)
-    return count, cloud, innovation, present & innovation.accepted
+    return count, cloud, innovation, ~xp.isnan(mean) & innovation.accepted
 
 
 def _widened(cloud: OutdoorCloud, weight: Array, grow: Array, gated: _Gated, xp: Any) -> OutdoorCloud:

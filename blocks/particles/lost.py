@@ -26,6 +26,7 @@ __all__ = [
     "depletion",
     "depletion_remarks",
     "judge_pose",
+    "judged",
     "mixture",
     "pose_within_reach",
     "verdict",
@@ -54,7 +55,7 @@ def within_reach(x: Array, *, xp: Any) -> Array:
 
 @block
 def pose_within_reach(pose: Pose, *, xp: Any) -> Pose:
-    """A pose whose position is `within_reach`."""
+    """A pose whose position is `within_reach`; NaN stays."""
     return Pose(position=within_reach(pose.position, xp=xp), attitude=pose.attitude)
 
 
@@ -104,6 +105,16 @@ def verdict(
     return far, innovation, grow
 
 
+def judged(
+    state: Array, residual: Array, S: Array, *, gate: float | None, patience: int, xp: Any
+) -> tuple[Array, KalmanInnovation, Array]:
+    """`verdict` on the entries of a residual (m) that are not NaN."""
+    present = ~xp.isnan(residual)
+    S = xp.where(present[:, None] & present[None, :], S, xp.eye(S.shape[-1], dtype=S.dtype))
+    residual = xp.where(present, residual, 0.0)
+    return verdict(state, residual, S, present, gate=gate, patience=patience, xp=xp)
+
+
 @block
 def judge_pose(
     state: Any,
@@ -118,6 +129,9 @@ def judge_pose(
     xp: Any,
 ) -> tuple[Any, tuple[KalmanInnovation, Scalar]]:
     """The innovation (m, world; rad, body) of a whole cloud at a measured pose, and whether to believe it.
+
+    Of a pose of which some entries are NaN, the others are judged; a NaN in the quaternion takes all of the
+    attitude with it.
 
     Its covariance is that of the particles' innovations, the mean of their own and the noise. Whether it
     is believed is as in `verdict`.
@@ -140,14 +154,12 @@ def judge_pose(
         point = point + lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=point.dtype), xp=xp)
     turn = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     mean, S = mixture(weight, xp.concat([-point, turn], axis=0), xp=xp)
-    mean = mean + xp.concat([pose.position, 0.0 * pose.position])
+    mean = mean + xp.concat([pose.position, 0.0 * cloud.position[:, 0]])
     own = xp.sum(cloud.position_covariance * weight, axis=-1)
     wide = xp.asarray(np.eye(3, 6), dtype=S.dtype)
     noise = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
     S = S + wide.mT @ own @ wide + xp.asarray(noise, dtype=S.dtype)
-    count, innovation, grow = verdict(
-        state, mean, 0.5 * (S + S.mT), mean == mean, gate=gate, patience=patience, xp=xp
-    )
+    count, innovation, grow = judged(state, mean, 0.5 * (S + S.mT), gate=gate, patience=patience, xp=xp)
     return count, (innovation, grow)
 
 
@@ -174,7 +186,8 @@ def believe_pose(
     was lost.
 
     A new cloud is equally weighted and lies about the measured pose, with its noise; the velocities stay,
-    with variances `grow` times as large. Draws `anew` (3, n).
+    with variances `grow` times as large, and so does what was not measured of the pose (NaN), attitudes as
+    they are. Draws `anew` (3, n).
 
     Args:
         prior, posterior: before and after the correction.
@@ -197,16 +210,21 @@ def _anew(
     errors = xp.asarray(draw.normal("anew", (3, n)), dtype=kind) * attitude_noise
     measured = pose.attitude[:, None] + 0.0 * prior.attitude
     q = lanes.normalize(lanes.multiply(measured, lanes.exponential(errors, xp=xp), xp=xp), xp=xp)
+    q = xp.where(xp.any(xp.isnan(pose.attitude)), prior.attitude, q)
     p = pose.position[:, None] - lanes.rotate(q, xp.asarray(lever, dtype=kind), xp=xp)
+    seen = ~xp.isnan(pose.position)
     one = xp.asarray(np.eye(3)[:, :, None], dtype=kind)
+    fixed = one * position_noise**2 + 0.0 * prior.position_covariance
+    vague = grow * prior.position_covariance
+    both = (seen[:, None] | seen[None, :])[:, :, None]
     fresh = Cloud(
         log_weight=0.0 * prior.log_weight - float(np.log(n)),
         attitude=q,
         velocity=prior.velocity,
-        position=p,
+        position=xp.where(seen[:, None], p, prior.position),
         velocity_covariance=grow * prior.velocity_covariance,
         cross_covariance=0.0 * prior.cross_covariance,
-        position_covariance=one * position_noise**2 + 0.0 * prior.position_covariance,
+        position_covariance=xp.where(both, fixed, vague),
     )
     gone = grow > 1.0
     return Cloud(
