@@ -104,7 +104,7 @@ def bridge(  # type: ignore[no-untyped-def]
     *,
     held: Held,
     position: int | None = None,
-    velocity: int,
+    velocity: int | None = None,
     attitude: int | None = None,
     dt: float,
     xp: Any,
@@ -125,8 +125,8 @@ def bridge(  # type: ignore[no-untyped-def]
         control: where there is a fresh one; the age of the one before counts in the step that ends with it.
         held: from which age on, and how fast, it becomes worthless.
         position, velocity, attitude: where these stand in the covariance. An attitude of three numbers is an
-            error in the body or angles; of a belief with ten, it is the quaternion. A position or attitude
-            may be left out.
+            error in the body or angles; of a belief with ten, it is the quaternion. What a belief has not is
+            left out.
 
     State: the age of the control, s.
     """
@@ -135,11 +135,12 @@ def bridge(  # type: ignore[no-untyped-def]
     n = P.shape[-1]
     table = np.zeros((3, n, n))
     one = np.eye(3)
-    v = slice(velocity, velocity + 3)
-    table[0, v, v] = one * held.force**2
-    if position is not None:
-        p = slice(position, position + 3)
-        table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
+    if velocity is not None:
+        v = slice(velocity, velocity + 3)
+        table[0, v, v] = one * held.force**2
+        if position is not None:
+            p = slice(position, position + 3)
+            table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
     push = [xp.asarray(part_, dtype=P.dtype) for part_ in table]
     more = push[0] * w + push[1] * (0.5 * part * w) + push[2] * (part * part * w / 3.0)
     if attitude is not None:
