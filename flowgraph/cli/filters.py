@@ -70,7 +70,7 @@ def list_(as_json: AsJson = False) -> None:
 def show(
     graph: Name,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
+        Path | None, typer.Option("-o", "--output", help="An .html, .svg, .png, .pdf or .dot file.")
     ] = None,
     fold: Annotated[
         int | None, typer.Option(min=0, help="Draw graphs nested deeper than this as one box.")
@@ -80,14 +80,20 @@ def show(
     settings: Settings = None,
     seed: Seed = 0,
 ) -> None:
-    """Draw a graph: in the terminal, or to a file."""
+    """Draw a graph: in the terminal, or to a file; an .html is a page in which it unfolds."""
+    from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
+    from flowgraph.pipeline.costs.places import costs_by_path
+
     built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
         return
     with writing(output), without_font_warnings():
-        built.draw(str(output), fold=fold)
+        if output.suffix.lower() == ".html":
+            diagram_page(built, output, fold=fold, costs=costs_by_path(built))
+        else:
+            built.draw(str(output), fold=fold)
 
 
 @app.command()
