@@ -112,7 +112,7 @@ def test_all_that_a_reader_asks_is_in_the_description() -> None:
     assert smoothed["costs"]["operations"] == 4  # three of the step, and the choice of the new state
     assert nodes["before"]["role"] == "delay"
     assert nodes["before"]["initially"] == [["value", "1"]]
-    assert nodes["before"]["costs"] == {"format": "float64", "bytes": 8}
+    assert {"format": "float64", "bytes": 8}.items() <= nodes["before"]["costs"].items()
     assert nodes["kept"]["initial"] == "7"
     assert nodes["pairs"]["queue"] == "queues ≤ 4, within 1 ms"
     clocks = {clock["words"]: clock["rate"] for clock in made["clocks"]}

@@ -10,7 +10,7 @@ for (const name of Object.keys(used)) {
   await build({
     entryPoints: [`src/${name}_page.ts`],
     outfile: join(out, `${name}.js`),
-    bundle: true, minify: true, format: "iife", target: "es2022", charset: "ascii", legalComments: "none",
+    bundle: true, minify: true, format: "iife", target: "es2023", charset: "ascii", legalComments: "none",
     // elkjs asks for a worker of node's, which no page has.
     external: ["web-worker"],
     logLevel: "warning",

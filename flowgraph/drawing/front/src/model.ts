@@ -36,3 +36,23 @@ export function unpack(packed: Packed): Float32Array {
 export function given<T>(id: string): T {
   return JSON.parse(document.getElementById(id)!.textContent!) as T;
 }
+
+export interface Dots { name: string; t: Packed; y: Packed }
+export interface Panel {
+  group: string; title: string; unit: string; dots: boolean; t: number; lines: { name: string; y: Packed }[];
+  sigma: Packed | null; range: [number, number]; whole?: [number, number] | null; words?: string;
+  bounds?: [number, number]; wrong?: boolean; points?: Dots[];
+}
+export interface Part { name: string; way: "whole" | "deviation" | "range"; size: number; unit: string }
+export interface Cloud { name: string; times: Packed; size: number; of: number; places: Packed }
+export interface Watch {
+  times: Packed; stride: number; wires: Record<string, { at: Packed; values: Packed; parts: Part[] }>; cloud?: Cloud;
+}
+export interface Way {
+  t: Packed; estimate: Packed; attitude: Packed | null; truth: Packed | null; unit: string;
+  seen: { name: string; gnss: boolean; t: Packed; places: Packed }[];
+}
+export interface Run {
+  title: string; graph: Graph; engine: string; ticks: number; end: number; figures: Pair[]; notes: string[];
+  times: Packed[]; panels: Panel[]; watch: Watch | null; blocks: Record<string, [number, number]>; way: Way | null;
+}
