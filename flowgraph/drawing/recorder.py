@@ -1,10 +1,10 @@
 """What a page remembers of the wires of a run: at some of its ticks, the last value on each, in few numbers.
 
 A page must open in seconds and weigh little, so it cannot hold each value of each wire. A recorder looks at
-ticks that are evenly spaced over the run; where it cannot know how long that will be, it drops every second of
-what it has when that is enough, and then looks half as often. Of a value it keeps the small arrays
-whole, of a square matrix the roots of the diagonal, and of what is larger the range; of a cloud of particles,
-where some of them are.
+ticks that are evenly spaced over the run; where it cannot know how long that will be, it drops every second
+of what it has when that is enough, and then looks half as often. Of a value it keeps the small arrays whole,
+of a square matrix the roots of the diagonal, and of what is larger the range; of a cloud of particles, where
+some of them are.
 """
 
 from __future__ import annotations
@@ -199,12 +199,8 @@ def _cloud_of(graph: Graph) -> _Cloud | None:
                     continue
                 across = leaf.axes[1] == "particles"
                 own, count = leaf.shape if across else leaf.shape[::-1]
-                if (
-                    name.rpartition(".")[2] == "position"
-                    and own in (2, 3)
-                    or name == "state"
-                    and own in SIZES
-                ):
+                places = name.rpartition(".")[2] == "position" and own in (2, 3)
+                if places or (name == "state" and own in SIZES):
                     found = _Cloud(Wire(index, k), port.type, place, across, int(count))
     return found
 

@@ -61,9 +61,8 @@ def describe_run(
     known = dict(inputs or {})
     scopes = Scopes(result, estimate, truth, known, order)
     panels = scopes.panels()
-    blocks = {} if recorder is None else {
-        path: [1e6 * seconds / times if times else 0.0, times] for path, (seconds, times) in recorder.blocks.items()
-    }  # fmt: skip
+    took = {} if recorder is None else recorder.blocks
+    blocks = {path: [1e6 * seconds / max(times, 1), times] for path, (seconds, times) in took.items()}
     return {
         "title": title,
         "graph": describe(graph),
@@ -138,8 +137,8 @@ def _way(
         if seen is not None and seen[0].ndim == 2 and seen[0].shape[1] in (2, 3) and len(series):
             some = slice(None, None, -(-len(series) // SEEN))
             made["seen"].append({
-                "name": name, "gnss": bool(_GNSS.search(name)), "t": packed((series.time[some] - begin) * 1e-9),
-                "places": packed(_in_space(seen[0][some])),
+                "name": name, "gnss": bool(_GNSS.search(name)),
+                "t": packed((series.time[some] - begin) * 1e-9), "places": packed(_in_space(seen[0][some])),
             })  # fmt: skip
     return made
 

@@ -1,4 +1,4 @@
-"""A run that is watched: the same run, with what stood on the wires at some of its ticks, and each block's time.
+"""A run that is watched: the same run, with what stands on its wires now and then, and each block's time.
 
 A result holds what a graph collects. Who looks for the block that goes wrong wants the rest as well, which
 would be gigabytes if all of it were kept. So the Python engine hands every value on every wire to a watcher,

@@ -11,12 +11,12 @@ export function before(times: ArrayLike<number>, t: number): number {
   return low - 1;
 }
 
-/** A number in about four figures. */
-export function short(x: number): string {
+/** A number in few figures. */
+export function short(x: number, figures = 4): string {
   if (!Number.isFinite(x)) return "–";
   const size = Math.abs(x);
-  if (size !== 0 && (size < 1e-3 || size >= 1e5)) return x.toExponential(2).replace("e+", "e");
-  return x.toPrecision(4).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, "");
+  if (size !== 0 && (size < 1e-3 || size >= 10 ** (figures + 1))) return x.toExponential(figures - 2).replace("e+", "e");
+  return x.toPrecision(figures).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, "");
 }
 
 const colours = new Map<string, string>();

@@ -15,7 +15,7 @@ const header = document.querySelector("header")!, main = document.querySelector(
 const picker = html("select", { "aria-label": "Run" }, ...runs.map((run, k) => html("option", { value: k }, run.title)));
 const other = html("select", { "aria-label": "Compare with" }, html("option", { value: -1 }, "compare with …"), ...runs.map((run, k) => html("option", { value: k }, run.title)));
 const slider = html("input", { type: "range", min: 0, max: 1000, value: 0, step: "any", "aria-label": "Time" });
-const clock = html("output", { class: "clock" });
+const clock = html("output", { class: "reading-time" });
 const play = button("▶", "Play", () => void (timer ? stop() : start()));
 
 interface At { at(t: number): void; leave?(): void }
@@ -69,6 +69,14 @@ function notes(run: Run): HTMLElement | null {
     html("ul", {}, ...run.notes.map((words) => html("li", { class: wrong.test(words) ? "wrong" : undefined }, words))));
 }
 
+/** What the colours of the plots mean. */
+function key(run: Run, beside: Run | undefined): HTMLElement {
+  const entry = (name: string, words: string) => html("li", {}, html("span", { class: "swatch", style: `--colour: var(--${name})` }), words);
+  const seen = run.way?.seen.map((s) => s.name).join(", ");
+  return html("ul", { class: "key", "aria-label": "Colours of the plots" }, entry("estimate", "estimate, error, innovation"), entry("truth", "truth (dashed)"),
+    seen ? entry("measured", `measured: ${seen}`) : null, entry("band", "3σ, or 95 % bounds"), beside ? entry("mark", beside.title) : null);
+}
+
 function blocks(run: Run): HTMLElement | null {
   const all = Object.entries(run.blocks).map(([path, [micros, times]]) => ({ path, micros, times, sum: micros * times }));
   const sum = all.reduce((total, one) => total + one.sum, 0);
@@ -87,14 +95,14 @@ async function show(): Promise<void> {
   const beside = second === run ? undefined : second;
   const watched = new Watched(run), moved: At[] = [];
   const sheet = html("div", { class: "sheet" });
-  const diagram = new Diagram(run.graph, sheet, { down: true, labels: run.watch ? 118 : 0, values: run.watch ? watched.values : undefined });
+  const diagram = new Diagram(run.graph, sheet, { down: true, labels: run.watch ? 122 : 0, values: run.watch ? watched.values : undefined });
   const panel = details(diagram, (node) => {
     const path = node === undefined ? undefined : run.graph.nodes[node]?.path;
     const took = path === undefined ? undefined : run.blocks[path];
     return took ? [html("p", { class: "took" }, `${short(took[0])} µs a firing, ${took[1]} firings`)] : [];
   });
   const scopes = html("div", { class: "scopes", tabindex: "0", role: "region", "aria-label": "Plots of the run" });
-  scopes.append(...[notes(run)].filter((part) => part !== null));
+  scopes.append(...[notes(run)].filter((part) => part !== null), key(run, beside));
   if (run.way) {
     const places = html("div", { class: "places" });
     const space = new Space(run, run.way, beside?.way ?? undefined);

@@ -89,7 +89,7 @@ export class Scope {
     const axis = { stroke: colour("grey"), grid: { stroke: colour("rule"), width: 0.5 }, ticks: { stroke: colour("rule"), size: 4 }, font: "11px system-ui" };
     const plot = new uPlot({
       width: Math.max(canvas.clientWidth, 120), height: HEIGHT, series, bands, scales: scale, padding: [6, 8, 0, 0],
-      axes: [{ ...axis, size: 26, gap: 2 }, { ...axis, size: 62, gap: 3, values: (_, splits) => splits.map(short) }],
+      axes: [{ ...axis, size: 26, gap: 2 }, { ...axis, size: 62, gap: 3, space: 26, values: (_, splits) => splits.map((y) => short(y)) }],
       legend: { show: false },
       cursor: { y: false, points: { show: false }, drag: { x: true, y: false }, sync: { key: "time", scales: ["x", null] } },
       hooks: {

@@ -79,13 +79,14 @@ export class Space {
     const box = geometry(this.path);
     box.computeBoundingSphere();
     const radius = Math.max(box.boundingSphere?.radius ?? 1, 1e-3), centre = box.boundingSphere?.center ?? new Vector3();
-    this.body.scale.setScalar(radius * 0.22);
+    this.body.scale.setScalar(radius * 0.3);
     scene.add(this.body);
     const step = 10 ** Math.floor(Math.log10(radius)), cells = Math.max(2, 2 * Math.ceil((1.3 * radius) / step));
     const grid = new GridHelper(cells * step, cells);
     box.computeBoundingBox();
+    grid.material.vertexColors = false;
     grid.position.set(centre.x, box.boundingBox?.min.y ?? 0, centre.z);
-    this.coloured.push([grid.material as unknown as { color: Color }, "rule"]);
+    this.coloured.push([grid.material, "rule"]);
     scene.add(grid);
     this.reading.dataset.grid = `grid of ${short(step)} ${way.unit}`;
     const cloud = run.watch?.cloud;

@@ -8,7 +8,7 @@ interface Wire { at: Float32Array; values: Float32Array; parts: Part[]; size: nu
 
 function partLine(part: Part, values: Float32Array): string {
   const unit = part.unit ? ` ${part.unit}` : "";
-  const numbers = Array.from(values, short);
+  const numbers = Array.from(values, (x) => short(x));
   if (part.way === "range") return `  ${part.name}: from ${numbers[0]} to ${numbers[1]}${unit}`;
   if (part.way === "deviation") return `  ${part.name}: roots of the diagonal ${numbers.join(", ")}`;
   return `  ${part.name}: ${numbers.join(", ")}${unit}`;
@@ -49,7 +49,7 @@ export class Watched {
     const age = now - at, fresh = age < 1e-5;
     const when = fresh ? `at ${now.toFixed(3)} s:` : `at ${now.toFixed(3)} s, from ${(1e3 * age).toPrecision(3)} ms before:`;
     const first = wire.parts[0];
-    const some = Array.from(values.subarray(0, Math.min(first?.size ?? 0, 3)), short).join(" ");
+    const some = Array.from(values.subarray(0, Math.min(first?.size ?? 0, 3)), (x) => short(x, 3)).join(" ");
     return { short: first?.way === "range" ? some.replace(" ", "…") : some, lines: [when, ...lines], fresh };
   };
 }
