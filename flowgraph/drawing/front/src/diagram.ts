@@ -214,11 +214,10 @@ export class Diagram {
 
   private boxOf(box: Box): SVGElement {
     const node = this.graph.nodes[box.node]!;
-    const words = [node.kind === "host" ? "block" : node.kind, node.path, node.block && `block ${node.block}`].filter(Boolean).join(", ");
-    const body = svg("g", { class: "body", role: "button", tabindex: "0", "aria-label": words, "data-key": node.path },
+    const body = svg("g", { class: "body", role: "button", tabindex: "0", "data-key": node.path },
       outline(node, box.width, box.height, this.down),
       box.chip && svg("rect", { class: "chip", x: box.chip.x, y: box.chip.y, width: box.chip.width, height: box.chip.height, rx: 4 }),
-      ...box.texts.map((t) => svg("text", { x: t.x, y: t.y, class: t.style, "text-anchor": t.anchor }, t.words)));
+      ...box.texts.flatMap((t) => [svg("text", { x: t.x, y: t.y, class: t.style, "text-anchor": t.anchor }, t.words), " "]));
     const select = () => this.select(box.node);
     body.addEventListener("click", select);
     body.addEventListener("keydown", (event) => {

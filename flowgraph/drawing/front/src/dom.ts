@@ -26,9 +26,9 @@ export function svg<K extends keyof SVGElementTagNameMap>(
   return element;
 }
 
-/** A button that says what it does to a reader and to a screen reader. */
+/** A button that says what it does to a reader and to a screen reader: a word is its own name, a sign is none. */
 export function button(label: string, title: string, act: () => void): HTMLButtonElement {
-  const made = html("button", { type: "button", title, "aria-label": title }, label);
+  const made = html("button", { type: "button", title, "aria-label": /[a-z]/i.test(label) ? undefined : title }, label);
   made.addEventListener("click", act);
   return made;
 }

@@ -94,7 +94,7 @@ export class Space {
       const places = unpack(cloud.places);
       this.cloud = { times: unpack(cloud.times), places, size: cloud.size, points: dots(places.subarray(0, 3 * cloud.size), "clock-3", 2.5) };
     }
-    camera.position.copy(centre).add(new Vector3(1.1, 0.9, 1.6).multiplyScalar(1.5 * radius));
+    camera.position.copy(centre).add(new Vector3(1.1, 0.9, 1.6).multiplyScalar(1.75 * radius));
     camera.near = radius / 200;
     camera.far = radius * 60;
     this.controls = new OrbitControls(camera, renderer.domElement);
