@@ -250,7 +250,8 @@ def _setting(value: Any) -> str:
         return array_words(value)
     if callable(value) and hasattr(value, "__name__"):
         return str(value.__name__)
-    return shorten(re.sub(r" at 0x[0-9a-f]+", "", repr(value)), LONGEST)
+    words = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+    return shorten(re.sub(r"\d+\.\d{6,}(e-?\d+)?", lambda m: f"{float(m[0]):.5g}", words), LONGEST)
 
 
 def source_words(block: Block[Any]) -> str:

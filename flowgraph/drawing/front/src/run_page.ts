@@ -155,5 +155,6 @@ const pick = html("div", { class: "tools" });
 if (runs.length > 1) pick.append(picker, other);
 pick.append(dom.themeButton());
 header.append(pick);
+time = Number(/[#&]t=([\d.]+)/.exec(location.hash)?.[1] ?? 0); // a link may name the time: run.html#t=2.5
 footer.append(html("div", { class: "time" }, play, slider, clock));
 void show();
