@@ -1,8 +1,8 @@
 """Pictures and reference tables of the site, made when it is built and kept out of the tree.
 
 `generated/NAME.svg` is the diagram of each installed graph, started on a simulated flight, and
-`generated/rooms.svg` that of the rooms of this package; `screens` makes interactive pages and
-takes pictures of them. The pages named in `RUN` are run as programs, and the pictures that they write are taken as they are.
+`generated/rooms.svg` that of the rooms of this package; `screens` makes interactive pages and takes pictures
+of them. The pages named in `RUN` are run as programs, and the pictures that they write are taken as they are.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The pages of the docs, and pictures of them as a person sees them, made when the site is built.
 
-The pictures are taken by Chromium without a window, 1,280 pixels wide. Where there is none, a picture says so: it
-is no part of what the build checks.
+The pictures are taken by Chromium without a window, 1,280 pixels wide. Where there is none, a picture says
+so: it is no part of what the build checks.
 """
 
 from __future__ import annotations
@@ -17,19 +17,21 @@ from typer.testing import CliRunner
 
 from flowgraph.cli import app
 
-PAGES: dict[str, tuple[list[str], str, bool]] = {
-    "page_rbpf_outdoor": (["show", "rbpf_outdoor", "-o"], "", False),
-    "page_run": (["run", "ins_eskf", "--data", "sim", "--set", "duration=6", "--html"], "#t=2", False),
+PAGES: dict[str, tuple[str, str, bool]] = {
+    "page_rbpf_outdoor": ("show rbpf_outdoor -o", "", False),
+    "page_run": ("run ins_eskf --data sim --set duration=6 --html", "#t=2", False),
     "page_run_dark": (
-        ["run", "rbpf_outdoor", "--data", "sim:thesis", "--set", "sensors=all", "--set", "duration=2", "--set",
-         "particles=60", "--html"], "#t=1", True,
+        "run rbpf_outdoor --data sim:thesis --set sensors=all --set duration=2 --set particles=60 --html",
+        "#t=1",
+        True,
     ),
-}  # fmt: skip
+}
 """By name: the command that writes the page, where it is opened, and whether it is dark."""
 
 _FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", "--window-size=1280,800",
-    "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--virtual-time-budget=5000",
+    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars",
+    "--window-size=1280,800", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--virtual-time-budget=5000",
 )  # fmt: skip
 
 
@@ -38,9 +40,9 @@ def screens() -> Iterator[tuple[str, bytes]]:
     with tempfile.TemporaryDirectory() as folder:
         for name, (command, where, dark) in PAGES.items():
             page = Path(folder) / f"{name}.html"
-            done = CliRunner().invoke(app, [*command, str(page)])
+            done = CliRunner().invoke(app, [*command.split(), str(page)])
             if done.exit_code:
-                raise RuntimeError(f"flowgraph {' '.join(command)}: {done.output}")
+                raise RuntimeError(f"flowgraph {command}: {done.output}")
             yield page.name, page.read_bytes()
             yield f"{name}.png", picture(page, where, dark)
 

@@ -97,8 +97,8 @@ def test_wheel_holds_real_files_under_one_name(wheel: Path) -> None:
         assert {n.rpartition("/")[2] for n in entries if n.startswith("flowgraph/drawing/pages/")} == set(
             parts
         )
-        for name in (f"flowgraph/drawing/pages/{part}" for part in parts):
-            assert archive.read(name) == (ROOT / name).read_bytes()
+        for place in (f"flowgraph/drawing/pages/{part}" for part in parts):
+            assert archive.read(place) == (ROOT / place).read_bytes()
         assert not [name for name in entries if "/front/" in name]
         assert any(name.endswith(".dist-info/licenses/LICENSE") for name in entries)
 

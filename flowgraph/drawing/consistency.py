@@ -69,7 +69,7 @@ def error_of(estimate: Series, truth: Series, field: str) -> np.ndarray | None:
     ):
         return None
     known = between(truth, field, estimate.time)
-    return np.deg2rad(turn_between(known, mine[0])) if field == "attitude" else mine[0] - known
+    return np.asarray(np.deg2rad(turn_between(known, mine[0])) if field == "attitude" else mine[0] - known)
 
 
 def nees(estimate: Series, truth: Series) -> tuple[np.ndarray, int] | None:
@@ -93,7 +93,7 @@ def nees(estimate: Series, truth: Series) -> tuple[np.ndarray, int] | None:
 def _squared(error: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Error^T P^-1 error; NaN where P has no inverse."""
     try:
-        return np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0])
+        return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]))
     except np.linalg.LinAlgError:
         one = [np.linalg.lstsq(p, e, rcond=None)[0] @ e if np.linalg.matrix_rank(p) == len(p) else np.nan
                for p, e in zip(P, error, strict=True)]  # fmt: skip

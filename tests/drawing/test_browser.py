@@ -1,7 +1,7 @@
 """The pages in a real browser: what a person sees when they unfold, search, point and move the slider.
 
-They need Chromium and its driver, and Selenium; what accessibility asks is asked by axe-core, which `make front`
-puts into out/front.
+They need Chromium and its driver, and Selenium; what accessibility asks is asked by axe-core, which
+`make front` puts into out/front.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
 from flowgraph.drawing.page import diagram_page
+from flowgraph.drawing.run_page import runs_of_page
 from flowgraph.engines.watched import simulate_watched
 from flowgraph.pipeline.costs.places import costs_by_path
 from tests.test_house import ROOT
@@ -175,8 +176,6 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Pat
         for title in ("the first", "the second") if name == "ins_eskf" else ("the only",):
             write_page(run, others, title, case, flight.truth, recorded, result, recorder, report)
             if title == "the first":
-                from flowgraph.drawing.run_page import runs_of_page
-
                 others = runs_of_page(run)
         made[name] = diagram, run, case, result
     return made
