@@ -76,6 +76,7 @@ export class Diagram {
     this.mark();
     this.refresh();
     this.host.dataset.drawn = String(turn);
+    document.body.dataset.drawnMs ??= performance.now().toFixed(1);
   }
 
   fit(): void {
