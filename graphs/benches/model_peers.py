@@ -127,13 +127,19 @@ def _filterpy_points(cubature: bool) -> Peer:
         moving, seeing = made(wide, go), made(t, lambda s, dt: s)
         moving.Q = np.zeros((wide, wide))
         flat = (lambda a: a[:, None]) if cubature else (lambda a: a)
-        seeing.x, seeing.P, seeing.R = flat(np.array(problem.start.mean)), np.array(problem.start.covariance), R
+        seeing.x, seeing.P, seeing.R = (
+            flat(np.array(problem.start.mean)),
+            np.array(problem.start.covariance),
+            R,
+        )
 
         def predict(u: Any) -> None:
             now[0] = u
             root = motion.noise_root(u, problem.step, np.float64, np)
             moving.x = flat(np.concatenate([np.ravel(seeing.x), np.zeros(wide - t)]))
-            moving.P = np.block([[seeing.P, np.zeros((t, wide - t))], [np.zeros((wide - t, t)), root @ root.T]])
+            moving.P = np.block(
+                [[seeing.P, np.zeros((t, wide - t))], [np.zeros((wide - t, t)), root @ root.T]]
+            )
             moving.predict()
             seeing.x, seeing.P = flat(np.ravel(moving.x)[:t]), moving.P[:t, :t].copy()
 

@@ -145,9 +145,7 @@ def _exact(
     return peer, float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off))) if len(off) > 1 else None
 
 
-def _peers(
-    which: str, name: str, made: Problem, run: Drawn, belief: Any
-) -> tuple[str | None, float | None]:
+def _peers(which: str, name: str, made: Problem, run: Drawn, belief: Any) -> tuple[str | None, float | None]:
     """Who has the same method, and how far the farthest is from ours on the first run."""
     there = [
         (peer, theirs)
