@@ -10,8 +10,8 @@ the first measurements come, where a large covariance loses as many as it has: w
 times that of a measurement, twelve. (Beyond ten million the covariance, which is given at every tick, can no
 longer be had of it.) A correction inverts a matrix of the size of the state, not of the measurement.
 
-Source: P. Maybeck, "Stochastic Models, Estimation, and Control", vol. 1, 1979, sec. 5.7; Y. Bar-Shalom, X. Li,
-T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, sec. 7.2.
+Source: P. Maybeck, "Stochastic Models, Estimation, and Control", vol. 1, 1979, sec. 5.7; Y. Bar-Shalom, X.
+Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, sec. 7.2.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def weigh_cloud(
 
 
 def weighed(cloud: Any, likely: Array, xp: Any) -> tuple[Any, Array]:
-    """The cloud with its weights multiplied by likelihoods (n), given by logarithms, and that of the whole."""
+    """The cloud with its weights multiplied by likelihoods (n, logarithms), and that of the whole."""
     log_weight = cloud.log_weight + likely
     whole = log_sum_exp(log_weight, xp=xp)
     return cloud.replace(log_weight=log_weight - whole), whole

@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Report, UnknownNameError, simulate
-from flowgraph.blocks.filtering import cubature, extended, linear, particles, unscented
+from flowgraph.blocks.filtering import (
+    cubature,
+    ensemble,
+    extended,
+    information,
+    linear,
+    particles,
+    rao_blackwellized,
+    square_root,
+    unscented,
+)
 from flowgraph.graphs.benches.model_peers import PEERS, volatility_log_likelihood
 from flowgraph.graphs.benches.model_problems import PROBLEMS, Drawn, Problem, declared, drawn
 from flowgraph.language.checks import need_count
@@ -24,12 +34,23 @@ METHODS: dict[str, Callable[[int], Any]] = {
     "linear": lambda n: linear(),
     "extended": lambda n: extended(),
     "iterated": lambda n: extended(iterations=3),
+    "square_root": lambda n: square_root(),
+    "information": lambda n: information(),
     "unscented": lambda n: unscented(),
     "cubature": lambda n: cubature(),
+    "ensemble": lambda n: ensemble(n),
     "bootstrap": lambda n: particles(n),
     "guided": lambda n: particles(n, proposal="guided"),
+    "auxiliary": lambda n: particles(n, proposal="auxiliary"),
+    "rao_blackwellized": lambda n: rao_blackwellized(max(n // 10, 2), linear="velocity"),
 }
-"""By name, given the number of particles."""
+"""By name, given the number of particles; at a Gaussian each there are a tenth of them."""
+
+SAMPLED = ("ensemble", "bootstrap", "guided", "auxiliary", "rao_blackwellized")
+"""Those that draw."""
+
+ONLY = {"linear": ("point",), "rao_blackwellized": ("point", "radar", "ranges", "turn")}
+"""Methods that need a model with linear parts, and the problems whose model has them."""
 
 
 def models(
@@ -45,9 +66,10 @@ def models(
 
     Args:
         problem: point, radar, ranges, turn, bicycle, pendulum, pose, volatility, or all.
-        method: linear, extended, iterated, unscented, cubature, bootstrap, guided, or all.
+        method: linear, extended, iterated, square_root, information, unscented, cubature, ensemble,
+            bootstrap, guided, auxiliary, rao_blackwellized, or all.
         runs: drawn from the model, over which errors are averaged.
-        particles: how many.
+        particles: how many; so many members has an ensemble.
         engine: that runs the filters.
         seed: of the first run; the next has the next.
 
@@ -75,7 +97,7 @@ def models(
         some = [drawn(made, seed + k) for k in range(runs)]
         declaration = declared(made)
         for name in METHODS if method == "all" else (method,):
-            if name == "linear" and not made.linear:
+            if which not in ONLY.get(name, PROBLEMS):
                 continue
             rows.append(_row(which, name, made, declaration, some, particles, engine, seed))
     notes = [f"{runs} runs a row, drawn from the model; {particles} particles"]

@@ -151,6 +151,7 @@ def test_a_bank_without_transitions_is_that_of_filterpy():
     assert (np.abs(found - means) / np.maximum(1.0, np.abs(means))).max() < 1e-12
 
 
+@pytest.mark.filterwarnings("ignore:divide by zero encountered in log")
 def test_a_motion_that_lost_does_no_harm():
     """Its weight is zero after a while, and the bank is the filter of the other."""
     wild = DiscreteModel(F, 1e12 * Q + 1e-6 * np.eye(6))

