@@ -7,6 +7,7 @@ of those that believe in a Gaussian. Everything that a user's own filter needs i
 
 from __future__ import annotations
 
+from flowgraph.blocks.filtering.ageing import AgedMotion, Ageing, doubt_control
 from flowgraph.blocks.filtering.banks import Interacting, imm, mmae
 from flowgraph.blocks.filtering.ensembles import Ensemble, carry_ensemble, correct_ensemble, ensemble
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
@@ -76,6 +77,9 @@ __all__ = [
     "Gaussian",
     "filtered",
     "first",
+    "Ageing",
+    "AgedMotion",
+    "doubt_control",
     "FirstMeasurement",
     "linear",
     "extended",

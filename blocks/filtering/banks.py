@@ -13,8 +13,8 @@ mean and covariance. Over no time nothing goes over.
 
 Source: D. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10(4), 1965
 (independent filters); H. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for systems with
-Markovian switching coefficients", IEEE TAC 33(8), 1988; Y. Bar-Shalom et al., "Estimation with Applications to Tracking
-and Navigation", 2001, sec. 11.6.6.
+Markovian switching coefficients", IEEE TAC 33(8), 1988; Y. Bar-Shalom et al., "Estimation with Applications
+to Tracking and Navigation", 2001, sec. 11.6.6.
 """
 
 from __future__ import annotations

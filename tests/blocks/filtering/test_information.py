@@ -21,7 +21,7 @@ def test_it_is_the_extended_filter_of_a_car():
 
 @pytest.mark.parametrize("deviation", [1e4, 1e6])
 def test_of_a_start_of_which_nothing_is_known_no_digit_is_lost(deviation):
-    """The belief is the least-squares fit to all measurements: of a covariance of 1e12 few digits are left."""
+    """The belief is the least-squares fit to all measurements: of a covariance of 1e12 few are left."""
     inputs = spots(12)
     nothing = POINT.space.gaussian(position=((5.0, -3.0), deviation), velocity=((1.0, 1.0), deviation))
     # the same by least squares, in the state at the first time and the noises of the steps
