@@ -23,11 +23,10 @@ import numpy as np
 from flowgraph import Array, Signal, block, real
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.lost import Held, aged
-from flowgraph.blocks.signals import vector_of
 from flowgraph.blocks.statespace import Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.recorder.derivatives import jacobian
-from flowgraph.types import ArrayType, Type, flatten, leaves_of, type_of, unflatten
+from flowgraph.types import Type, flatten, leaves_of, type_of, unflatten
 
 __all__ = ["Ageing", "AgedMotion", "doubt_control"]
 

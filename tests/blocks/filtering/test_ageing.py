@@ -112,7 +112,7 @@ def test_nothing_changes_while_controls_come(method, apart):
 
 @pytest.mark.parametrize("engines", [both_quick, pytest.param(all_engines, marks=pytest.mark.slow)])
 def test_a_gap_of_the_steering_is_doubted_in_the_engines(engines):
-    """After two seconds without steering the filter is less sure, and honest: what it is off by is expected."""
+    """After two seconds without steering the filter is less sure, and honest."""
     states, flown = driven(6.0)
     steering = flown["steering"]
     keep = (steering.time < 2000 * MS) | (steering.time >= 4000 * MS)
