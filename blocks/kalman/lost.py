@@ -165,7 +165,7 @@ def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, m
     the motion is then that which was measured. A measurement that passes ends the run.
 
     Args:
-        posterior: any belief with a `covariance`, or its `root`, after the correction.
+        posterior: any belief with a `covariance`, its `root` or `information`, after the correction.
         innovation: of that correction, where there was one.
         patience: how many refusals in a row are taken for outliers.
         moving: how many numbers of the covariance, from the first on, may have lost track.
@@ -174,8 +174,8 @@ def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, m
     """
     if innovation is None:
         return state, posterior
-    on_root = "root" in posterior._fields
-    P = posterior.root if on_root else posterior.covariance
+    on_root, inverse = "root" in posterior._fields, "information" in posterior._fields
+    P = posterior.root if on_root else posterior.information if inverse else posterior.covariance
     refused = 1.0 - xp.astype(innovation.accepted, P.dtype)
     count = (state + refused) * refused
     lost = xp.astype(count > float(patience), P.dtype)
@@ -184,6 +184,8 @@ def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, m
     scale = 1.0 + 3.0 * xp.asarray(moved, dtype=P.dtype) * lost
     if on_root:
         return count, posterior.replace(root=P * scale[..., :, None])
+    if inverse:
+        return count, posterior.replace(information=P / scale[..., :, None] / scale[..., None, :])
     return count, _with(posterior, P * scale[..., :, None] * scale[..., None, :])
 
 
