@@ -235,7 +235,7 @@ def find_back(  # type: ignore[no-untyped-def]
     which nothing is known, everything else as `REACH`.
 
     Args:
-        posterior: any belief with a `covariance`, or its `root`, after the correction.
+        posterior: any belief with a `covariance`, its `root` or `information`, after the correction.
         innovation: of that correction, where there was one.
         patience: how many refusals in a row are taken for outliers.
         moving: how many numbers of the covariance, from the first on, may have lost track; or from which on
@@ -248,14 +248,14 @@ def find_back(  # type: ignore[no-untyped-def]
     """
     if innovation is None:
         return state, posterior
-    on_root = "root" in posterior._fields
-    kept = posterior.root if on_root else posterior.covariance
+    on_root, inverse = "root" in posterior._fields, "information" in posterior._fields
+    kept = posterior.root if on_root else posterior.information if inverse else posterior.covariance
     kind, n = kept.dtype, kept.shape[-1]
     count, lost, grow = in_doubt(
         state, innovation.accepted, innovation.nis, innovation.parts, patience=float(patience), xp=xp
     )
-    P = kept @ kept.mT if on_root else kept
     one = xp.eye(n, dtype=kind)
+    P = kept @ kept.mT if on_root else xp.linalg.solve(kept, one) if inverse else kept
     variance = xp.sum(P * one, axis=-1)
     wide = lost_variances(variance, grow, moving=moving, attitude=attitude, shown=shown, xp=xp)
     inside = _inside(n, moving)
@@ -264,6 +264,8 @@ def find_back(  # type: ignore[no-untyped-def]
     lost = lost[..., None, None]
     if on_root:
         return count, posterior.replace(root=xp.where(lost, covariance_root(doubted, xp=xp), kept))
+    if inverse:
+        return count, posterior.replace(information=xp.where(lost, xp.linalg.solve(doubted, one), kept))
     return count, _with(posterior, xp.where(lost, doubted, P))
 
 
