@@ -4,13 +4,15 @@
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open. `smoothing` goes back over a run and adds to each
-state what later measurements say of it; `backward` is that as a graph. What moves and what is measured is not said here: see `models`.
+state what later measurements say of it; `backward` is that as a graph. What moves and what is measured is
+not said here: see `models`.
 """
 
 from __future__ import annotations
 
 from flowgraph.blocks.kalman.backward import (
     backwards,
+    collect_steps,
     cross_covariance,
     forwards,
     go_back,
@@ -75,6 +77,7 @@ __all__ = [
     "smoothing_pass",
     "steps_of",
     "backwards",
+    "collect_steps",
     "cross_covariance",
     "forwards",
     "go_back",

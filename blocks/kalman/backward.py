@@ -3,8 +3,8 @@
     filter       tick after tick: the belief, its prior, and the covariance of both with the tick before
     smoother     the same ticks in reverse: each is smoothed by the one that came after it
 
-`cross_covariance` stands beside a filter's prediction and gives what a smoother needs of it. `backwards` turns
-a collected run into the tape of `smoother`, which any engine plays, and `forwards` turns what it gives.
+`cross_covariance` stands beside a filter's prediction and gives what a smoother needs of it. `backwards`
+turns a collected run into the tape of `smoother`, which any engine plays, and `forwards` turns what it gives.
 
     steps = backwards(result["prior"], result["posterior"], result["cross"])
     played = simulate(smoother.build(space=CAR, sizes=sizes_of(CAR)), {"step": steps}, engine="c")
@@ -20,12 +20,22 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series, Stream, block, delay, graph
+from flowgraph import Array, Series, Stream, block, collect, delay, graph
 from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.kalman.smoothing import gone_back, smoother_gain
 from flowgraph.blocks.signals import CrossCovariance, FilterStep, SmoothedBelief
 
-__all__ = ["backwards", "cross_covariance", "forwards", "go_back", "sizes_of", "smoother"]
+__all__ = [
+    "Crossing",
+    "backwards",
+    "collect_steps",
+    "cross_covariance",
+    "forwards",
+    "go_back",
+    "sizes_of",
+    "smoother",
+]
 
 Crossing = Callable[[Any, Any, Any, Any], Array]
 """`(belief, control, dt, xp)`: the covariance (t, t) of a belief and what is predicted of it."""
@@ -47,6 +57,28 @@ def cross_covariance(
     if longest is not None:
         found = xp.where(dt > longest, belief.covariance, found)
     return CrossCovariance(covariance=found)
+
+
+def collect_steps(
+    belief: Any, prior: Any, control: Any, *, crossing: Crossing, held: Held | None = None, at: Any = None
+) -> None:
+    """Collect the `prior`, `cross` and `control` of each tick for a smoother, in a graph that is being wired.
+
+    Args:
+        belief: that was predicted.
+        prior: that came of it, before measurements.
+        control: that drove the step.
+        crossing: as in `cross_covariance`.
+        held: as in `bridged`.
+        at: when to fire, where all else is held.
+    """
+    more = {} if at is None else {"at": at}
+    longest = None if held is None else held.longest
+    collect(prior, "prior")
+    collect(
+        cross_covariance(belief, control, crossing=crossing, longest=longest, name="cross", **more), "cross"
+    )
+    collect(control, "control")
 
 
 @block

@@ -135,7 +135,8 @@ def smoothing_pass(
 
     Args:
         gains: C (n - 1, ..., t, t).
-        prior, prior_P, mean, P: of each tick (n, ..., size) and (n, ..., t, t), before and after measurements.
+        prior, prior_P, mean, P: of each tick (n, ..., size) and (n, ..., t, t), before and after its
+            measurements.
         space: of the state; None: a vector.
     """
     mean, P, lag_one = mean.copy(), P.copy(), np.zeros(P.shape)

@@ -53,8 +53,8 @@ class Bank(Signal):
 
 
 class CrossCovariance(Signal):
-    """What a belief and what was predicted of it have in common: covariance[i, j] of the error i of the belief
-    before a step and the error j of the prediction after it. Of a linear prediction it is P F^T."""
+    """What a belief and what was predicted of it have in common: the covariance of the errors of the belief
+    before a step (rows) and of the prediction after it (columns). Of a linear prediction it is P F^T."""
 
     covariance: Array = real("t", "t")
 

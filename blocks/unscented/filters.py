@@ -12,8 +12,8 @@ exact numbers, and stays positive in single precision.
 
 Source: E. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000;
 on manifolds C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound
-state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; for smoothing
-S. Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE TAC 53(3), 2008.
+state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; of smoothing S.
+Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE TAC 53(3), 2008.
 """
 
 from __future__ import annotations
@@ -141,9 +141,7 @@ def unscented_crossing(
     def crossing(belief: Gaussian, control: Any, dt: Any, xp: Any) -> Array:
         shaken = _shaken(noise, dt, belief.mean.dtype, xp)
         carry = lambda x, w: move(x, control, w, dt, xp)
-        return motion_cross(
-            belief.mean, belief.covariance, carry, shaken, space=space, points=points, xp=xp
-        )
+        return motion_cross(belief.mean, belief.covariance, carry, shaken, space=space, points=points, xp=xp)
 
     return crossing
 
