@@ -12,7 +12,7 @@ exact numbers, and stays positive in single precision.
 
 Source: E. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000;
 on manifolds C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound
-state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; of smoothing S.
+state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; S.
 Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE TAC 53(3), 2008.
 """
 
