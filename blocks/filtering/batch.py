@@ -1,7 +1,7 @@
 """The batch estimate: the most likely trajectory of a whole recording, from the model of the filter.
 
-A smoother goes back over a run whose model was linearised where the filter was, once. A batch estimate has all
-measurements at hand and linearises where the estimate is, until it stays there: it minimises
+A smoother goes back over a run whose model was linearised where the filter was, once. A batch estimate has
+all measurements at hand and linearises where the estimate is, until it stays there: it minimises
 
     |x_0 minus m|^2_P0 + sum |x_k+1 minus move(x_k)|^2_Q + sum rho(|z_k minus h(x_k)|_R)
 
@@ -16,15 +16,15 @@ With a robust `Loss` a measurement far off counts less, by weights that are foun
 two pipelines: `linearised` forward, `kalman.backward.smoother` back; the forward one is played by an engine.
 
 Sources: B. Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optimization 4(3), 1994;
-P. Huber, "Robust Statistics", 1981; Z. Zhang, "Parameter estimation techniques: a tutorial with application to
-conic fitting", Image and Vision Computing 15, 1997 (the losses and their widths).
+P. Huber, "Robust Statistics", 1981; Z. Zhang, "Parameter estimation techniques: a tutorial with application
+to conic fitting", Image and Vision Computing 15, 1997 (the losses and their widths).
 """
 
 from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -46,7 +46,7 @@ from flowgraph.language.clock import Source, clock_of
 from flowgraph.language.graph import SourceNode, Wire
 from flowgraph.types import Type, zeros
 
-__all__ = ["LOSSES", "Aged", "Derived", "Loss", "cauchy", "estimate_batch", "huber", "loss_of"]
+__all__ = ["LOSSES", "Aged", "Derived", "Loss", "Recording", "cauchy", "estimate_batch", "huber", "loss_of"]
 
 LOSSES = ("none", "huber", "cauchy")
 """What a measurement that is far off counts."""
@@ -138,6 +138,36 @@ class Aged(NamedTuple):
     control: Series
     held: Held
     places: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a filter was given, for a batch estimate of it: `recording(around, loss)` makes it.
+
+    Args:
+        motion, measurements, start, longest, aged: as for `estimate_batch`.
+        drive: `drive(time)`, the control of the step to each of these times (n,); None for a motion that has
+            none.
+    """
+
+    motion: Moves
+    measurements: Mapping[Measurement, Series]
+    start: Gaussian
+    drive: Callable[[np.ndarray], Series] | None = None
+    longest: float | None = None
+    aged: Aged | None = None
+
+    def __call__(self, around: Series, loss: Loss | None = None) -> Series:
+        """The batch estimate.
+
+        Args:
+            around: the trajectory to begin with, at the ticks of the filter.
+            loss: as for `estimate_batch`.
+        """
+        return estimate_batch(
+            self.motion, self.measurements, start=self.start, around=around, loss=loss,
+            control=None if self.drive is None else self.drive(around.time), longest=self.longest, aged=self.aged,
+        )  # fmt: skip
 
 
 @block
@@ -247,7 +277,9 @@ def linearised(
         before = delay(np.asarray(start.mean, dtype=float), name="before")
         now = latest(nominal, init=np.asarray(start.mean, dtype=float), at=ticks, name="now")
         held = None if drive is None else latest(drive, init=zeros(drive.type), at=ticks, name="drive")
-        prior, cross = predict_about(belief, before, now, held, motion=motion, longest=longest, name="predict")
+        prior, cross = predict_about(
+            belief, before, now, held, motion=motion, longest=longest, name="predict"
+        )
         if aged is not None:
             prior = bridge(prior, fresh, held=aged.held, **aged.places)
         posterior = prior

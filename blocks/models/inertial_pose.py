@@ -31,6 +31,7 @@ __all__ = [
     "inertial_motion",
     "inertial_steps",
     "pose_seen",
+    "stacked",
 ]
 
 INERTIAL = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion())
@@ -106,15 +107,14 @@ def inertial_crossing(belief: Belief, imu: Imu, dt: Any, xp: Any) -> Array:
 
 def inertial_steps(result: Result) -> Steps:
     """Those of a run of `ins_eskf` that was wired for a smoother; over `INERTIAL_BIASED`."""
-    prior, posterior = (_stacked(result[name]) for name in ("prior", "belief"))
+    prior, posterior = (Series(s.time, stacked(s.values)) for s in (result["prior"], result["belief"]))
     return Steps(prior, posterior, result["cross"], INERTIAL_BIASED, _beliefs)
 
 
-def _stacked(series: Series) -> Series:
-    """A series of `Belief` as `Gaussian` over `INERTIAL_BIASED`."""
-    parts = ("position", "velocity", "attitude", "gyro_bias", "accelerometer_bias")
-    mean = np.concatenate([series[part] for part in parts], axis=-1)
-    return Series(series.time, Gaussian(mean=mean, covariance=series["covariance"]), name=series.name)
+def stacked(belief: Belief) -> Gaussian:
+    """A belief, or one at each tick, over `INERTIAL_BIASED`."""
+    mean = np.concatenate([getattr(belief, part) for part in INERTIAL_BIASED.names], axis=-1)
+    return Gaussian(mean=mean, covariance=np.asarray(belief.covariance))
 
 
 def _beliefs(smoothed: Series) -> Series:

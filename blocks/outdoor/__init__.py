@@ -12,11 +12,13 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
     predict_clone,
     start_outdoor,
 )
@@ -41,6 +43,8 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "clone_crossing",
+    "outdoor_steps",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",
