@@ -166,7 +166,8 @@ class Recording:
         """
         return estimate_batch(
             self.motion, self.measurements, start=self.start, around=around, loss=loss,
-            control=None if self.drive is None else self.drive(around.time), longest=self.longest, aged=self.aged,
+            control=None if self.drive is None else self.drive(around.time),
+            longest=self.longest, aged=self.aged,
         )  # fmt: skip
 
 

@@ -148,8 +148,13 @@ def smoothing_pass(
 
 
 def smoother_gain(cross: Array, ahead_P: Array, xp: Any) -> Array:
-    """C = cross ahead_P^-1 (..., t, t): how much of what is learnt of the next tick comes back."""
-    return xp.linalg.solve(ahead_P, cross.mT).mT
+    """C = cross ahead_P^-1 (..., t, t): how much of what is learnt of the next tick comes back.
+
+    Of a number that is known exactly, whose variance is 0, nothing can be learnt, and its column is 0.
+    """
+    one = xp.eye(ahead_P.shape[-1], dtype=ahead_P.dtype)
+    exact = xp.astype(xp.sum(ahead_P * one, axis=-1) == 0.0, ahead_P.dtype)
+    return xp.linalg.solve(ahead_P + one * exact[..., None], cross.mT).mT
 
 
 def gone_back(

@@ -1,4 +1,4 @@
-"""What the filters of a pose were given, as a batch estimate takes it: motion, measurements, and every reading.
+"""What the filters of a pose were given, as a batch estimate takes it: motion, measurements, all readings.
 
 The motion and its noise are those of the filters' own prediction; a measurement is seen as they see it. But a
 filter drives its step with the readings that it has by then, and a batch has them all: it takes a reading of

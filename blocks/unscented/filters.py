@@ -130,7 +130,7 @@ def motion_cross(
 
 
 def unscented_crossing(
-    move: Callable[..., Array], noise: npt.ArrayLike, space: StateSpace, points: SigmaPoints
+    move: Callable[..., Array], noise: npt.ArrayLike | None, space: StateSpace | None, points: SigmaPoints
 ) -> Callable[..., Array]:
     """What `cross_covariance` asks of a filter that predicts with `predict_unscented`.
 
@@ -139,7 +139,7 @@ def unscented_crossing(
     """
 
     def crossing(belief: Gaussian, control: Any, dt: Any, xp: Any) -> Array:
-        shaken = _shaken(noise, dt, belief.mean.dtype, xp)
+        shaken = None if noise is None else _shaken(noise, dt, belief.mean.dtype, xp)
         carry = lambda x, w: move(x, control, w, dt, xp)
         return motion_cross(belief.mean, belief.covariance, carry, shaken, space=space, points=points, xp=xp)
 
