@@ -9,7 +9,7 @@ by Gauss-Newton. Each round is a Kalman filter and a Rauch-Tung-Striebel smoothe
 the trajectory of the round before, which solves the round's normal equations exactly (Bell 1994), in time
 linear in the length, and without the inverse of Q, which may be singular:
 
-    error of a prediction   d + F' e      d = move(x_k) minus x_k+1, F' the derivative about x_k+1
+    error of a prediction   d + F' e      d = move(x_k) minus x_k+1, F' the derivative about both
     residual                z minus h(x) - H e, with R over the weight that the loss gives
 
 With a robust `Loss` a measurement far off counts less, by weights that are found anew each round. A round is
@@ -44,6 +44,7 @@ from flowgraph.errors import DataError, DeclarationError, MissingDependencyError
 from flowgraph.language.builder import Builder, building
 from flowgraph.language.clock import Source, clock_of
 from flowgraph.language.graph import SourceNode, Wire
+from flowgraph.recorder.derivatives import jacobian
 from flowgraph.types import Type, zeros
 
 __all__ = ["LOSSES", "Aged", "Derived", "Loss", "Recording", "cauchy", "estimate_batch", "huber", "loss_of"]
@@ -178,13 +179,15 @@ def predict_about(
 ) -> tuple[Gaussian, CrossCovariance]:  # fmt: skip
     """The error about a trajectory after `dt` seconds, and its covariance with that before.
 
-        e' = d + F' e      d = move(before) minus now      P' = F' P F'^T + Q'
+        w = (now plus e') minus (move(before) plus F e), linearised, d + A e' + B F e, is noise of N(0, Q)
 
-    F' and Q' are F and Q in the tangent space at `now`. With dt = 0, as at the first firing, what is known of
-    the start is brought there.
+        e' = -A^-1 (d + B F e)      P' = F' P F'^T + A^-1 Q A^-T      F' = -A^-1 B F
+
+    A and B are derivatives of minus and plus; of a vector 1 and -1. With dt = 0, as at the first firing, what
+    is known of the start stands in place of the noise.
 
     Args:
-        belief: of the error about `before`: mean and covariance (t, t).
+        belief: of the error about `before`: mean and covariance (t, t); at first that of the start.
         before, now: the trajectory at the tick before, and at this one.
         control: as the motion takes it.
         motion: how the state moves.
@@ -197,11 +200,20 @@ def predict_about(
         moves = xp.asarray(dt, dtype=kind) <= longest
         after, Q = xp.where(moves, after, before), xp.where(moves, Q, 0.0)
         F = xp.where(moves, F, xp.eye(t, dtype=kind))
-    d = space.minus(after, now, xp)
-    turn = space.reset(-d, xp)
-    F, Q = (F, Q) if turn is None else (turn @ F, turn @ Q @ turn.mT)
+    first = xp.asarray(dt, dtype=kind) <= 0.0  # the start is where the noise of a first step would lead
+    F, Q = xp.where(first, 0.0, F), xp.where(first, belief.covariance, Q)
+    left = (F @ belief.mean[..., None])[..., 0]
+    if _curved(space, kind, xp):
+        still = xp.zeros((t,), dtype=kind)
+        d, A = jacobian(lambda e, xp: space.minus(space.plus(now, e, xp), after, xp), still, xp)
+        B = jacobian(lambda e, xp: space.minus(now, space.plus(after, e, xp), xp), still, xp)[1]
+        columns = [B @ F, Q, ((B @ left[..., None])[..., 0] + d)[..., None]]
+        solved = xp.linalg.solve(A, xp.concat(columns, axis=-1))
+        F, mean = -solved[..., :t], -solved[..., -1]
+        Q = xp.linalg.solve(A, solved[..., t : 2 * t].mT)
+    else:
+        mean = left - space.minus(now, after, xp)
     P = F @ belief.covariance @ F.mT + Q
-    mean = d + (F @ belief.mean[..., None])[..., 0]
     cross = CrossCovariance(covariance=belief.covariance @ F.mT)
     return Gaussian(mean=mean, covariance=0.5 * (P + P.mT)), cross
 
@@ -229,8 +241,10 @@ def correct_about(
     present = ~xp.isnan(apart)
     residual = xp.where(present, apart, 0.0)
     seen = measurement.measured_space
-    turn = None if seen is None else seen.reset(residual, xp)
-    H = H if turn is None else turn @ H
+    if seen is not None and _curved(seen, now.dtype, xp):
+        known = xp.where(xp.any(~present), z, measurement.vector(message, xp))  # a NaN has no derivative
+        far = lambda e, xp: seen.minus(known, seen.plus(z, e, xp), xp)
+        H = -jacobian(far, xp.zeros((seen.tangent,), dtype=now.dtype), xp)[1] @ H
     if loss is not None:
         _, noise = masked(H, R, present, xp)
         square = residual @ xp.linalg.solve(noise, residual[..., None])[..., 0]
@@ -239,6 +253,11 @@ def correct_about(
     left = xp.where(present, residual - (H @ prior.mean[..., None])[..., 0], 0.0)
     found = correct_jointly(prior.covariance, left, H, R, present=present, xp=xp)
     return Gaussian(mean=prior.mean + found.shift, covariance=found.covariance)
+
+
+def _curved(space: StateSpace, kind: Any, xp: Any) -> bool:
+    """Whether plus and minus turn small errors."""
+    return space.reset(xp.zeros((space.tangent,), dtype=kind), xp) is not None
 
 
 def linearised(
