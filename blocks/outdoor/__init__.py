@@ -19,6 +19,7 @@ from flowgraph.blocks.outdoor.belief import (
     observe_flow,
     outdoor_pose,
     outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
@@ -45,6 +46,7 @@ from flowgraph.blocks.outdoor.flight import (
 __all__ = [
     "clone_crossing",
     "outdoor_steps",
+    "picture_cross",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",
