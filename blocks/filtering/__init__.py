@@ -52,6 +52,7 @@ from flowgraph.blocks.filtering.particles import (
     resample_cloud,
     weigh_cloud,
 )
+from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel, smooth
 from flowgraph.blocks.signals import Gaussian
@@ -89,6 +90,8 @@ __all__ = [
     "first",
     "FirstMeasurement",
     "smooth",
+    "backward_simulation",
+    "smoothed_cloud",
     "estimate_batch",
     "Loss",
     "huber",
