@@ -30,8 +30,10 @@ def test_a_run_is_smoothed_by_a_setting(name):
     case = made(name, smooth="rts", lag=0.4)
     score = scored(case)
     assert score["position_rmse_m"] == scored(plain)["position_rmse_m"]  # the filter is as it was
-    assert score["smoothed_position_rmse_m"] < 0.95 * score["position_rmse_m"]
-    assert score["smoothed_position_rmse_m"] < score["lagged_position_rmse_m"] < score["position_rmse_m"]
+    assert score["smoothed_position_rmse_m"] < score["position_rmse_m"]
+    assert score["smoothed_position_rmse_m"] < 1.01 * score["lagged_position_rmse_m"]
+    if name != "outdoor_eskf":  # whose receivers all err alike over a short flight
+        assert score["smoothed_position_rmse_m"] < 0.85 * score["position_rmse_m"]
     if name != "tracker":
         assert score["smoothed_attitude_rmse_deg"] < 1.1 * score["attitude_rmse_deg"]
         assert {"smoothed_tilt_rmse_deg", "smoothed_heading_rmse_deg"} <= set(score)
@@ -80,6 +82,8 @@ def test_what_has_no_batch_says_so():
         made("outdoor_eskf", smooth="batch")
     with pytest.raises(DeclarationError, match="no smoother that goes back"):
         made("tracker", smooth="rts", method="imm")
+    with pytest.raises(DeclarationError, match=r"particles have no smoother[\s\S]*smoothed_cloud"):
+        made("tracker", lag=0.5, method="particles")
 
 
 @pytest.mark.slow
