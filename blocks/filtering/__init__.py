@@ -9,6 +9,17 @@ from __future__ import annotations
 
 from flowgraph.blocks.filtering.ageing import AgedMotion, Ageing, doubt_control
 from flowgraph.blocks.filtering.banks import Interacting, imm, mmae
+from flowgraph.blocks.filtering.batch import (
+    LOSSES,
+    Aged,
+    Derived,
+    Loss,
+    Recording,
+    cauchy,
+    estimate_batch,
+    huber,
+    loss_of,
+)
 from flowgraph.blocks.filtering.ensembles import Ensemble, carry_ensemble, correct_ensemble, ensemble
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
@@ -31,6 +42,7 @@ from flowgraph.blocks.filtering.methods import (
     Method,
     Seen,
     correct,
+    crossed,
     cubature,
     extended,
     linear,
@@ -46,10 +58,11 @@ from flowgraph.blocks.filtering.proposals import (
     guide_cloud,
     propose_cloud,
 )
+from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
 from flowgraph.blocks.filtering.towards import find_cloud_back
 from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.kalman import LinearModel
+from flowgraph.blocks.kalman import LinearModel, smooth
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.statespace import (
     DiscreteModel,
@@ -61,6 +74,12 @@ from flowgraph.blocks.statespace import (
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
+    "crossed",
+    "loss_of",
+    "Recording",
+    "Derived",
+    "Aged",
+    "LOSSES",
     "StateSpace",
     "euclidean",
     "angle",
@@ -81,6 +100,13 @@ __all__ = [
     "AgedMotion",
     "doubt_control",
     "FirstMeasurement",
+    "smooth",
+    "backward_simulation",
+    "smoothed_cloud",
+    "estimate_batch",
+    "Loss",
+    "huber",
+    "cauchy",
     "linear",
     "extended",
     "information",
