@@ -45,3 +45,5 @@ def test_what_cannot_be_is_refused():
         a_case(method="kalman")
     with pytest.raises(DataError, match="position"):
         tracker.case(load_flight("sim", settings={"duration": "1"}))
+    with pytest.raises(DataError, match=r"sim:thesis: position[\s\S]*of 3"):
+        tracker.case(load_flight("sim:thesis", settings={"duration": "1", "sensors": "position"}))
