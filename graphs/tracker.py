@@ -88,7 +88,8 @@ def for_flight(
         position_noise: standard deviation in m; the flight's own if left out.
 
     Raises:
-        DataError: where the flight lacks the stream, or is not in a plane; DeclarationError: for a setting that is out of range.
+        DataError: where the flight lacks the stream, or is not in a plane.
+        DeclarationError: for a setting that is out of range.
     """
     motion = constant_velocity(wander)
     chosen = {
@@ -104,7 +105,8 @@ def for_flight(
     if first.shape != (2,):
         raise DataError(
             "the tracker follows a point in a plane", path=f"{on.flight.name}: position",
-            expected="positions of two numbers", got=f"of {len(first)}", fix="choose a flight such as sim:plane",
+            expected="positions of two numbers", got=f"of {len(first)}",
+            fix="choose a flight such as sim:plane",
         )  # fmt: skip
     return on.case(
         scored.score(on, plane_errors),
