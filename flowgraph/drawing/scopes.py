@@ -18,7 +18,7 @@ from flowgraph.data.result import Result
 from flowgraph.data.series import Series
 from flowgraph.drawing.angles import NAMES, between, euler_angles, euler_variances
 from flowgraph.drawing.canvas import SETTLING, deviation
-from flowgraph.drawing.consistency import FAR, bounds, covariance_of, error_of, nees
+from flowgraph.drawing.consistency import bounds, covariance_of, error_of, is_far, nees
 from flowgraph.drawing.fields import STATES, components, find, unit_words
 from flowgraph.drawing.recorder import packed
 from flowgraph.types import leaves_of
@@ -170,14 +170,14 @@ class Scopes:
         low, high = bounds(max(typical, 1))
         inside = float(np.mean((value[known] >= low) & (value[known] <= high)))
         words = f"mean {mean:.3g} of 1 per number, {100 * inside:.0f} % inside (95 % is right)"
-        if not 1 / FAR < mean < FAR:
+        wrong = is_far(mean, float(degrees[known].sum()))
+        if wrong:
             self.notes.append(
                 note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
             )
         lines = {"value": np.where(known, value, np.nan), "expected": degrees}
         panel = self._panel("Consistency", title, "", time, lines, None, dots=dots)
         top = max(2.5 * high, float(np.quantile(value[known], 0.99)))
-        wrong = not 1 / FAR < mean < FAR
         panel |= {"range": [0.0, top], "whole": None, "words": words, "bounds": [low, high], "wrong": wrong}
         yield panel
 
