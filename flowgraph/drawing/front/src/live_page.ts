@@ -60,8 +60,8 @@ function plots(): void {
 
 function plot(host: HTMLElement, size: number): uPlot {
   const axis = { stroke: () => colour("grey"), grid: { stroke: () => colour("rule"), width: 0.5 }, font: "11px system-ui" };
-  const series: uPlot.Series[] = [{}];
-  for (let k = 0; k < size; k++) series.push({ stroke: () => colour(`clock-${k}`), width: 1.2, points: { show: false } });
+  const series: uPlot.Series[] = [{}], paths = uPlot.paths.stepped!({ align: 1 }); // a value holds until the next
+  for (let k = 0; k < size; k++) series.push({ stroke: () => colour(`clock-${k}`), width: 1.2, paths, points: { show: false } });
   const made = new uPlot({
     width: Math.max(host.clientWidth, 300), height: HEIGHT, series, legend: { show: false }, scales: { x: { time: false } },
     axes: [{ ...axis, size: 26 }, { ...axis, size: 56, space: 26 }], cursor: { show: false },
