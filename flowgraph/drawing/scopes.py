@@ -26,6 +26,9 @@ from flowgraph.types import leaves_of
 POINTS = 6000
 """Of a line, at most: more than a screen has pixels."""
 
+WIDER = 3.0
+"""A start that makes a scale wider than this by factors is left out of it."""
+
 _FIELDS = (*STATES, "rate")
 _DEGREES = {"attitude": ("deg", np.rad2deg(1.0))}
 _SMALL = 6
@@ -254,6 +257,8 @@ def _scale(time: np.ndarray, lines: Sequence[np.ndarray], ends: Sequence[np.ndar
     begun, whole = _range(lines), _range(ends)
     if late is None or own is None or begun is None or whole is None:
         return {"range": [0.0, 1.0], "words": f"none of {len(time)} values is finite"}
+    if begun[1] - begun[0] <= WIDER * (late[1] - late[0]):  # the start hides nothing
+        late, own = (min(late[0], begun[0]), max(late[1], begun[1])), begun
     if late[1] - late[0] > 12 * (own[1] - own[0]) > 0:  # a band so wide that it would hide what it is of
         room = 3 * (own[1] - own[0])
         late = max(late[0], own[0] - room), min(late[1], own[1] + room)

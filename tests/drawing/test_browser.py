@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,9 +24,10 @@ from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
 from flowgraph.drawing.live import LiveServer, Sender, live_page
 from flowgraph.drawing.page import diagram_page
-from flowgraph.drawing.run_page import runs_of_page
+from flowgraph.drawing.run_page import describe_run, run_page, runs_of_page
 from flowgraph.engines.watched import simulate_watched
 from flowgraph.pipeline.costs.places import costs_by_path
+from tests.drawing.test_run_page import flown, result_of
 from tests.test_house import ROOT
 
 selenium = pytest.importorskip("selenium", reason="Selenium, which drives the browser, is not installed")
@@ -334,6 +336,25 @@ def test_runs_are_picked_and_compared(page, pages) -> None:
     assert page.texts(".figures thead th") == ["the first", "the second"]
     assert page.texts(".figures tbody td") == ["0.25", "0.25"]
     page.is_quiet()
+
+
+def test_a_way_far_from_the_origin_is_in_the_picture(page, pages, tmp_path) -> None:
+    belief, truth = flown(300)
+    far = np.array([5e4, -3e4, 800.0])
+    way = np.cumsum(belief["position"], axis=0) + far
+    moved = Series(belief.time, belief.values.replace(position=way), name="belief")
+    still = Series(truth.time, truth.values.replace(position=way + 0.1), name="truth")
+    run = describe_run(
+        pages["ins_eskf"][2].graph, result_of(belief=moved), title="far", estimate="belief", truth=still
+    )
+    run_page([run], tmp_path / "far.html")
+    look(page, "light")
+    page.open(tmp_path / "far.html", "[data-shown]")
+    page.slide(0.5)
+    time.sleep(0.3)
+    picture = cv2.imdecode(np.frombuffer(page.find(".frame3d canvas").screenshot_as_png, np.uint8), 1)
+    blue = (picture[..., 0].astype(int) - picture[..., 2] > 60).sum()  # the line of the estimate
+    assert blue > 100
 
 
 def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:

@@ -120,6 +120,16 @@ def test_a_scale_is_of_what_comes_after_the_start_and_says_what_the_start_reache
     assert panel["whole"][1] >= 80
 
 
+def test_what_only_moves_on_is_shown_whole() -> None:
+    belief, _ = flown()
+    position = np.array(belief["position"]) + np.linspace(0.0, 100.0, len(belief))[:, None]
+    moving = Series(belief.time, belief.values.replace(position=position), name="belief")
+    panel = panels_of(Scopes(result_of(belief=moving), "belief", None))["position x"]
+    assert "words" not in panel
+    assert panel["range"][0] <= position[:, 0].min()
+    assert panel["range"][1] >= position[:, 0].max()
+
+
 @pytest.mark.parametrize(("size", "warned"), [(1.0, False), (2.0, True), (0.5, True)])
 def test_a_filter_that_is_wrong_about_itself_is_a_warning(size: float, warned: bool) -> None:
     belief, truth = flown(size=size)

@@ -103,6 +103,7 @@ export class Space {
     camera.far = radius * 60;
     this.controls = new OrbitControls(camera, renderer.domElement);
     this.controls.target.copy(centre);
+    this.controls.update();
     this.controls.addEventListener("change", () => this.ask());
     frame.addEventListener("keydown", (event) => this.turn(event, centre));
     new ResizeObserver(() => {
