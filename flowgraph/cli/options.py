@@ -9,13 +9,14 @@ from typing import Annotated
 import typer
 
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.series import Flight
+from flowgraph.data.settings import parsed_settings
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
-Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.")]
 Data = Annotated[
     list[str],
     typer.Option(

@@ -19,9 +19,10 @@ import numpy as np
 
 from flowgraph.data.batch import Batch
 from flowgraph.data.notes import note
-from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
+from flowgraph.data.settings import parsed_settings
 from flowgraph.engines.many import run_many
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.parts import run_graph

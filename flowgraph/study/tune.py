@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.registry import find_graph, parsed_settings
+from flowgraph.data.registry import find_graph
+from flowgraph.data.settings import parsed_settings
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.study.spec import Value, text
