@@ -196,10 +196,8 @@ _SI = {name: (next(iter(kind)), factor) for kind in KINDS for name, factor in ki
 
 def _unit_of(sheet: Sheet, group: list[int]) -> tuple[str | None, float]:
     """The SI unit of the columns of a field, as the head says it, and the factor to it."""
-    written = {
-        (sheet.units[k] if sheet.units else split_unit(sheet.names[k])[1]) if sheet.names else ""
-        for k in group
-    }
+    units = sheet.units or [split_unit(n)[1] for n in sheet.names]
+    written = {units[k] for k in group} if units else {""}
     if len(written) > 1:
         raise DataError(
             "the columns of a field have several units",

@@ -21,10 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowgraph import Series
-from flowgraph.blocks.geometry.manifold import Quaternion, StateSpace, angle
+from flowgraph.blocks.geometry.manifold import Part, Quaternion, StateSpace, angle
 from flowgraph.blocks.geometry.rotations import multiply
 from flowgraph.blocks.metrics.errors import error_summary, nees_summary
-from flowgraph.blocks.metrics.truth import within_truth
+from flowgraph.blocks.metrics.truth import known, within_truth
+from flowgraph.drawing.angles import NAMES, euler_angles, euler_variances
+from flowgraph.drawing.canvas import deviation
+from flowgraph.drawing.states import Quantity
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.types import leaves_of
 
@@ -135,47 +138,100 @@ class StateErrors:
 
     def apart(self, estimate: Series, truth: Series) -> dict[str, np.ndarray]:
         """Of each part that the truth has, the moves (n, tangent) that take the estimates to the truth."""
-        known = self.known(estimate, truth)
+        right = self.true_parts(estimate, truth)
         found = {}
         for name, part, at in zip(self.space.names, self.space.parts, self._places(), strict=True):
-            if name in known:
-                found[name] = np.asarray(part.minus(known[name], estimate["mean"][:, at], np))
+            if name in right:
+                found[name] = np.asarray(part.minus(right[name], estimate["mean"][:, at], np))
         return found
 
-    def known(self, estimate: Series, truth: Series) -> dict[str, np.ndarray]:
+    def true_parts(self, estimate: Series, truth: Series) -> dict[str, np.ndarray]:
         """The truth's parts at the estimate's ticks, in the estimate's world."""
-        known = true_parts(self.space, truth, estimate.time)
-        return known if self.align == "none" else self._aligned(known, estimate["mean"])
+        parts = true_parts(self.space, truth, estimate.time)
+        return parts if self.align == "none" else self._aligned(parts, estimate["mean"])
+
+    def quantities(self, estimate: Series, truth: Series | None, seconds: np.ndarray) -> list[Quantity]:
+        """Each number of the estimates with its deviation and, where it is known, the truth; to be drawn.
+
+        Angles are in degrees, attitudes as roll, pitch and yaw. Of a rigid motion, whose deviations are in a
+        frame of its own, the numbers are drawn without a band.
+
+        Args:
+            estimate, truth: as for a comparison; the truth may be missing.
+            seconds: (n,) the estimate's times.
+        """
+        seen = {} if truth is None or not len(truth) else self.true_parts(estimate, truth)
+        at_all = np.zeros(len(estimate), bool) if truth is None else known(truth, estimate.time)
+        units = {} if truth is None else {n.rpartition(".")[2]: t.unit for n, t in leaves_of(truth.type)}
+        P = estimate["covariance"] if "covariance" in estimate.leaves else None
+        found: list[Quantity] = []
+        for name, (part, at, on) in zip(self.space.names, self.space.places(), strict=True):
+            x = estimate["mean"][:, at]
+            right = np.where(at_all[:, None], seen[name], np.nan) if name in seen else None
+            spread = None if P is None else P[:, on, on]
+            found += _drawn(name, part, units.get(name) or "", x, right, spread, seconds)
+        return found
 
     def _places(self) -> list[slice]:
         return [at for _, at, _ in self.space.places()]
 
-    def _aligned(self, known: Mapping[str, np.ndarray], mean: np.ndarray) -> dict[str, np.ndarray]:
-        if self.position not in known or known[self.position].shape[1] not in (2, 3):
+    def _aligned(self, parts: Mapping[str, np.ndarray], mean: np.ndarray) -> dict[str, np.ndarray]:
+        if self.position not in parts or parts[self.position].shape[1] not in (2, 3):
             raise DataError(
                 "the estimate cannot be aligned with the truth",
                 path=f"align={self.align}",
                 expected=f"a part {self.position!r} of 2 or 3 numbers that the truth has too",
-                got=", ".join(known) or "no part that the truth has",
+                got=", ".join(parts) or "no part that the truth has",
                 fix="leave align out, or name the part: StateErrors(space, align, position=...)",
             )
-        there = known[self.position]
+        there = parts[self.position]
         here = mean[:, self._places()[self.space.names.index(self.position)]]
         from_, to = there - there.mean(axis=0), here - here.mean(axis=0)
         R = _turn(from_, to, flat=self.align == "yaw" or there.shape[1] == 2)
         yaw = np.arctan2(R[1, 0], R[0, 0])
-        found = dict(known)
+        found = dict(parts)
         found[self.position] = from_ @ R.T + here.mean(axis=0)
         for name, part in zip(self.space.names, self.space.parts, strict=True):
-            if name not in known:
+            if name not in parts:
                 continue
-            if name in self.vectors and known[name].shape[1] == len(R):
-                found[name] = known[name] @ R.T
+            if name in self.vectors and parts[name].shape[1] == len(R):
+                found[name] = parts[name] @ R.T
             elif isinstance(part, Quaternion):
-                found[name] = np.asarray(multiply(_quaternion(R), known[name], xp=np))
+                found[name] = np.asarray(multiply(_quaternion(R), parts[name], xp=np))
             elif name in self.headings and isinstance(part, _ANGLE) and (self.align == "yaw" or len(R) == 2):
-                found[name] = np.asarray(part.plus(known[name], np.array([yaw]), np))
+                found[name] = np.asarray(part.plus(parts[name], np.array([yaw]), np))
         return found
+
+
+def _drawn(
+    name: str, part: Part, unit: str, x: np.ndarray, truth: np.ndarray | None, spread: np.ndarray | None,
+    seconds: np.ndarray,
+) -> list[Quantity]:  # fmt: skip
+    """The numbers of one part (n, size), with the covariance (n, tangent, tangent) of its moves."""
+    labels = [f"{name} {k}" for k in range(x.shape[1])] if x.shape[1] > 1 else [name]
+    variance = None if spread is None or part.curved else np.einsum("nii->ni", spread)
+    turns = isinstance(part, _ANGLE)
+    if isinstance(part, Quaternion):
+        labels, unit = [f"{name}, {angle_}" for angle_ in NAMES], "deg"
+        variance = None if spread is None else np.minimum(euler_variances(x, spread), 60.0**2)
+        x, truth = euler_angles(x), None if truth is None else euler_angles(truth)
+        x, turns = (x + 180.0) % 360.0 - 180.0, True
+        truth = None if truth is None else (truth + 180.0) % 360.0 - 180.0
+    elif turns:
+        x, truth = np.rad2deg(x), None if truth is None else np.rad2deg(truth)
+        variance, unit = None if variance is None else variance * np.rad2deg(1.0) ** 2, "deg"
+    return [
+        Quantity(
+            label,
+            seconds,
+            x[:, k],
+            unit,
+            None if variance is None else deviation(variance[:, k]),
+            None if truth is None else truth[:, k],
+            turns,
+        )
+        for k, label in enumerate(labels)
+    ]
 
 
 def _turn(a: np.ndarray, b: np.ndarray, *, flat: bool) -> np.ndarray:

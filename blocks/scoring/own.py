@@ -206,7 +206,7 @@ def _score(graph: Graph, flight: Flight, scored: Mapping[str, Any]) -> tuple[Any
     estimate = next((n for n, t in types.items() if _is_belief(t, space) and not n.endswith("prior")), None)
     settle = scored.get("settle", Scored.settle)
     if space is None or not space.names or estimate is None:
-        return Scorer(None, _nothing, next(iter(types), ""), settle), next(iter(types), "")
+        return Scorer(flight.truth, _nothing, next(iter(types), ""), settle), next(iter(types), "")
     errors = StateErrors(space, scored.get("align", ALIGNMENTS[0]))
     return Scorer(flight.truth, errors, estimate, settle), estimate
 

@@ -235,10 +235,19 @@ def _pictures(
     # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
+    from flowgraph.drawing.states import innovations_of, plot_states
     from flowgraph.drawing.trajectory import plot_space
 
     found: dict[str, Callable[[Path], object]] = {"diagram.svg": lambda file: case.graph.draw(str(file))}
     if estimate is None:
+        return found
+    tell = getattr(case.score, "pictured", None)  # of states that only their filter knows
+    numbers = [] if tell is None else tell(result)
+    if numbers:
+        found["states.png"] = lambda file: plot_states(numbers, file, heading=case.graph.name)
+        residuals = innovations_of(result)
+        if residuals:
+            found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         seen = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
