@@ -63,7 +63,8 @@ def test_a_table_feeds_it_by_the_names_of_its_head_or_by_settings(here: Path):
     assert "streams steering, fix" in without.stderr
 
 
-def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neither(here: Path):
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neither(here: Path, workers: int):
     (here / "small.toml").write_text(
         'graphs = ["own_tracker.py:tracker"]\ndata = ["own_tracker.py:drive"]\nseeds = 2\n'
         'engine = "reference"\n[parameters]\nduration = 3\n'
@@ -72,7 +73,7 @@ def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neithe
     study = Study.load(here / "small.toml")
     assert study.graphs == (f"{here / 'own_tracker.py'}:tracker",)
     assert len(list(study.combinations(study.graphs[0]))) == 2
-    outcome = run_study(study, here / "out", workers=2)
+    outcome = run_study(study, here / "out", workers=workers)
     assert (outcome.done, outcome.failed) == (4, [])
     rows = read_table(here / "out")
     assert len({row["position_rmse_m"] for row in rows}) == 4  # of two seeds, at two settings
@@ -96,7 +97,7 @@ def test_a_run_of_a_study_is_done_anew_when_the_file_says_something_else(here: P
         ("gone.py:tracker", None, DeclarationError, ["no such file", "gone.py", "check the path"]),
         ("my.py", "", DeclarationError, ["names a file", "FILE.py:NAME"]),
         ("my.py:car", "from flowgraph import *", UnknownNameError, ["my.py", "'car'"]),
-        ("my.py:car", "def car(): ...", DeclarationError, ["my.py:car", "the function car", "put @graph over"]),
+        ("my.py:car", "def car(): ...", DeclarationError, ["the function car", "put @graph over"]),
         ("my.py:car", "car = 3", DeclarationError, ["int: 3"]),
         ("my.py:car", "x = 1\ny = x / 0\n", PluginError, ["my.py, line 2", "ZeroDivisionError"]),
         ("my.py:car", "x = (\n", PluginError, ["my.py, line 1", "SyntaxError"]),

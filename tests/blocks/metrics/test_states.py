@@ -81,7 +81,9 @@ def test_a_moved_world_is_aligned_away(align, turn):
     truth = Series(TIME, BodyTruth(position=p, velocity=v, attitude=q))
     R = np.asarray(from_rotation_vector(np.array(turn), xp=np))
     put = lambda x: np.asarray(rotate(np.broadcast_to(R, (50, 4)), x, xp=np))
-    mean = np.concatenate([put(p) + [5.0, -3.0, 2.0], put(v), np.asarray(multiply(R, q, xp=np))], axis=1)
+    mean = np.concatenate(
+        [put(p) + np.array([5.0, -3.0, 2.0]), put(v), np.asarray(multiply(R, q, xp=np))], axis=1
+    )
     found = StateErrors(BODY, align)(beliefs(BODY, mean), truth, settle=0.0)
     assert found["position_rmse_m"] < 1e-9
     assert found["velocity_rmse_mps"] < 1e-9
