@@ -92,23 +92,23 @@ def drive(
     *,
     seed: int = 0,
     duration: float = 30.0,
-    fix_noise: float = 2.0,
-    turn_noise: float = 0.02,
-    push_noise: float = 0.2,
+    gps: float = 2.0,
+    wheel: float = 0.02,
+    pedal: float = 0.2,
 ) -> Flight:
-    """A drive of so many seconds, steered at 20 Hz and seen at 2 Hz."""
-    rng, model = np.random.default_rng(seed), car(turn_noise, push_noise)
+    """A drive of so many seconds, steered at 20 Hz and seen at 2 Hz; with these noises."""
+    rng, model = np.random.default_rng(seed), car(wheel, pedal)
     time = np.arange(0, round(duration * 1e9), 50_000_000)
     told = Steering(rate=0.3 * np.sin(time * 1e-9), acceleration=0.4 * np.cos(0.7e-9 * time))
     x = rng.multivariate_normal(START.mean, START.covariance)[None]
     states = []
     for k in range(len(time)):
-        w = rng.normal(size=(1, 2)) * np.array([turn_noise, push_noise]) / np.sqrt(0.05)
+        w = rng.normal(size=(1, 2)) * np.array([wheel, pedal]) / np.sqrt(0.05)
         held = Steering(rate=told.rate[max(k - 1, 0)], acceleration=told.acceleration[max(k - 1, 0)])
         x = model.carry(x, held, w, 0.05 * (k > 0), np)
         states.append(x[0])
     truth = np.array(states)
-    fix = Fix(position=truth[::10, :2] + fix_noise * rng.normal(size=truth[::10, :2].shape))
+    fix = Fix(position=truth[::10, :2] + gps * rng.normal(size=truth[::10, :2].shape))
     return Flight(
         f"drive-{seed}",
         {"steering": Series(time, told), "fix": Series(time[::10], fix)},

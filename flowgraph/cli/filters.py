@@ -22,10 +22,12 @@ from flowgraph.cli.options import (
     Name,
     Seed,
     Settings,
+    SettingsFile,
     Truth,
     case_of,
     graph_of,
     one_flight,
+    with_file,
 )
 from flowgraph.cli.terminal import (
     err_console,
@@ -78,10 +80,11 @@ def show(
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file."""
-    built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
+    built, _ = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
@@ -100,6 +103,7 @@ def run(
     dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     seed: Seed = 0,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
     diverged: Annotated[
         str, typer.Option(help="Numbers that are no longer finite: raise or count.")
@@ -117,7 +121,7 @@ def run(
                 err_console.print(f"note: {words}", markup=False)
             notes[words] = None
 
-    spec = one_flight(data) or ""
+    spec, settings = one_flight(data) or "", with_file(settings, settings_file)
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
     result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged)
     say(case.remarks(result))

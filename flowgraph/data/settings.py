@@ -8,9 +8,11 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["keyword_types", "parsed_settings", "setting_names"]
+__all__ = ["keyword_types", "of_any_stream", "parsed_settings", "setting_names", "text"]
 
 
 def setting_names(function: Callable[..., Any]) -> list[str]:
@@ -44,23 +46,34 @@ def parsed_settings(
     own = list(types)
     mine: dict[str, Any] = {}
     rest: dict[str, str] = {}
-    for key, text in given.items():
+    for key, word in given.items():
         name = key.replace(".", "_")  # start.heading is the argument start_heading
         if key in also:
-            rest[key] = text
+            rest[key] = word
         elif name in own:
-            mine[name] = _parse(text, types[name], f"{path}.{key}")
-        elif _of_any_stream(key, also):
-            rest[key] = text
+            mine[name] = _parse(word, types[name], f"{path}.{key}")
+        elif of_any_stream(key, also):
+            rest[key] = word
         else:
             raise UnknownNameError("setting", key, [*own, *also], path=path)
     return mine, rest
 
 
-def _of_any_stream(key: str, also: Sequence[str]) -> bool:
+def of_any_stream(key: str, also: Sequence[str]) -> bool:
     """Whether a kind of flight has a setting for streams of any name: STREAM.time_offset, STREAM.FIELD."""
     of_any = "STREAM." + key.rpartition(".")[2] in also
     return of_any or ("STREAM.FIELD" in also and key.count(".") == 1)
+
+
+def text(value: Any) -> str:
+    """A value as `--set` writes it; a float to its last bit, rows of an array with semicolons between."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, np.ndarray | list | tuple):
+        array = np.asarray(value, dtype=float)
+        rows = [",".join(map(repr, row)) for row in np.atleast_2d(array).tolist()]
+        return ";".join(rows)
+    return repr(value) if isinstance(value, float) else str(value)
 
 
 def _parse(text: str, annotation: Any, path: str) -> Any:

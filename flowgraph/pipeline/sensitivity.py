@@ -32,17 +32,21 @@ from flowgraph.recorder.tangents import spread
 from flowgraph.recorder.trace import Instruction, Trace
 from flowgraph.types import DTYPES
 
-__all__ = ["CHANGE", "sensitivity"]
+__all__ = ["CHANGE", "resets", "sensitivity"]
 
 CHANGE = "_change"
-"""The cell of a register, and the leaf of an output, that holds a change (p, *shape) is called NAME_change."""
+"""Behind the name of a register's cell, or of a leaf of a port: its change (p, *shape)."""
 
 Place = tuple[str, str]
 """A register by its path and a cell of it by name; or an input and a leaf of it."""
 
 
 def sensitivity(
-    pipeline: Pipeline, p: int, starts: Collection[Place], outputs: Collection[str], inputs: Collection[Place] = ()
+    pipeline: Pipeline,
+    p: int,
+    starts: Collection[Place],
+    outputs: Collection[str],
+    inputs: Collection[Place] = (),
 ) -> Pipeline:
     """The pipeline with changes along p directions.
 
@@ -95,7 +99,7 @@ class _Differentiated:
                 self._env[leaf.value] = self._value(leaf, (port.name, leaf.name), self._inputs)
         for register in of.registers:
             for cell in register.cells:
-                self._env[cell.read] = self._value(cell, (register.path, cell.name), self._active, cell.read)
+                self._env[cell.read] = self._value(cell, (register.path, cell.name), self._active)
         self._env |= {n: trace.constant(a) for n, a in of.constants.items() if n not in self._env}
         for stage in of.stages:
             begin = len(trace.instructions)
@@ -105,7 +109,7 @@ class _Differentiated:
             recorded = tuple(trace.instructions[begin:])
             self._stages.append(replace(stage, enable=-1, instructions=recorded))
 
-    def _value(self, part: Leaf | Cell, place: Place, changing: set[Place], _: int = 0) -> Any:
+    def _value(self, part: Leaf | Cell, place: Place, changing: set[Place]) -> Any:
         value = self._trace.input(Spec(part.shape, part.dtype))
         if place not in changing or part.dtype != "real":
             return value
@@ -149,7 +153,7 @@ class _Differentiated:
             dict(self._trace.constants),
             tuple(stages),
             of.faults,
-            (),
+            tuple(replace(site, value=self._plain(site.value)) for site in of.random),
             of.limits,
         )
 
@@ -185,7 +189,9 @@ class _Differentiated:
             leaves.append(replace(leaf, value=self._plain(leaf.value)))
             change = None
             if places is not None:
-                change = self._changes.get((port.name, leaf.name)) if (port.name, leaf.name) in places else None
+                change = (
+                    self._changes.get((port.name, leaf.name)) if (port.name, leaf.name) in places else None
+                )
             elif wanted and leaf.dtype == "real":
                 change = self._change(leaf.value, leaf.shape)
             if change is not None:

@@ -20,9 +20,9 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.registry import flight_settings
+from flowgraph.data.settings import text
 from flowgraph.drawing import canvas
 from flowgraph.errors import UnknownNameError, plain
-from flowgraph.study.spec import text
 from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
 from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
 

@@ -25,7 +25,7 @@ from flowgraph.data.files import text_of
 from flowgraph.data.joint import parts_of
 from flowgraph.data.own import is_in_file, kind_and_place
 from flowgraph.data.registry import find_graph, flight_names, flight_settings
-from flowgraph.data.settings import parsed_settings
+from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
 from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError
@@ -231,13 +231,6 @@ class Study:
             if name not in given:
                 raise _wrong(name, "a list of names", "nothing")
         return cls(**given, checked=checked)
-
-
-def text(value: Value) -> str:
-    """A value as `--set` writes it; a float to its last bit."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value) if isinstance(value, float) else str(value)
 
 
 _EXAMPLES = {

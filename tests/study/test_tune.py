@@ -21,7 +21,8 @@ from flowgraph import (
 )
 from flowgraph.cli import app
 from flowgraph.study import trials
-from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
+from flowgraph.study.search import first_steps
+from flowgraph.study.tune import Fit, Recording, _start, surprise, tune
 from tests.blocks.datasets.test_datasets import course
 from tests.recordings import recordings
 
@@ -114,7 +115,7 @@ def test_a_simplex_moves_each_parameter_at_first_also_from_one():
         watch=lambda count, best, value: seen.append(value),
     )  # fmt: skip
     assert len(seen) == 3
-    steps = _first_steps(np.log([1.0, 10.0]), np.log([0.1, 0.1]), np.log([10.0, 10.0]))
+    steps = first_steps(np.log([1.0, 10.0]), np.log([0.1, 0.1]), np.log([10.0, 10.0]))
     np.testing.assert_allclose(steps, [1.0, -1.0])
 
 
