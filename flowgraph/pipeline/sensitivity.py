@@ -14,7 +14,7 @@ Source: A. Griewank and A. Walther, "Evaluating Derivatives", 2nd ed., SIAM 2008
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -32,7 +32,7 @@ from flowgraph.recorder.tangents import spread
 from flowgraph.recorder.trace import Instruction, Trace
 from flowgraph.types import DTYPES
 
-__all__ = ["CHANGE", "resets", "sensitivity"]
+__all__ = ["CHANGE", "sensitivity"]
 
 CHANGE = "_change"
 """Behind the name of a register's cell, or of a leaf of a port: its change (p, *shape)."""
@@ -231,14 +231,3 @@ def _at(trace: Trace, line: str) -> Iterator[None]:
     yield
     for k in range(begin, len(trace.instructions)):
         trace.instructions[k] = replace(trace.instructions[k], line=line)
-
-
-def resets(pipeline: Pipeline, values: Mapping[Place, Any]) -> Pipeline:
-    """The pipeline with other initial values of register cells."""
-
-    def cell(path: str, c: Cell) -> Cell:
-        given = values.get((path, c.name))
-        return c if given is None else replace(c, reset=np.asarray(given, DTYPES[c.dtype]))
-
-    registers = tuple(replace(r, cells=tuple(cell(r.path, c) for c in r.cells)) for r in pipeline.registers)
-    return replace(pipeline, registers=registers)

@@ -27,12 +27,14 @@ from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
 from flowgraph.engines.contract import PipelineEngine
-from flowgraph.engines.playback import run_pipeline
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.playback import play
 from flowgraph.engines.registry import find_engine
+from flowgraph.engines.subject import LoadedPipeline
 from flowgraph.language.graph import Graph, join_states
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline, type_of_leaves
-from flowgraph.pipeline.sensitivity import CHANGE, resets, sensitivity
+from flowgraph.pipeline.sensitivity import CHANGE, sensitivity
 from flowgraph.study.keys import structure
 from flowgraph.study.lifting import CONSTANTS, lifted, real_constants
 from flowgraph.types import flatten, leaves_of, unflatten
@@ -96,8 +98,9 @@ class Slopes:
         which = (len(smooth), frozenset(cells), frozenset(moved), known)
         made = self._differentiated(case.graph, which, wanted)
         started = starts | {(path, name + CHANGE): a for (path, name), a in cells.items()}
-        made, given = resets(made, started), _given(made, streams, moved)
-        result = run_pipeline(made, given, engine=self.engine, seed=seed)
+        first = [started.get((r.path, c.name), c.reset) for r in made.registers for c in r.cells]
+        subject = LoadedPipeline(made, first)  # other numbers in one program, which is compiled once
+        result = play(subject, _given(made, streams, moved), RunOptions(engine=self.engine, seed=seed))
         total, count, d = surprise_and_slope(result, len(smooth))
         slope[smooth] = d / max(count, 1.0)
         return total / count if count else math.nan, count, slope
