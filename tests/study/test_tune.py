@@ -199,7 +199,7 @@ def test_the_command_prints_what_it_found(tmp_path):
     done = runner.invoke(app, [*words, "--most", "9", "--json", "--out", str(tmp_path / "found.json")])
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "found.json").read_text())
-    assert 0.001 < found["parameters"]["position_noise"] < 0.1
+    assert 0.001 < found["parameters"]["position_noise"]["value"] < 0.1
     assert [r["held_out"] for r in found["recordings"]] == [False, True]
     assert found["recordings"][1]["metrics"]["position_rmse_m"].keys() == {"before", "after", "own"}
     assert found["mean"]["held_out"]["after"] == found["recordings"][1]["after"]
