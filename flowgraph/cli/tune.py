@@ -76,7 +76,7 @@ def tune(
     hidden = quiet or as_json
 
     def watch(count: int, best: Any, value: float) -> None:
-        err_console.print(f"{count} tried: {value:.6g} at {_said(best)}", markup=False)
+        err_console.print(f"{count} tried: {value:.6g} at {said_of(best)}", markup=False)
 
     found = search(
         graph, fits, train, judges, folds=folds, measure=by, metric=metric, settings=dict(pairs(settings)),
@@ -89,14 +89,14 @@ def tune(
     if as_json:
         return print_json(report)
     print_whole(table(_lines(found)))
-    out_console.print(f"before: {_said(found.start)}", markup=False)
+    out_console.print(f"before: {said_of(found.start)}", markup=False)
     for k, part in enumerate(found.folds):
-        out_console.print(f"after, without fold {k}: {_said(part.parameters)}", markup=False)
+        out_console.print(f"after, without fold {k}: {said_of(part.parameters)}", markup=False)
     whole = "of all: " if found.folds else "after: "
     out_console.print(whole + " ".join(f"--set {n}={shown(v)}" for n, v in found.parameters.items()))
     sure = {n: d for n, d in found.deviations.items() if d is not None}
     if sure:
-        out_console.print("standard deviations: " + _said(sure), markup=False)
+        out_console.print("standard deviations: " + said_of(sure), markup=False)
     for said in _notes(found):
         err_console.print(f"note: {said}", markup=False)
     bounds = {f.name: {"low": f.low, "high": f.high} for f in fits}
@@ -134,7 +134,7 @@ def _searches(found: Tuned) -> list[tuple[str, Found]]:
     return [*parts, (" over all" if parts else "", found)]
 
 
-def _said(values: Mapping[str, Any]) -> str:
+def said_of(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{n}={shown(v)}" for n, v in values.items())
 
 
@@ -214,7 +214,7 @@ def _report(found: Tuned) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def span(given: str) -> tuple[str, list[float]]:
+def span(given: str, option: str = "--fit") -> tuple[str, list[float]]:
     name, _, span = given.partition("=")
     try:
         numbers = [float(x) for x in span.split(":")]
@@ -223,9 +223,9 @@ def span(given: str) -> tuple[str, list[float]]:
     except ValueError:
         raise DeclarationError(
             "a parameter to find has bounds",
-            path="--fit",
+            path=option,
             expected="NAME=LOW:HIGH or NAME=LOW:HIGH:START",
             got=repr(given),
-            fix="write --fit position_noise=0.001:0.1",
+            fix=f"write {option} position_noise=0.001:0.1",
         ) from None
     return name, numbers

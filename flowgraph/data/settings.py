@@ -73,7 +73,7 @@ def text(value: Any) -> str:
         array = np.asarray(value, dtype=float)
         rows = [",".join(map(repr, row)) for row in np.atleast_2d(array).tolist()]
         return ";".join(rows)
-    return repr(value) if isinstance(value, float) else str(value)
+    return repr(float(value)) if isinstance(value, float) else str(value)
 
 
 def _parse(text: str, annotation: Any, path: str) -> Any:

@@ -14,6 +14,7 @@ so that a recording counts by how much better it gets and not by how hard it is.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -100,6 +101,19 @@ class Trials:
                 return seen[what], one
             seen[what] = one
         return None
+
+    @property
+    def flights(self) -> list[Flight]:
+        """Those of the recordings."""
+        return list(self._flights)
+
+    def at(self, fixed: Mapping[str, Parameter]) -> Trials:
+        """The same with some settings of the flights fixed at these values."""
+        other = copy.copy(self)
+        other.settings = {**self.settings, **{n: text(v) for n, v in fixed.items()}}
+        other._flights = [self._flight(k, fixed) for k in range(len(self.recordings))]
+        other._moved = OrderedDict()
+        return other
 
     def _flight(self, place: int, point: Mapping[str, Parameter]) -> Flight:
         """The flight of a recording, with those of its own settings that a point names."""

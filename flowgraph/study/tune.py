@@ -126,7 +126,7 @@ def tune(
     problem = Trials(graph, [*recordings, *held_out], settings, measure, metric, engine)
     if same := problem.twice():
         raise _wrong("data", "recordings that differ, each once, fitted to or held out", same)
-    start = {f.name: _start(graph, f) for f in fits}
+    start = {f.name: start_of_fit(graph, f) for f in fits}
     whole = range(len(recordings))
 
     def search(places: Sequence[int]) -> Found:
@@ -183,7 +183,7 @@ def _far(fit: Fit, found: Parameter) -> Parameter:
     return np.asarray(found) * 10.0
 
 
-def _start(graph: str, fit: Fit) -> Parameter:
+def start_of_fit(graph: str, fit: Fit) -> Parameter:
     """Where to begin: as told, or at the graph's own value, or in the middle of the bounds."""
     prepare = find_graph(graph).prepare
     if fit.start is not None:
@@ -213,16 +213,28 @@ def _check(
     graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
     settings: Mapping[str, Value], most: int, folds: int | None,
 ) -> None:  # fmt: skip
-    if not fits:
-        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
-    if not recordings:
-        raise _wrong("data", "one recording or more", "none")
+    check_fits(graph, fits, recordings, held_out, settings)
     if type(most) is not int or most < 1:
         raise _wrong("most", "a whole number from 1", most)
     if folds is not None and (type(folds) is not int or not 2 <= folds <= len(recordings)):
         raise _wrong("folds", f"a whole number from 2 to that of the recordings, {len(recordings)}", folds)
     if folds is not None and held_out:
         raise _wrong("folds", "either folds or recordings that are held out", f"{len(held_out)} held out")
+
+
+def check_fits(
+    graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
+    settings: Mapping[str, Value],
+) -> None:  # fmt: skip
+    """Refuse what cannot be sought: bounds that are none, what is no parameter of a filter or of its sensors.
+
+    Raises:
+        DeclarationError, UnknownNameError: naming the parameter.
+    """
+    if not fits:
+        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
+    if not recordings:
+        raise _wrong("data", "one recording or more", "none")
     prepare = find_graph(graph).prepare
     for fit in fits:
         numbers = [fit.low, fit.low if fit.start is None or np.ndim(fit.start) else fit.start, fit.high]
@@ -232,7 +244,7 @@ def _check(
         ):
             expected = "0 < low" if fit.scale == "log" else "low"
             raise _wrong(f"fit {fit.name}", f"{expected} <= start <= high, low < high", fit)
-        matrix = _start(graph, fit)
+        matrix = start_of_fit(graph, fit)
         if np.ndim(matrix) == 2 and not _is_covariance(matrix):
             raise _wrong(f"fit {fit.name}", "a start that is a covariance", matrix)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
@@ -249,7 +261,7 @@ def _check(
         if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
             raise _wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
         if prepare is not None:
-            parsed_settings(prepare, {fit.name: text(_start(graph, fit))}, also=(), path=graph)
+            parsed_settings(prepare, {fit.name: text(start_of_fit(graph, fit))}, also=(), path=graph)
 
 
 def _is_covariance(value: Parameter) -> bool:

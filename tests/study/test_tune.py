@@ -22,7 +22,7 @@ from flowgraph import (
 from flowgraph.cli import app
 from flowgraph.study import trials
 from flowgraph.study.search import first_steps
-from flowgraph.study.tune import Fit, Recording, _start, surprise, tune
+from flowgraph.study.tune import Fit, Recording, start_of_fit, surprise, tune
 from tests.blocks.datasets.test_datasets import course
 from tests.recordings import recordings
 
@@ -100,10 +100,11 @@ def test_each_recording_is_held_out_once_and_judged_by_the_search_that_did_witho
 
 
 def test_a_search_starts_as_told_or_at_the_own_value_or_in_the_middle():
-    assert _start("quaternion_ukf", Fit("force_noise", 0.1, 40.0)) == 2.0
-    assert _start("quaternion_ukf", Fit("force_noise", 0.1, 40.0, 3.0)) == 3.0
-    assert _start("quaternion_ukf", Fit("force_noise", 4.0, 9.0)) == pytest.approx(6.0)  # its own is outside
-    assert _start("ekf", Fit("position_noise", 1e-3, 0.1)) == pytest.approx(0.01)  # its own is a flight's
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 0.1, 40.0)) == 2.0
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 0.1, 40.0, 3.0)) == 3.0
+    # of these two the own value is outside, or that of a flight
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 4.0, 9.0)) == pytest.approx(6.0)
+    assert start_of_fit("ekf", Fit("position_noise", 1e-3, 0.1)) == pytest.approx(0.01)
 
 
 def test_a_simplex_moves_each_parameter_at_first_also_from_one():
