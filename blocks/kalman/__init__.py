@@ -20,7 +20,19 @@ from flowgraph.blocks.kalman.filters import (
 )
 from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, aged, bridge, bridged, find_back, stay
+from flowgraph.blocks.kalman.lost import (
+    FARTHEST,
+    PATIENCE,
+    UNKNOWN_TURN,
+    Held,
+    aged,
+    bridge,
+    bridged,
+    find_back,
+    in_doubt,
+    lost_variances,
+    stay,
+)
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
@@ -30,13 +42,17 @@ from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 __all__ = [
     "noise_matrix",
     "observation_matrix",
+    "FARTHEST",
     "PATIENCE",
+    "UNKNOWN_TURN",
     "Held",
     "aged",
     "bridge",
     "bridged",
     "stay",
     "find_back",
+    "in_doubt",
+    "lost_variances",
     "covariance_root",
     "LinearModel",
     "LinearGaussian",
