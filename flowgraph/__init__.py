@@ -35,7 +35,7 @@ from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
     from flowgraph.data.batch import Batch
-    from flowgraph.data.export import write_tum
+    from flowgraph.data.export import write_table, write_tum
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
@@ -52,6 +52,7 @@ if _TYPE_CHECKING:
 # What is done with a graph is imported when it is first asked for: who declares pays for no engine.
 _LATER = {
     "Batch": "flowgraph.data.batch",
+    "write_table": "flowgraph.data.export",
     "write_tum": "flowgraph.data.export",
     "arrays": "flowgraph.data.inputs",
     "clocks_of": "flowgraph.data.inputs",
@@ -184,6 +185,7 @@ __all__ = [
     "unzip",
     "when",
     "window",
+    "write_table",
     "write_tum",
     "zip",
     "zip_latest",
