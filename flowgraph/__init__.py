@@ -26,6 +26,7 @@ from flowgraph.language.graph import Graph
 from flowgraph.language.joins import collect, every, latest, merge, sink
 from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
+from flowgraph.language.stamps import stamp_of
 from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
@@ -34,6 +35,7 @@ from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
+    from flowgraph.data.arrival import delayed
     from flowgraph.data.batch import Batch
     from flowgraph.data.export import write_tum
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
@@ -51,6 +53,7 @@ if _TYPE_CHECKING:
 
 # What is done with a graph is imported when it is first asked for: who declares pays for no engine.
 _LATER = {
+    "delayed": "flowgraph.data.arrival",
     "Batch": "flowgraph.data.batch",
     "write_tum": "flowgraph.data.export",
     "arrays": "flowgraph.data.inputs",
@@ -148,6 +151,7 @@ __all__ = [
     "clocks_of",
     "collect",
     "delay",
+    "delayed",
     "delta_time",
     "drop",
     "every",
@@ -176,6 +180,7 @@ __all__ = [
     "simulate_many",
     "sink",
     "stacked",
+    "stamp_of",
     "take_while",
     "tap",
     "ticks",

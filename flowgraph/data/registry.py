@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.arrival import LATENCY, delayed_flight
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
@@ -189,7 +190,8 @@ def load_flight(
         spec: KIND or KIND:WHERE; several, of one flight, are joined by `+`: "csv:imu.csv+csv:mocap.csv".
         seed: of what is simulated.
         settings: of the loaders by name. Of several parts, each takes those that it has; `2.NAME` is for the
-            second alone.
+            second alone. Every kind has `STREAM.latency`, seconds by which a stream arrives after it was true;
+            LOW:HIGH for random ones.
         truth: a SPEC whose truth, or only stream of poses, is the flight's truth; its settings have the
             number after the last part.
 
@@ -199,13 +201,20 @@ def load_flight(
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong, or
             parts do not fit together.
     """
+    late = {k: v for k, v in (settings or {}).items() if k.endswith(LATENCY)}
+    rest = {k: v for k, v in (settings or {}).items() if k not in late}
+    flight = _load(spec, seed, rest, truth)
+    return delayed_flight(flight, late, seed=seed) if late else flight
+
+
+def _load(spec: str, seed: int, settings: Mapping[str, str], truth: str | None) -> Flight:
     specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
     loaders = [find_entry("flowgraph.flights", s.partition(":")[0]) for s in specs]
-    each = [dict(settings or {})]
+    each = [dict(settings)]
     if len(specs) > 1:
         claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
         names = [flight_settings(s) for s in specs]
-        given = of_a_truth(settings or {}, names) if truth is not None else settings or {}
+        given = of_a_truth(settings, names) if truth is not None else settings
         each = shared(specs, names, claims, given)
     found = [_read(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
     if truth is None:
@@ -237,7 +246,7 @@ def flight_settings(spec: str, truth: str | None = None) -> list[str]:
     for one in specs:
         module = inspect.getmodule(find_entry("flowgraph.flights", one.partition(":")[0]))
         names.append(list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {}))))
-    return names[0] if len(names) == 1 else numbered(names)
+    return [*(names[0] if len(names) == 1 else numbered(names)), "STREAM" + LATENCY]
 
 
 def setting_names(function: Callable[..., Any]) -> list[str]:

@@ -1,0 +1,155 @@
+"""When a value arrives and when it was true, which are two times wherever there is a wire between.
+
+A `Series` has both: `time`, at which its values arrive and make ticks, and `stamp`, when they were true. Here
+is what makes the one of the other. A graph that asks for the stamps of a source (`stamp_of`) has a second
+source beside it, `NAME.stamp`, which is filled from the series; nobody else pays for it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.notes import note
+from flowgraph.data.series import Flight, Series
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.language.clock import nanoseconds
+from flowgraph.language.stamps import STAMP
+
+__all__ = ["LATENCY", "delayed", "delayed_flight", "stamp_events", "with_stamps"]
+
+LATENCY = ".latency"
+"""How the setting of a flight ends that delays a stream: `leica.latency=0.135`."""
+
+
+def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = None) -> Series:
+    """The values of a series as they arrive later; each keeps the stamp at which it was true.
+
+    Values that overtake others come in the order of their arrival. Two that would arrive together arrive
+    1 ns apart, as two events of one source cannot have one time.
+
+    Args:
+        series: what is delayed; one that is delayed already is delayed further.
+        latency: a duration such as "135ms"; a pair of them, between which each value's own is drawn; or (n,)
+            integer nanoseconds.
+        seed: of what is drawn.
+        name: of the new series; as before if left out.
+
+    Raises:
+        DeclarationError: for a latency below 0, or a pair in the wrong order.
+    """
+    called = name or series.name
+    if isinstance(latency, tuple) and len(latency) == 2:
+        low, high = (nanoseconds(part, what="latency") for part in latency)
+        key = np.random.SeedSequence([seed, zlib.crc32(f"{called}{LATENCY}".encode())])
+        share = np.random.Generator(np.random.Philox(key)).uniform(size=len(series))
+        by = low + np.rint(share * (high - low)).astype(np.int64)
+    elif isinstance(latency, np.ndarray):
+        by, low, high = latency.astype(np.int64), int(latency.min(initial=0)), int(latency.max(initial=0))
+    else:
+        low = high = nanoseconds(latency, what="latency")
+        by = np.full(len(series), low, np.int64)
+    if not 0 <= low <= high or by.shape != series.time.shape:
+        raise DeclarationError(
+            "this is no latency",
+            path=called,
+            expected='0 ns or more: "135ms", a pair ("0ms", "500ms"), or one a value',
+            got=repr(latency)[:80],
+            fix='write delayed(series, "135ms")',
+        )
+    arrival = series.time + by
+    order = np.argsort(arrival, kind="stable")
+    moved, stamp = series[order], series.stamp[order]
+    time = moved.time + by[order]
+    if len(time):  # each after the one before: t_k >= t_j + (k - j)
+        count = np.arange(len(time))
+        time = np.maximum.accumulate(time - count) + count
+    return Series(time, moved.values, type=series.type, name=called, gaps=series.gaps, stamp=stamp)
+
+
+def delayed_flight(flight: Flight, settings: Mapping[str, Any], *, seed: int = 0) -> Flight:
+    """A flight whose streams arrive as settings say: `STREAM.latency`, seconds, or LOW:HIGH for random ones.
+
+    Raises:
+        DeclarationError: for a text that is no latency. UnknownNameError: for a stream that is not there.
+    """
+    streams, said = dict(flight.streams), []
+    for key, given in settings.items():
+        name = key.removesuffix(LATENCY)
+        if name not in streams:
+            raise UnknownNameError("stream", name, streams, path=f"{flight.name}.{key}")
+        bounds = _seconds(key, given)
+        streams[name] = delayed(streams[name], bounds if len(bounds) == 2 else bounds[0], seed=seed)
+        text = " to ".join(f"{b * 1e-9:g}" for b in bounds)
+        said.append(note("info", f"{name}: each value arrives {text} s after it was true"))
+    return replace(flight, streams=streams, notes=(*flight.notes, *said))
+
+
+def _seconds(key: str, given: Any) -> tuple[int, ...]:
+    """Nanoseconds, one or two, of "0.135" or "0:0.5"."""
+    try:
+        found = tuple(round(float(part) * 1e9) for part in str(given).split(":"))
+        if len(found) > 2 or "_" in str(given) or not 0 <= found[0] <= found[-1] < 10**15:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise DeclarationError(
+            f"setting {key!r} is not usable",
+            path=key,
+            expected="seconds, 0 or more; or LOW:HIGH, between which each value's own is drawn",
+            got=repr(given),
+            fix=f"for example {key}=0.135",
+        ) from None
+    return found
+
+
+def with_stamps(sources: Iterable[str], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was given, and the stamps of those sources of which a graph asks for them.
+
+    Raises:
+        DataError: for a source whose events are read as they go, since their stamps have to be given too.
+    """
+    found = dict(given)
+    for name in sources:
+        base = name.removesuffix(STAMP)
+        if name == base or name in found or base not in found:
+            continue
+        value = found[base]
+        if isinstance(value, tuple) and len(value) == 2:
+            found[base] = value = Series(value[0], value[1], name=base)
+        if not isinstance(value, Series):
+            raise DataError(
+                f"this graph asks when the values of {base!r} were true",
+                path=name,
+                expected="a Series, which has stamps, or a source of stamps beside the values",
+                got=type(value).__name__,
+                fix=f"write Series(time, values, stamp=...), or give {name!r} too",
+            )
+        found[name] = Series(value.time, value.stamp, name=name)
+    return found
+
+
+def stamp_events(sources: Iterable[str], time: int, values: dict[str, Any]) -> None:
+    """Add to the events of one live tick the stamps that were left out: what arrives is true now.
+
+    Raises:
+        DataError: for a stamp without its value, or after the tick.
+    """
+    for name in sources:
+        base = name.removesuffix(STAMP)
+        if name == base:
+            continue
+        if base in values:
+            values.setdefault(name, time)
+        stamp = values.get(name, time)
+        if (name in values and base not in values) or not stamp <= time:
+            raise DataError(
+                "a stamp comes without its value" if base not in values else "a value was true after it arrived",
+                path=name,
+                expected=f"with a value of {base!r}, a time up to that of the tick, {time} ns",
+                got=f"{stamp} ns",
+                fix="push both in one call",
+            )
