@@ -147,7 +147,9 @@ def stamp_events(sources: Iterable[str], time: int, values: dict[str, Any]) -> N
         stamp = values.get(name, time)
         if (name in values and base not in values) or not stamp <= time:
             raise DataError(
-                "a stamp comes without its value" if base not in values else "a value was true after it arrived",
+                "a stamp comes without its value"
+                if base not in values
+                else "a value was true after it arrived",
                 path=name,
                 expected=f"with a value of {base!r}, a time up to that of the tick, {time} ns",
                 got=f"{stamp} ns",

@@ -190,8 +190,8 @@ def load_flight(
         spec: KIND or KIND:WHERE; several, of one flight, are joined by `+`: "csv:imu.csv+csv:mocap.csv".
         seed: of what is simulated.
         settings: of the loaders by name. Of several parts, each takes those that it has; `2.NAME` is for the
-            second alone. Every kind has `STREAM.latency`, seconds by which a stream arrives after it was true;
-            LOW:HIGH for random ones.
+            second alone. Every kind has `STREAM.latency`, the seconds after which a stream arrives; LOW:HIGH
+            for random ones.
         truth: a SPEC whose truth, or only stream of poses, is the flight's truth; its settings have the
             number after the last part.
 

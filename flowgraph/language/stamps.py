@@ -1,8 +1,8 @@
 """Stamps: when the values of a source were true, for graphs that ask.
 
-A tick is when something arrives. `stamp_of(stream)` is a stream beside that of a source, present whenever it
-is, of the times at which its values were true. It is a source of its own, `NAME.stamp`, of the same clock, and
-is filled from the stamps of the series that is given for NAME; without stamps it is the time of the tick.
+A tick is when something arrives. `stamp_of(stream)` is a stream beside that of a source, present whenever
+it is, of the times at which its values were true. It is a source of its own, `NAME.stamp`, of the same clock,
+and is filled from the stamps of the series that is given for NAME; without stamps it is the time of the tick.
 """
 
 from __future__ import annotations
