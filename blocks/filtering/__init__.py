@@ -2,7 +2,7 @@
 
 A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
 by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
-of those that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
+of those that believe in a Gaussian. `rewind` runs any filter over events that come late. Everything that a user's own filter needs is importable from here.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from flowgraph.blocks.filtering.particles import (
     resample_cloud,
     weigh_cloud,
 )
+from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import Gaussian
@@ -92,6 +93,9 @@ __all__ = [
     "Seen",
     "predict",
     "correct",
+    "rewind",
+    "Rewound",
+    "OLDER",
     "GaussianMethod",
     "Linear",
     "Extended",

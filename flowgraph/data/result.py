@@ -13,7 +13,6 @@ from flowgraph.errors import UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.verbs import verb
 
-
 COUNTED = ("expired", "late_")
 """How the parts of a block's state begin that are counts for `run.stats`."""
 
@@ -26,9 +25,7 @@ def statistics(graph: Graph, state: Mapping[str, Any]) -> dict[str, int]:
             path = graph.nodes[call.state].path
             part = state["registers"][path]
             if isinstance(part, Mapping):
-                counts.update(
-                    {f"{call.path}.{n}": int(v) for n, v in part.items() if n.startswith(COUNTED)}
-                )
+                counts.update({f"{call.path}.{n}": int(v) for n, v in part.items() if n.startswith(COUNTED)})
     return counts
 
 

@@ -37,8 +37,8 @@ from flowgraph.pipeline.pipeline import (
     spec_of,
     type_of_leaves,
 )
-from flowgraph.recorder.replay import Body
 from flowgraph.recorder.ops import OPS, Spec
+from flowgraph.recorder.replay import Body
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, leaves_of
 

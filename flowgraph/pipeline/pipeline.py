@@ -22,8 +22,8 @@ from flowgraph.data.files import content_of, put_new, text_of
 from flowgraph.errors import LoweringError, PipelineError, UnknownNameError
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
-from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
 from flowgraph.verbs import verb

@@ -276,7 +276,12 @@ def _check_body(body: Body, before: int, row: int) -> None:
         specs |= {n: Spec(a.shape, dtype_name(a)) for n, a in case.constants.items()}
         for turn in case.turns:
             op = OPS.get(turn.op)
-            if op is None or turn.op == "replay" or turn.out in specs or any(a not in specs for a in turn.args):
+            if (
+                op is None
+                or turn.op == "replay"
+                or turn.out in specs
+                or any(a not in specs for a in turn.args)
+            ):
                 raise ShapeError(f"a turn of replay cannot do {turn.op}{list(turn.args)}")
             found = op.rule(*(specs[a] for a in turn.args), **turn.attrs)
             if found != turn.spec:

@@ -246,7 +246,9 @@ class _File:
         body = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
         unused = [n for n in ("s", "before", "row") if not _names_it("\n".join(body), n)]
         real, state = self.real, f"{self.names.module}_state"
-        head = f"static FG_APART void {name}({state} *s, const {real} *before, const {real} *row, {real} *after)"
+        head = (
+            f"static FG_APART void {name}({state} *s, const {real} *before, const {real} *row, {real} *after)"
+        )
         return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
 
     def signature(self, key: int | None) -> str:

@@ -24,7 +24,6 @@ from flowgraph import (
 from flowgraph.engines.c import generate
 from flowgraph.engines.c.expand import _RULES
 from flowgraph.pipeline.optimise import optimise, without
-from flowgraph.pipeline.program import specialise
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import ELEMENTWISE, OPS
 
