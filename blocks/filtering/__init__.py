@@ -2,7 +2,8 @@
 
 A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
 by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
-of those that believe in a Gaussian. `rewind` runs any filter over events that come late. Everything that a user's own filter needs is importable from here.
+of those that believe in a Gaussian. `rewind` runs any filter over events that come late. Everything that a
+user's own filter needs is importable from here.
 """
 
 from __future__ import annotations

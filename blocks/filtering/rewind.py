@@ -1,9 +1,9 @@
 """Late measurements, applied at their own time: a filter that goes back, and through what came since again.
 
-A filter is a graph whose ticks come in order of time. `rewind` runs such a graph over events that do not: it
-keeps what the graph remembered after each of its last ticks, and what happened at each. An event that was true
-before the last tick is put among these at its own time, and the ticks from there on are made again. So what is
-known after it is what the graph would have made of the events in order.
+A filter is a graph whose ticks come in order of time. `rewind` runs such a graph over events that do not:
+it keeps what the graph remembered after each of its last ticks, and what happened at each. An event that was
+true before the last tick is put among these at its own time, and the ticks from there on are made again. So
+what is known after it is what the graph would have made of the events in order.
 
     rewound = rewind(ins_eskf, {"imu": imu, "position": leica}, late=("position",), max_lag="0.5s", size=128,
                      start=..., noise=...)

@@ -8,7 +8,7 @@ source beside it, `NAME.stamp`, which is filled from the series; nobody else pay
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,9 +18,21 @@ from flowgraph.data.notes import note
 from flowgraph.data.series import Flight, Series
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.language.clock import nanoseconds
+from flowgraph.language.graph import NEVER
 from flowgraph.language.stamps import STAMP
 
-__all__ = ["LATENCY", "delayed", "delayed_flight", "stamp_events", "with_stamps"]
+__all__ = [
+    "LATENCY",
+    "Reordered",
+    "batched",
+    "delayed",
+    "delayed_flight",
+    "reorder",
+    "replayed",
+    "stamp_events",
+    "timeouts",
+    "with_stamps",
+]
 
 LATENCY = ".latency"
 """How the setting of a flight ends that delays a stream: `leica.latency=0.135`."""
@@ -104,6 +116,86 @@ def _seconds(key: str, given: Any) -> tuple[int, ...]:
             fix=f"for example {key}=0.135",
         ) from None
     return found
+
+
+class Reordered(dict[str, Series]):
+    """Streams in order of their stamps; `late` says how many of each came too late, and are left out."""
+
+    late: dict[str, int]
+
+
+def reorder(inputs: Mapping[str, Series], max_lag: Any) -> Reordered:
+    """Streams held back until they are in order: each value makes its tick `max_lag` after it was true.
+
+    Ticks are as far apart as the stamps, so `dt` is right; what a graph then knows is `max_lag` old. A value
+    that arrives later than that is left out and counted. Of two values of one stream with one stamp the
+    first that arrived is kept, and the other counted.
+
+    Args:
+        inputs: by name; those that are not late are held back as well.
+        max_lag: a duration such as "0.2s".
+
+    Raises:
+        DeclarationError: for one below 0.
+    """
+    lag = nanoseconds(max_lag, what="max_lag")
+    if lag < 0:
+        raise DeclarationError(
+            "nothing can be held back for less than no time",
+            path="reorder",
+            expected="0 ns or more",
+            got=repr(max_lag),
+            fix='write reorder(inputs, "0.2s")',
+        )
+    made = Reordered()
+    made.late = {}
+    for name, series in inputs.items():
+        kept = series[series.time - series.stamp <= lag]
+        kept = kept[np.argsort(kept.stamp, kind="stable")]
+        kept = kept[np.concatenate([[True], np.diff(kept.stamp) > 0])[: len(kept)]]
+        made[name] = Series(
+            kept.stamp + lag, kept.values, type=series.type, name=series.name, gaps=series.gaps, stamp=kept.stamp
+        )
+        made.late[name] = len(series) - len(kept)
+    return made
+
+
+def timeouts(series: Series, after: Any, *, until: int | None = None, name: str = "timeouts") -> Series:
+    """A source of the times at which a stream had not come for `after`: true, once in each silence.
+
+    Args:
+        series: the stream.
+        after: a duration such as "0.5s".
+        until: int64 ns, the last time at which it is looked; that of the last value, if left out.
+    """
+    span = nanoseconds(after, what="after")
+    end = int(series.time[-1]) if until is None and len(series) else until
+    nexts = np.append(series.time[1:], np.int64(2**63 - 1))
+    due = series.time + span
+    silent = due[(due < nexts) & (due <= (NEVER if end is None else end))]
+    return Series(silent, np.ones(len(silent), bool), name=name)
+
+
+def batched(series: Series, function: Callable[[Any], Any], *, name: str | None = None) -> Series:
+    """What a function makes of a whole recording at once: a value for each of its values, at their times.
+
+    Args:
+        series: the recording.
+        function: of all values, with the time axis in front, to as many.
+    """
+    return Series(series.time, function(series.values), name=name or series.name, gaps=series.gaps)
+
+
+def replayed(series: Series, *, start: int, name: str | None = None) -> Series:
+    """A recording as it is played again: its first value arrives at `start`, int64 ns, all else as far apart.
+
+    What a run gave, or what `batched` made of it, so becomes a source of another run, or later of the same.
+    """
+    by = int(start) - int(series.time[0]) if len(series) else 0
+    stamp = series.stamp + by if series.is_late else None
+    return Series(
+        series.time + by, series.values, type=series.type, name=name or series.name, gaps=series.gaps, stamp=stamp
+    )
 
 
 def with_stamps(sources: Iterable[str], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """A pipeline as the body of a replay: one tick of it is one turn.
 
-What a pipeline remembers (its register cells) and what it gives (its outputs) become one vector of reals, the
-history before or after a turn; what happens at a tick (which inputs came, when, and with what) becomes another,
-the row. A `Layout` says what lies where. Whole numbers are cut into pieces that a float32 holds exactly, so
-that a time in ns comes out as it went in.
+What a pipeline remembers (its register cells) and what it gives (its outputs) become one vector of reals,
+the history before or after a turn; what happens at a tick (which inputs came, when, and with what) becomes
+another, the row. A `Layout` says what lies where. Whole numbers are cut into pieces that a float32 holds
+exactly, so that a time in ns comes out as it went in.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ class Loop:
         self.body = body
 
     def __call__(self, history: Any, rows: Any, first: Any, count: Any, *, xp: Any) -> Any:
-        """The history (N, k) after `count` turns from place `first` on; recorded where anything is symbolic."""
+        """The history (N, k) after `count` turns from place `first` on; recorded where that is asked."""
         given = (history, rows, first, count)
         trace = next((x.trace for x in given if isinstance(x, Symbolic)), None)
         if trace is not None:

@@ -7,9 +7,10 @@ the one before it and of the row of what happened there:
 
     history[i] = turn(history[i - 1], rows[i])        i modulo N
 
-It is the one loop that a pipeline has: bounded, of one body, and without a branch but one. A body has one case
-or several, of which rows[i, 0] names the one for a turn by its number. Each is a list as a pipeline's own, in
-single assignment: value 0 is the history before (k), value 1 the row (m), and `result` what comes of them (k).
+It is the one loop that a pipeline has: bounded, of one body, and without a branch but one. A body has one
+case or several, of which rows[i, 0] names the one for a turn by its number. Each is a list as a pipeline's
+own, in single assignment: value 0 is the history before (k), value 1 the row (m), and `result` what comes of
+them (k).
 
 A `Body` is plain data, as it stands in a description: {"cases": [{"constants", "instructions", "result"}]}.
 """

@@ -1,12 +1,12 @@
 """`flowgraph bench late`: what becomes of a filter whose position comes late, by what is done about it.
 
-`ins_eskf` on MH_01 of EuRoC, whose Leica is given its right stamps and arrives `latency` seconds after them.
-All rows are scored at the same ticks, those of the inertial unit once the first fix has arrived, by the belief
-that was known at each.
+`ins_eskf` on MH_01 of EuRoC, whose Leica is given its right stamps and arrives `latency` seconds after
+them. All rows are scored at the same ticks, those of the inertial unit once the first fix has arrived, by the
+belief that was known at each.
 
     sorted       as if nothing were late: what no filter can know by then
-    foreseen     the best that can be known: the sorted belief of the last fix that has arrived, predicted to
-                 now by the inertial unit, step by step
+    foreseen     the best that can be known: the sorted belief of the last fix that has arrived, predicted
+                 to now by the inertial unit, step by step
     on arrival   each fix is taken for fresh when it comes
     reorder      all streams are held back until the fix has come: right, but the belief is old
     rewind       each fix is applied at its own time, and what came since is made again
