@@ -154,7 +154,12 @@ def reorder(inputs: Mapping[str, Series], max_lag: Any) -> Reordered:
         kept = kept[np.argsort(kept.stamp, kind="stable")]
         kept = kept[np.concatenate([[True], np.diff(kept.stamp) > 0])[: len(kept)]]
         made[name] = Series(
-            kept.stamp + lag, kept.values, type=series.type, name=series.name, gaps=series.gaps, stamp=kept.stamp
+            kept.stamp + lag,
+            kept.values,
+            type=series.type,
+            name=series.name,
+            gaps=series.gaps,
+            stamp=kept.stamp,
         )
         made.late[name] = len(series) - len(kept)
     return made
@@ -194,7 +199,12 @@ def replayed(series: Series, *, start: int, name: str | None = None) -> Series:
     by = int(start) - int(series.time[0]) if len(series) else 0
     stamp = series.stamp + by if series.is_late else None
     return Series(
-        series.time + by, series.values, type=series.type, name=name or series.name, gaps=series.gaps, stamp=stamp
+        series.time + by,
+        series.values,
+        type=series.type,
+        name=name or series.name,
+        gaps=series.gaps,
+        stamp=stamp,
     )
 
 

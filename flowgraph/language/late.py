@@ -213,9 +213,7 @@ def _(x: Type, asked: Type, *, span: int) -> Any:
     return np.int64(NEVER)
 
 
-def absent_for(
-    stream: Stream[Any], span: str | int, *, at: object, name: str | None = None
-) -> Stream[Any]:
+def absent_for(stream: Stream[Any], span: str | int, *, at: object, name: str | None = None) -> Stream[Any]:
     """Whether a stream has not come for longer than `span`, at the ticks of `at`.
 
     Before the first value, silence is counted from the first tick of either. Remembers one time. It fires

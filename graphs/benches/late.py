@@ -12,8 +12,9 @@ belief that was known at each.
     rewind       each fix is applied at its own time, and what came since is made again
     random       rewind, with delays of 0 to `spread` s that reorder the fixes
 
-`difference` is how far, in any number of the belief, rewind is from the sorted run at the time of each fix, once
-that fix and all before it have been applied, relative to max(1, |x|); covariances relative to the deviations.
+`difference` is how far, in any number of the belief, rewind is from the sorted run at the time of each fix,
+once that fix and all before it have been applied, relative to max(1, |x|); covariances relative to the
+deviations.
 """
 
 from __future__ import annotations
@@ -55,10 +56,9 @@ OFFSET = "-0.135"
 def late_eskf(
     imu: Stream[Imu], position: Stream[Position], *, settings: Mapping[str, Any], max_lag: str, size: int
 ):
-    """`ins_eskf` whose position may come late. `then`: the belief at the stamp of a fix that has just come."""
-    rewound = rewind(
-        ins_eskf, {"imu": imu, "position": position}, late=("position",), max_lag=max_lag, size=size, **settings
-    )  # fmt: skip
+    """`ins_eskf` whose position may come late. `then`: the belief at the stamp of a fix that just came."""
+    streams = {"imu": imu, "position": position}
+    rewound = rewind(ins_eskf, streams, late=("position",), max_lag=max_lag, size=size, **settings)
     return {"belief": rewound.now["belief"], "then": rewound.then["belief"], "stamp": rewound.stamp}
 
 
@@ -115,8 +115,8 @@ def late(
     return Report(
         made.rows,
         notes=(
-            f"The Leica arrives {latency:g} s late, in random up to {spread:g} s; a history of {places} places; "
-            f"errors at {len(made.times)} ticks of the inertial unit.",
+            f"The Leica arrives {latency:g} s late, in random up to {spread:g} s; a history of {places} "
+            f"places; errors at {len(made.times)} ticks of the inertial unit.",
             "Bytes are of registers, what lasts from tick to tick.",
         ),
     )

@@ -11,13 +11,17 @@ from flowgraph import (
     Series,
     Stream,
     apply,
+    batched,
     delayed,
     graph,
     latest,
     load_flight,
     lower,
+    reorder,
+    replayed,
     simulate,
     stamp_of,
+    timeouts,
 )
 from flowgraph.data.arrival import with_stamps
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
@@ -153,3 +157,47 @@ def test_only_what_arrives_has_stamps():
 
     with pytest.raises(DeclarationError, match="only what arrives has stamps"):
         asks.build()
+
+
+def test_reorder_holds_all_back_until_they_are_in_order():
+    late = delayed(FIX, ("0ms", "30ms"), seed=3)
+    held = reorder({"imu": IMU, "fix": late}, "30ms")
+    assert (held["fix"].stamp == FIX.time).all()
+    assert (held["fix"].time == FIX.time + 30 * MS).all()
+    assert (held["fix"].value == FIX.value).all()
+    assert (held["imu"].time == IMU.time + 30 * MS).all()
+    assert held.late == {"imu": 0, "fix": 0}
+    on_time = simulate(aged.build(), {"imu": IMU, "fix": FIX})
+    found = simulate(aged.build(), held)
+    assert (found["held"].value == on_time["held"].value).all()
+    assert (found["held"].time == on_time["held"].time + 30 * MS).all()
+
+
+def test_what_comes_later_than_is_waited_for_is_left_out_and_counted():
+    late = delayed(FIX, np.where(np.arange(8) == 2, 50, 10) * MS)
+    held = reorder({"fix": late}, "20ms")
+    assert held.late == {"fix": 1}
+    assert held["fix"].value.tolist() == [0, 1, 3, 4, 5, 6, 7]
+    twice = Series([10, 20, 30], [1.0, 2.0, 3.0], stamp=[5, 5, 30])
+    assert reorder({"fix": twice}, 100)["fix"].value.tolist() == [1.0, 3.0]
+    with pytest.raises(DeclarationError, match="held back for less than no time"):
+        reorder({"fix": FIX}, -1)
+    assert len(reorder({"fix": FIX[:0]}, 5)["fix"]) == 0
+
+
+def test_timeouts_are_ticks_of_their_own():
+    s = Series(np.array([0, 10, 50, 55]) * MS, np.zeros(4))
+    assert (timeouts(s, "15ms").time // MS).tolist() == [25]
+    assert (timeouts(s, "15ms", until=100 * MS).time // MS).tolist() == [25, 70]
+    assert (timeouts(s, "5ms", until=100 * MS).time // MS).tolist() == [5, 15, 60]
+    assert len(timeouts(s[:0], "5ms")) == 0
+
+
+def test_a_recording_is_worked_on_whole_and_played_again():
+    smooth = batched(FIX, lambda v: v - v.mean())
+    assert smooth.value.sum() == 0.0
+    again = replayed(delayed(smooth, "5ms"), start=10**9)
+    assert again.time[0] == 10**9
+    assert (np.diff(again.time) == np.diff(FIX.time)).all()
+    assert (again.time - again.stamp == 5 * MS).all()
+    assert not replayed(FIX, start=0).is_late

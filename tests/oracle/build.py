@@ -58,7 +58,7 @@ TWO: tuple[Callable[[Any, Any], Any], ...] = (
     lambda a, b: a - 2.0 * b,
     lambda a, b: 0.25 * a + 0.125 * a * b,
 )
-PAIR = lambda p: p[0] + 3.0 * p[1]  # noqa: E731 (one of a kind with those above)
+PAIR = lambda p: p[0] + 3.0 * p[1]
 WIDE = 64
 
 
@@ -132,9 +132,7 @@ BUILD: dict[str, Callable[..., Any]] = {
     "match": lambda n, a, b: match(
         a, b, tolerance=n["tolerance"] * MS, size=n["size"], full="drop_oldest"
     ).map(PAIR),
-    "merge": lambda n, a, b: merge(
-        a, b, tie=n["tie"] if n["tie"] != "mean" else lambda x, y: 0.5 * (x + y)
-    ),
+    "merge": lambda n, a, b: merge(a, b, tie=n["tie"] if n["tie"] != "mean" else lambda x, y: 0.5 * (x + y)),
     "optional": _optional,
     "running": _running,
     "window": lambda n, a, at: window(a, at=at, size=WIDE).map(_sum),

@@ -1,8 +1,8 @@
 """Random graphs as plain data: `{"sources": [...], "nodes": [...]}`, each node one operation.
 
 Whatever is drawn is legal: which streams are of one clock is kept in mind while drawing, by `Drawn.clock`.
-Times lie on a coarse grid, so that ties are frequent; numbers are multiples of 1/4, so that sums are exact, and
-thresholds are not, so that no engine's rounding decides.
+Times lie on a coarse grid, so that ties are frequent; numbers are multiples of 1/4, so that sums are exact,
+and thresholds are not, so that no engine's rounding decides.
 """
 
 from __future__ import annotations
@@ -119,8 +119,9 @@ def _sampled(d: Draw, name: str) -> None:
 
 def _both_held(d: Draw, name: str) -> None:
     at = d.union()
-    d.add("both_held", [d.any(), d.any(), *at], at[0].clock if len(at) == 1 else None, f=d.random.randrange(3),
-          inits=[d.quarter(), d.quarter()])  # fmt: skip
+    clock = at[0].clock if len(at) == 1 else None
+    inits = [d.quarter(), d.quarter()]
+    d.add("both_held", [d.any(), d.any(), *at], clock, f=d.random.randrange(3), inits=inits)
 
 
 def _every(d: Draw, name: str) -> None:
@@ -160,6 +161,10 @@ def _stamp(d: Draw, name: str) -> None:
     d.add("stamp", [d.streams[source]], d.streams[source].clock)
 
 
+def _tau(d: Draw) -> int | None:
+    return d.random.choice((None, 7))
+
+
 KINDS: dict[str, Callable[[Draw, str], None]] = {
     "map": _one("map", f=lambda d: d.random.randrange(4)),
     "apply": _apply,
@@ -189,8 +194,8 @@ KINDS: dict[str, Callable[[Draw, str], None]] = {
     "reduce": _window,
     "batch": _one("batch", same=False, n=lambda d: d.random.randint(1, 4)),
     "flat_map": _one("flat_map"),
-    "low_pass": _one("low_pass", tau=lambda d: d.random.choice((None, 7)), init=lambda d: d.random.choice((None, 0.5))),
-    "high_pass": _one("high_pass", tau=lambda d: d.random.choice((None, 7))),
+    "low_pass": _one("low_pass", tau=_tau, init=lambda d: d.random.choice((None, 0.5))),
+    "high_pass": _one("high_pass", tau=_tau),
     "delta_time": _one("delta_time"),
     "integrate": _one("integrate", rule=lambda d: d.random.choice(("rectangle", "trapezoid"))),
     "resample": _two("resample", how=lambda d: d.random.choice(("linear", "hold"))),
