@@ -12,8 +12,8 @@ from tests.oracle.check import fault
 from tests.oracle.meaning import Meaning
 from tests.oracle.specs import KINDS, drawn
 
-FOUND: tuple[int, ...] = ()
-"""Seeds that once showed a fault."""
+FOUND = (59,)
+"""Seeds that once showed a fault: a batch of one, whose clock is its stream's, was taken for a cycle."""
 
 
 @pytest.mark.parametrize("seed", range(50))

@@ -84,10 +84,10 @@ def given_events(pipeline: Pipeline, inputs: Any) -> dict[str, Any]:
         )
     given: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs
     names = [p.name for p in pipeline.inputs]
-    given = with_stamps(names, given)
     for name in given if inputs is given else ():
         if name not in names:
             raise UnknownNameError("input", name, names, path=pipeline.name)
+    given = with_stamps(names, given)
     found: dict[str, Any] = {}
     for port in pipeline.inputs:
         if port.name not in given:

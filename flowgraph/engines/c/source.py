@@ -24,6 +24,7 @@ from flowgraph.engines.c.header import NOT_FINITE, header
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
+from flowgraph.engines.c.preamble import MACROS, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.syntax import comment, ctype, number
@@ -137,8 +138,8 @@ class _File:
             "#include <math.h>",
             "#include <stddef.h>",
             "",
-            _REFUSED,
-            _MACROS,
+            REFUSED,
+            MACROS,
             helper_text(self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),
             *(text for _, text in self.expressions.functions.values()),
@@ -431,31 +432,3 @@ def _whole(buffer: Buffer, shape: tuple[int, ...]) -> Value:
 
 
 _HOST = {"real": np.float64, "bool": np.bool_}
-
-_REFUSED = """/* NaN and infinity mean something here, and sums are made in this order */
-#if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || defined(_M_FP_FAST) \\
-    || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
-#error "a filter needs IEEE arithmetic: compile without -ffast-math, -Ofast and what they stand for"
-#endif
-"""
-
-_MACROS = """#ifdef __cplusplus
-#define restrict __restrict
-#define FG_ZERO {}
-#else
-#define FG_ZERO {0}
-#endif
-#if defined(__GNUC__)
-#define FG_INLINE inline __attribute__((always_inline))
-#define FG_APART __attribute__((noinline))
-#else
-#define FG_INLINE inline
-#define FG_APART
-#endif
-/* with FLOWGRAPH_SIMD (and -fopenmp-simd) loops say that their turns may be done together */
-#ifdef FLOWGRAPH_SIMD
-#define FG_SIMD(text) _Pragma(#text)
-#else
-#define FG_SIMD(text)
-#endif
-"""
