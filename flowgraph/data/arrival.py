@@ -124,7 +124,7 @@ class Reordered(dict[str, Series]):
     late: dict[str, int]
 
 
-def reorder(inputs: Mapping[str, Series], max_lag: Any) -> Reordered:
+def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
     """Streams held back until they are in order: each value makes its tick `max_lag` after it was true.
 
     Ticks are as far apart as the stamps, so `dt` is right; what a graph then knows is `max_lag` old. A value
@@ -132,7 +132,7 @@ def reorder(inputs: Mapping[str, Series], max_lag: Any) -> Reordered:
     first that arrived is kept, and the other counted.
 
     Args:
-        inputs: by name; those that are not late are held back as well.
+        inputs: series, or (times, values), by name; those that are not late are held back as well.
         max_lag: a duration such as "0.2s".
 
     Raises:
@@ -149,7 +149,8 @@ def reorder(inputs: Mapping[str, Series], max_lag: Any) -> Reordered:
         )
     made = Reordered()
     made.late = {}
-    for name, series in inputs.items():
+    for name, given in inputs.items():
+        series = given if isinstance(given, Series) else Series(*given, name=name)
         kept = series[series.time - series.stamp <= lag]
         kept = kept[np.argsort(kept.stamp, kind="stable")]
         kept = kept[np.concatenate([[True], np.diff(kept.stamp) > 0])[: len(kept)]]

@@ -143,7 +143,7 @@ BUILD: dict[str, Callable[..., Any]] = {
     ).map(_sum),
     "low_pass": lambda n, a: low_pass(a, init=n["init"], **_share(n)),
     "high_pass": lambda n, a: high_pass(a, **_share(n)),
-    "delta_time": lambda n, a: delta_time(a),
+    "delta_time": lambda n, a: delta_time(a).map(lambda v: 1.0 * v),  # seconds fit no other unit
     "integrate": lambda n, a: integrate(a, rule=n["rule"]),
     "resample": lambda n, a, b: resample_at(a, b, how=n["how"]).map(
         lambda p, *, xp: p[1] + 1e-6 * xp.astype(p[0], xp.float64)
