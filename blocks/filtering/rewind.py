@@ -297,7 +297,8 @@ def _inner(
             got=repr(tuple(late)),
             fix=f"write late=({next(iter(streams), 'position')!r},)",
         )
-    inner = graph.build(**{n: Timing() for n in streams}, **settings)
+    timings: dict[str, Any] = dict.fromkeys(streams, Timing())
+    inner = graph.build(**timings, **settings)
     return inner, turns_of(lower(inner))
 
 

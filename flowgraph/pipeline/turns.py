@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,7 +140,8 @@ def turns_of(pipeline: Pipeline) -> Turns:
     programs = [optimise(specialise(pipeline, key), ARRAYS) for key in keys]
     cells = [c for r in pipeline.registers for c in r.cells]
     fields: list[tuple[tuple[int, ...], str]] = [(c.shape, c.dtype) for c in cells]
-    outputs, kept = [], []
+    outputs: list[tuple[int, tuple[int, ...]]] = []
+    kept: list[tuple[int, int | None]] = []
     for k, port in enumerate(pipeline.outputs):
         present, places = len(fields), []
         fields.append(((), "bool"))
@@ -209,14 +211,13 @@ def _case(
     trace = Trace()
     before, now = trace.input(Spec((history.size,), "real")), trace.input(Spec((row.size,), "real"))
     later: dict[int, Callable[[], Any]] = {
-        n: (lambda k=k: history.unpack(before, k, namespace)) for k, n in enumerate(program.reads)
+        n: partial(history.unpack, before, k, namespace) for k, n in enumerate(program.reads)
     }
-    later[pipeline.time] = lambda: row.unpack(now, 1, namespace)
-    for port, places in zip(pipeline.inputs, leaves, strict=True):
+    later[pipeline.time] = partial(row.unpack, now, 1, namespace)
+    for k, (port, places) in enumerate(zip(pipeline.inputs, leaves, strict=True)):
+        later[port.present] = partial(_present, now, k)
         for leaf, place in zip(port.leaves, places, strict=True):
-            later[leaf.value] = lambda place=place: row.unpack(now, place, namespace)
-    for k, port in enumerate(pipeline.inputs):
-        later[port.present] = lambda k=k: _bit(now[0], k)
+            later[leaf.value] = partial(row.unpack, now, place, namespace)
     values: dict[int, Symbolic] = {n: trace.constant(a) for n, a in program.constants.items()}
 
     def value(n: int) -> Symbolic:
@@ -248,6 +249,7 @@ def _case(
     return Case(dict(trace.constants), turns, result.number)
 
 
-def _bit(key: Any, k: int) -> Any:
-    whole = namespace.astype(key, namespace.int32)
+def _present(row: Any, k: int) -> Any:
+    """Whether input k came, by the key of a row."""
+    whole = namespace.astype(row[0], namespace.int32)
     return namespace.bitwise_and(namespace.bitwise_right_shift(whole, np.int32(k)), np.int32(1)) != 0

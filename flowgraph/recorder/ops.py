@@ -16,7 +16,8 @@ from typing import Any
 
 from flowgraph.recorder import ranges
 from flowgraph.recorder.replay import Body, Turn, body_of, play
-from flowgraph.recorder.specs import ShapeError, Spec
+from flowgraph.recorder.specs import ShapeError as ShapeError
+from flowgraph.recorder.specs import Spec as Spec
 from flowgraph.types import DTYPES, dtype_name
 
 
@@ -345,7 +346,8 @@ def _run_replay(xp: Any, *args: Any, body: Any) -> Any:
     def bind(turn: Turn, real: Any) -> Callable[..., Any]:
         return partial(OPS[turn.op].run, xp, **bound_attrs(turn.op, turn.attrs, real))
 
-    return play(*args, body, bind)
+    history, rows, first, count = args
+    return play(history, rows, first, count, body, bind)
 
 
 def _table() -> dict[str, Op]:

@@ -57,7 +57,7 @@ def late_eskf(
     imu: Stream[Imu], position: Stream[Position], *, settings: Mapping[str, Any], max_lag: str, size: int
 ):
     """`ins_eskf` whose position may come late. `then`: the belief at the stamp of a fix that just came."""
-    streams = {"imu": imu, "position": position}
+    streams: dict[str, Stream[Any]] = {"imu": imu, "position": position}
     rewound = rewind(ins_eskf, streams, late=("position",), max_lag=max_lag, size=size, **settings)
     return {"belief": rewound.now["belief"], "then": rewound.then["belief"], "stamp": rewound.stamp}
 
@@ -91,14 +91,15 @@ def late(
     (folder,) = recordings(data, "euroc", "MH_01*")
     flight = load_flight(f"euroc:{folder}", settings={"leica.time_offset": OFFSET})
     case = ins_eskf.case(_first(flight, duration))
-    on_time = simulate(case.graph, case.inputs, engine="c")
+    given = _series(case)
+    on_time = simulate(case.graph, given, engine="c")
     wait = round(latency * 1e9)
-    fix = case.inputs["position"]
+    fix = given["position"]
     since = int(fix.time[0]) + wait + round(max(spread - latency, 0.0) * 1e9)
     made = _Rows(case, on_time, since)
     made.add("sorted", "c", on_time, case.graph)
     made.add("foreseen", "python", replace(on_time, series={"belief": foreseen(case, on_time, wait)}), None)
-    tardy = {**case.inputs, "position": _arrived(fix, delayed(fix, wait))}
+    tardy = {**given, "position": _arrived(fix, delayed(fix, wait))}
     plain = ins_eskf.build(**clocks_of(tardy), **case.graph.settings)
     made.add("on arrival", "c", simulate(plain, tardy, engine="c"), plain)
     shown = replace(on_time, series={"belief": _old(on_time["belief"], wait)})
@@ -106,7 +107,7 @@ def late(
     places = _places(case, max(latency, spread))
     mixed = delayed(fix, ("0s", f"{spread}s"), seed=seed)
     for policy, fixes in (("rewind", delayed(fix, wait)), ("random", mixed)):
-        inputs = {**case.inputs, "position": _arrived(fix, fixes)}
+        inputs = {**given, "position": _arrived(fix, fixes)}
         lag = f"{max(latency, spread)}s"
         built = late_eskf.build(**clocks_of(inputs), settings=case.graph.settings, max_lag=lag, size=places)
         for engine in engines.split(","):
@@ -127,7 +128,7 @@ class _Rows:
 
     def __init__(self, case: Case, on_time: Result, since: int) -> None:
         self.case = case
-        imu = case.inputs["imu"].time
+        imu = _series(case)["imu"].time
         self.times = imu[imu >= since]
         self.rows: list[dict[str, Any]] = []
 
@@ -148,6 +149,11 @@ class _Rows:
                 "refused": stats.get("refused"),
             }
         )
+
+
+def _series(case: Case) -> Mapping[str, Series]:
+    assert isinstance(case.inputs, Mapping)  # as this graph's cases have them
+    return case.inputs
 
 
 def _first(flight: Flight, duration: float | None) -> Flight:
@@ -172,7 +178,7 @@ def _old(belief: Series, wait: int) -> Series:
 
 def _places(case: Case, lag: float) -> int:
     """Different times within a lag, and some more."""
-    times = np.union1d(case.inputs["imu"].time, case.inputs["position"].time)
+    times = np.union1d(*(s.time for s in _series(case).values()))
     ends = np.searchsorted(times, times + round(lag * 1e9), side="right")
     return int((ends - np.arange(len(times))).max()) + 4
 
@@ -182,7 +188,8 @@ def foreseen(case: Case, on_time: Result, wait: int) -> Series:
 
     Made by the step of the prediction itself, apart from any history.
     """
-    settings, imu, fixes = case.graph.settings, case.inputs["imu"], case.inputs["position"].time
+    given, settings = _series(case), case.graph.settings
+    imu, fixes = given["imu"], given["position"].time
     belief = on_time["belief"]
     controls = list(imu)
     held = {"noise": settings["noise"], "gravity": settings["gravity"]}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import (
+    Array,
     DeclarationError,
     FifoOverflowError,
     Scalar,
@@ -22,6 +23,10 @@ from flowgraph import (
 )
 from flowgraph.blocks.signals import Pose
 from tests.support import MS, all_engines, scalars
+
+
+class Turn(Signal):
+    q: Array = real(4)
 
 
 def events(*pairs):
@@ -87,10 +92,10 @@ def test_two_nearly_equal_attitudes_are_no_division_by_nothing():
     q = np.array([[1.0, 0, 0, 0], [1.0, 0, 0, 0]])
 
     @graph
-    def still(q: Stream[real(4)], at: Stream[Scalar]):
-        return resample_at(q, at, how="slerp")
+    def still(q: Stream[Turn], at: Stream[Scalar]):
+        return resample_at(q.map(lambda v: v.q), at, how="slerp")
 
-    found = simulate(still.build(), {"q": (np.array([0, 4]) * MS, q), "at": events((1, 0))})
+    found = simulate(still.build(), {"q": (np.array([0, 4]) * MS, Turn(q=q)), "at": events((1, 0))})
     assert found.output["1"].tolist() == [[1.0, 0, 0, 0]]
 
 
@@ -103,10 +108,6 @@ def test_silence_is_counted_from_the_first_tick_where_nothing_came():
     assert found.output.value.tolist() == [False, False, True, False]
 
 
-class Counted(Signal):
-    n: real(2)
-
-
 @pytest.mark.parametrize(
     ("wire", "kind", "said"),
     [
@@ -115,7 +116,7 @@ class Counted(Signal):
         (lambda a, b: resample_at(a > 1.0, b), TypeMismatchError, "real"),
         (lambda a, b: absent_for(a, "-1ms", at=b), DeclarationError, "span is not understood"),
         (lambda a, b: absent_for(a, -1, at=b), DeclarationError, "a silence has a length"),
-        (lambda a, b: zip_last(a, 1.0), DeclarationError, "stream"),
+        (lambda a, b: zip_last(a, None), DeclarationError, "stream"),  # type: ignore[arg-type]
     ],
 )
 def test_what_makes_no_sense_is_refused(wire, kind, said):

@@ -173,7 +173,7 @@ def three(a: Stream[Scalar], b: Stream[Scalar], c: Stream[Scalar] | None = None,
 
 def built(spec: Spec) -> Graph:
     """The graph of a spec."""
-    timings = {}
+    timings: dict[str, Any] = {}
     for name, source in dict(_named(spec)).items():
         kind, *more = source["timing"]
         timings[name] = aperiodic() if kind == "aperiodic" else periodic(more[0] * MS, phase=more[1] * MS)

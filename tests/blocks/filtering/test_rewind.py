@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 
@@ -396,10 +398,12 @@ def test_particles_say_why_they_cannot():
 def test_ins_eskf_with_a_late_motion_capture(engine):
     flight = load_flight("sim", seed=3, settings={"duration": "3", "vicon.rate": "10"})
     case = ins_eskf.case(flight)
-    fix = case.inputs["position"]
+    assert isinstance(case.inputs, Mapping)
+    given = dict(case.inputs)
+    fix = given["position"]
     tardy = delayed(fix, ("50ms", "300ms"), seed=1)
-    inputs = {**{n: s for n, s in case.inputs.items() if n != "attitude"}, "position": tardy}
-    plain = {n: s for n, s in case.inputs.items() if n != "attitude"}
+    inputs = {**{n: s for n, s in given.items() if n != "attitude"}, "position": tardy}
+    plain = {n: s for n, s in given.items() if n != "attitude"}
     settings = dict(case.graph.settings)
     on_time = simulate(ins_eskf.build(**clocks_of(plain), **settings), plain, engine=engine)
     built = late_eskf.build(**clocks_of(inputs), settings=settings, max_lag="300ms", size=80)
