@@ -182,6 +182,10 @@ class Series:
         """(n,) times in seconds since the first."""
         return (self.time - self.time[0]) * 1e-9 if len(self.time) else np.zeros(0)
 
+    def holding(self, values: Any, name: str | None = None) -> Series:
+        """Other values at the times and stamps of this series, with its rule for gaps."""
+        return Series(self.time, values, name=name or self.name, gaps=self.gaps, stamp=self._stamp)
+
     def __len__(self) -> int:
         return len(self.time)
 

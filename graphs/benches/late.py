@@ -41,6 +41,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.filtering import rewind
 from flowgraph.blocks.inertial.imu import predict
+from flowgraph.blocks.scoring.late import places
 from flowgraph.blocks.signals import Belief, Imu, Position
 from flowgraph.graphs.benches import recordings
 from flowgraph.graphs.ins_eskf import ins_eskf
@@ -104,19 +105,19 @@ def late(
     made.add("on arrival", "c", simulate(plain, tardy, engine="c"), plain)
     shown = replace(on_time, series={"belief": _old(on_time["belief"], wait)})
     made.add("reorder", "c", shown, case.graph)
-    places = _places(case, max(latency, spread))
+    size = places(given, round(max(latency, spread) * 1e9))
     mixed = delayed(fix, ("0s", f"{spread}s"), seed=seed)
     for policy, fixes in (("rewind", delayed(fix, wait)), ("random", mixed)):
         inputs = {**given, "position": _arrived(fix, fixes)}
         lag = f"{max(latency, spread)}s"
-        built = late_eskf.build(**clocks_of(inputs), settings=case.graph.settings, max_lag=lag, size=places)
+        built = late_eskf.build(**clocks_of(inputs), settings=case.graph.settings, max_lag=lag, size=size)
         for engine in engines.split(","):
             result = simulate(built, inputs, engine=engine.strip())
             made.add(policy, engine.strip(), result, built, difference(result, on_time, fixes))
     return Report(
         made.rows,
         notes=(
-            f"The Leica arrives {latency:g} s late, in random up to {spread:g} s; a history of {places} "
+            f"The Leica arrives {latency:g} s late, in random up to {spread:g} s; a history of {size} "
             f"places; errors at {len(made.times)} ticks of the inertial unit.",
             "Bytes are of registers, what lasts from tick to tick.",
         ),
@@ -174,13 +175,6 @@ def _old(belief: Series, wait: int) -> Series:
     known = place >= 0
     held = belief[place[known]]
     return Series(belief.time[known], held.values, type=belief.type, name=belief.name)
-
-
-def _places(case: Case, lag: float) -> int:
-    """Different times within a lag, and some more."""
-    times = np.union1d(*(s.time for s in _series(case).values()))
-    ends = np.searchsorted(times, times + round(lag * 1e9), side="right")
-    return int((ends - np.arange(len(times))).max()) + 4
 
 
 def foreseen(case: Case, on_time: Result, wait: int) -> Series:
