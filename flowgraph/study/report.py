@@ -20,9 +20,9 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.registry import flight_settings
+from flowgraph.data.settings import text
 from flowgraph.drawing import canvas
 from flowgraph.errors import UnknownNameError, plain
-from flowgraph.study.spec import text
 from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
 from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
 
@@ -123,7 +123,7 @@ def write_comparison(
     metrics = [m for m in metrics_of(theirs, names) if m in metrics_of(ours, names)]
     if metric is not None and metric not in metrics:
         raise UnknownNameError("metric", metric, metrics, path=f"{a}, {b}")
-    flown = {n for spec in {r["data"] for r in (*ours, *theirs)} for n in flight_settings(spec)}
+    flown = {n for spec in {r["data"] for r in (*ours, *theirs)} for n in flight_settings(spec, run=False)}
     for name in across:
         if name not in names or name not in flown:
             raise UnknownNameError(
