@@ -38,7 +38,7 @@ from flowgraph.verbs import provide as _provide
 if _TYPE_CHECKING:
     from flowgraph.data.arrival import batched, delayed, reorder, replayed, timeouts
     from flowgraph.data.batch import Batch
-    from flowgraph.data.export import write_tum
+    from flowgraph.data.export import write_table, write_tum
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
@@ -60,6 +60,7 @@ _LATER = {
     "replayed": "flowgraph.data.arrival",
     "timeouts": "flowgraph.data.arrival",
     "Batch": "flowgraph.data.batch",
+    "write_table": "flowgraph.data.export",
     "write_tum": "flowgraph.data.export",
     "arrays": "flowgraph.data.inputs",
     "clocks_of": "flowgraph.data.inputs",
@@ -201,6 +202,7 @@ __all__ = [
     "unzip",
     "when",
     "window",
+    "write_table",
     "write_tum",
     "zip",
     "zip_last",

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph import Array, Stream, block, collect, delay, latest, when
+from flowgraph.blocks.filtering.ageing import Ageing, aged_motion, doubt_control
 from flowgraph.blocks.filtering.methods import Advanced, Method, Seen, believed, extended
 from flowgraph.blocks.kalman.lost import PATIENCE
 from flowgraph.blocks.signals import Gaussian
@@ -62,9 +63,11 @@ def filtered(
     start: Gaussian | FirstMeasurement,
     control: Stream[Any] | None = None,
     control_at_first: Any = None,
+    held: Ageing | None = None,
     method: Method | None = None,
     gate: float | None = None,
     patience: int = PATIENCE,
+    smoothing: bool = False,
     name: str = "filter",
 ) -> Stream[Gaussian]:
     """The belief about the state of a model, by any method: a sub-graph.
@@ -80,10 +83,14 @@ def filtered(
             from the first message.
         control: the stream of controls, each held until the next; None for a motion that has none.
         control_at_first: before the first control came; zeros if left out.
+        held: from which age on a control that is held is doubted, and how fast: `Ageing(after, spread)`; one
+            that is held counts as fresh if left out.
         method: `extended()`, `unscented()`, `particles(1000)`, ...; extended if left out.
         gate: as in `update_linear`: below 1 the probability with which an honest measurement passes, from 1
             on the largest NIS. Refused measurements change nothing.
         patience: how many refusals in a row are taken for outliers; then the gate opens again (`find_back`).
+        smoothing: collect what a smoother needs too: the `posterior`, and the `cross` covariance of each
+            belief with the next prior; of particles the `cloud`; and the `control` of each step.
         name: of the sub-graph; two in one graph need two.
 
     Returns:
@@ -98,15 +105,22 @@ def filtered(
     ticks = functools.reduce(operator.or_, (clock_of(s) for s in streams))
     rest = motion.space.resting() if isinstance(start, FirstMeasurement) else _fitting(start, motion)
     with builder("filtered").scope(name, given=name != "filter"):
-        held = None
+        last = None
         if control is not None:
             at_first = zeros(control.type) if control_at_first is None else control_at_first
-            held = latest(control, init=at_first, at=ticks, name="control")
+            last = latest(control, init=at_first, at=ticks, name="control")
+            if held is not None:
+                last = doubt_control(last, control, ageing=held, at=ticks, name="doubt")
+                motion = aged_motion(motion, control.type, held)
         initial = method.begin(rest, motion, NumpyDraw("start", seed_words(method.seed), 0), np)
         kept = delay(initial, name="belief")
-        found = method.advance(kept, held, motion, seen, at=ticks, gate=gate, patience=patience)
+        found = method.advance(kept, last, motion, seen, at=ticks, gate=gate, patience=patience)
+        more = dict(method.smoothable(kept, last, motion, found, at=ticks)) if smoothing else {}
         if isinstance(start, FirstMeasurement):
-            found = _from_first(found, start, seen, initial, motion, method)
+            found, more = _from_first(found, more, start, seen, initial, motion, method)
+        if smoothing:
+            more["posterior"] = found.belief
+            more |= {} if last is None else {"control": last}
         kept.feed(found.kept)
     own = "" if name == "filter" else f"{name}_"
     collect(found.prior, f"{own}prior")
@@ -114,7 +128,7 @@ def filtered(
         front = own + (f"{label}_" if len(seen) > 1 else "")
         collect(stream, f"{front}innovation")
         collect(found.log_likelihoods[label], f"{front}log_likelihood")
-    for label, stream in found.more.items():
+    for label, stream in [*found.more.items(), *more.items()]:
         collect(stream, own + label)
     return found.belief
 
@@ -200,9 +214,10 @@ def _chosen(first: Array, a: Any, b: Any, xp: Any) -> Any:
 
 
 def _from_first(
-    found: Advanced, start: FirstMeasurement, seen: list[Seen], rest: Any, motion: Motion, method: Method
-) -> Advanced:
-    """What a tick makes, where the filter waits for its first message."""
+    found: Advanced, more: Mapping[str, Any], start: FirstMeasurement, seen: list[Seen], rest: Any,
+    motion: Motion, method: Method,
+) -> tuple[Advanced, dict[str, Any]]:  # fmt: skip
+    """What a tick makes, and `more` of it, where the filter waits for its first message."""
     message = next((one.stream for one in seen if one.model is start.measurement), None)
     if message is None:
         raise DeclarationError(
@@ -219,7 +234,7 @@ def _from_first(
     )  # fmt: skip
     started.feed(now)
     belief = believed(kept, method=method, motion=motion, name="started_belief")
-    return Advanced(
+    advanced = Advanced(
         kept,
         once(prior, now, name="started_prior"),
         once(belief, now, name="once"),
@@ -227,3 +242,4 @@ def _from_first(
         {name: once(s, started, name=f"{name}_likelihood") for name, s in found.log_likelihoods.items()},
         found.more,
     )
+    return advanced, {name: once(s, now, name=f"started_{name}") for name, s in more.items()}

@@ -37,7 +37,8 @@ from flowgraph.blocks.scoring.cases import (
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import unbiased_factors
 from flowgraph.blocks.signals import Imu
-from flowgraph.data.registry import graph_names, parsed_settings, setting_names
+from flowgraph.data.registry import graph_names
+from flowgraph.data.settings import parsed_settings, setting_names
 from flowgraph.language.declare import GraphFunction
 
 UNIT = ImuNoise(0.01, 0.1, 0.0, 0.0)
