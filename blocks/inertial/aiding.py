@@ -17,6 +17,7 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from flowgraph.blocks.geometry.rotations import (
 from flowgraph.blocks.kalman.filters import accepts, masked
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
-__all__ = ["aid_attitude", "aid_position"]
+__all__ = ["aid_attitude", "aid_position", "correct_belief"]
 
 Spread = float | tuple[float, float, float]
 """A standard deviation: one number for three axes, or one each."""
@@ -42,18 +43,16 @@ ORIGIN = (0.0, 0.0, 0.0)
 ALIGNED = (1.0, 0.0, 0.0, 0.0)
 
 
-def _reset_table() -> np.ndarray:
-    """(3, 225): maps an attitude correction d to -skew(d)/2 in the attitude block of a 15 x 15 matrix."""
-    table = np.zeros((3, 15, 15))
+@functools.lru_cache
+def _reset_table(n: int) -> np.ndarray:
+    """(3, n^2): maps an attitude correction d to -skew(d)/2 in the attitude block of an n x n matrix."""
+    table = np.zeros((3, n, n))
     table[0, 7, 8], table[0, 8, 7] = 0.5, -0.5
     table[1, 8, 6], table[1, 6, 8] = 0.5, -0.5
     table[2, 6, 7], table[2, 7, 6] = 0.5, -0.5
-    flat = table.reshape(3, 225)
+    flat = table.reshape(3, n * n)
     flat.flags.writeable = False
     return flat
-
-
-_RESET = _reset_table()
 
 
 @block
@@ -92,7 +91,7 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
 
 
 @block
@@ -126,7 +125,7 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
 
 
 def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:
@@ -160,11 +159,19 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
     return to_rotation_vector(multiply(conjugate(q, xp=xp), measured, xp=xp), xp=xp)
 
 
-def _correct(
-    prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
-) -> tuple[Belief, KalmanInnovation]:
-    """The update every measurement shares: the posterior and the innovation, of the known entries."""
+def correct_belief(
+    prior: Any, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
+) -> tuple[Any, KalmanInnovation]:
+    """The update every measurement shares: the posterior and the innovation, of the known entries.
+
+    Args:
+        prior: a `Belief`, or a `NavigationBelief`.
+        apart: measured minus predicted (m); NaN where an entry was not measured.
+        H: (m, n), the Jacobian by the error of the belief. R: (m, m), the covariance of the noise.
+        gate, invariant: as in `aid_position`.
+    """
     P = prior.covariance
+    n = P.shape[-1]
     present = ~xp.isnan(apart)
     residual = xp.where(present, apart, 0.0)
     H, R = masked(H, R, present, xp)
@@ -172,9 +179,9 @@ def _correct(
     S = HP @ H.mT + R
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
-    nis = (column.mT @ solved[..., 15:])[..., 0, 0]
+    nis = (column.mT @ solved[..., n:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
-    K = solved[..., :15].mT
+    K = solved[..., :n].mT
     if gate is not None:
         K = K * xp.astype(accepted, K.dtype)[..., None, None]
     d = (K @ column)[..., 0]
@@ -187,21 +194,33 @@ def _correct(
         diagonal = (swing, swing, stay, stay, stay)
         rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
         reset = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+        if n > 15:
+            reset = _extended(reset, n - 15, xp)
     else:
         to_place, to_speed = d[..., 0:3], d[..., 3:6]
-        one = xp.eye(15, dtype=P.dtype)
-        reset = xp.reshape(turn @ xp.asarray(_RESET, dtype=P.dtype), (*d.shape[:-1], 15, 15)) + one
+        one = xp.eye(n, dtype=P.dtype)
+        reset = xp.reshape(turn @ xp.asarray(_reset_table(n), dtype=P.dtype), (*d.shape[:-1], n, n)) + one
     gain = reset @ K
     A = reset - gain @ H
     P = A @ P @ A.mT + gain @ R @ gain.mT
-    posterior = Belief(
-        position=prior.position + to_place,
-        velocity=prior.velocity + to_speed,
-        attitude=multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
-        gyro_bias=prior.gyro_bias + d[..., 9:12],
-        accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],
-        covariance=0.5 * (P + P.mT),
-    )
+    values = {
+        "position": prior.position + to_place,
+        "velocity": prior.velocity + to_speed,
+        "attitude": multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
+        "gyro_bias": prior.gyro_bias + d[..., 9:12],
+        "accelerometer_bias": prior.accelerometer_bias + d[..., 12:15],
+        "covariance": 0.5 * (P + P.mT),
+    }
+    if n > 15:
+        values["parameters"] = prior.parameters + d[..., 15:]
+    posterior = type(prior)(**values)
     parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
     innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
     return posterior, innovation
+
+
+def _extended(reset: Array, more: int, xp: Any) -> Array:
+    """A matrix (15, 15) and the identity of so many numbers behind it."""
+    side, corner = 0.0 * reset[..., :, :more], 0.0 * reset[..., :more, :more]
+    below = xp.concat([side.mT, corner + xp.eye(more, dtype=reset.dtype)], axis=-1)
+    return xp.concat([xp.concat([reset, side], axis=-1), below], axis=-2)

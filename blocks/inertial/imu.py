@@ -25,7 +25,7 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.blocks.signals import GRAVITY, Belief, Imu
 
-__all__ = ["GRAVITY", "ImuNoise", "predict"]
+__all__ = ["GRAVITY", "ImuNoise", "carried", "predict"]
 
 
 @dataclass(frozen=True)
@@ -137,15 +137,33 @@ def predict(
 
     Fires when its inputs do. No state of its own.
     """
-    kind = belief.position.dtype
     rate = imu.gyro - belief.gyro_bias
     force = imu.specific_force - belief.accelerometer_bias
+    pull = xp.asarray(gravity, dtype=belief.position.dtype)
+    values, F = carried(belief, rate, force, pull, dt=dt, xp=xp)
+    Q = xp.asarray(_density(noise), dtype=pull.dtype) * (0.5 * dt)
+    P = F @ (belief.covariance + Q) @ F.mT + Q
+    return Belief(
+        **values,
+        gyro_bias=belief.gyro_bias,
+        accelerometer_bias=belief.accelerometer_bias,
+        covariance=0.5 * (P + P.mT),
+    )
+
+
+def carried(
+    belief: Any, rate: Array, force: Array, gravity: Array, *, dt: float, xp: Any
+) -> tuple[dict[str, Array], Array]:
+    """Position, velocity and attitude after `dt` seconds at a rate (3) and specific force (3) without biases,
+    by name, and the Jacobian (15, 15) of the step in the order of `Belief`; the equations are those of `predict`.
+    """
+    kind = belief.position.dtype
     half = from_rotation_vector(rate * (0.5 * dt), xp=xp)
     by_half = right_product(half, xp=xp)
     middle = by_half @ belief.attitude[..., None]  # the attitude half-way, as a column
     both = to_matrix(xp.concat([middle.mT, half[..., None, :]], axis=-2), xp=xp)
     R, back = both[..., 0, :, :], both[..., 1, :, :].mT
-    acceleration = (R @ force[..., None])[..., 0] + xp.asarray(gravity, dtype=kind)
+    acceleration = (R @ force[..., None])[..., 0] + gravity
     step = acceleration * dt
 
     # d(velocity')/d(attitude, gyro bias, accelerometer bias); the position's are dt/2 times these
@@ -155,13 +173,9 @@ def predict(
     biases = _like(_BIASES_STAY, R, xp)
     moved = _like(xp.asarray(_STAYS, dtype=kind) + xp.asarray(_DRIFTS, dtype=kind) * dt, R, xp)
     F = xp.concat([moved, xp.concat([pull * (0.5 * dt), pull, turn, biases], axis=-2)], axis=-1)
-    Q = xp.asarray(_density(noise), dtype=kind) * (0.5 * dt)
-    P = F @ (belief.covariance + Q) @ F.mT + Q
-    return Belief(
-        position=belief.position + (belief.velocity + 0.5 * step) * dt,
-        velocity=belief.velocity + step,
-        attitude=normalize((by_half @ middle)[..., 0], xp=xp),
-        gyro_bias=belief.gyro_bias,
-        accelerometer_bias=belief.accelerometer_bias,
-        covariance=0.5 * (P + P.mT),
-    )
+    values = {
+        "position": belief.position + (belief.velocity + 0.5 * step) * dt,
+        "velocity": belief.velocity + step,
+        "attitude": normalize((by_half @ middle)[..., 0], xp=xp),
+    }
+    return values, F

@@ -46,6 +46,15 @@ from flowgraph.blocks.signals.motion import (
     WorldAcceleration,
     WorldForce,
 )
+from flowgraph.blocks.signals.navigation import (
+    GnssFix,
+    GnssHeading,
+    GnssPosition,
+    GnssVelocity,
+    Height,
+    NavigationBelief,
+    WheelSpeed,
+)
 from flowgraph.blocks.signals.particles import (
     Ancestors,
     Cloud,
@@ -139,4 +148,11 @@ __all__ = [
     "Window",
     "NormalEquations",
     "vector_of",
+    "GnssFix",
+    "GnssHeading",
+    "GnssPosition",
+    "GnssVelocity",
+    "Height",
+    "NavigationBelief",
+    "WheelSpeed",
 ]
