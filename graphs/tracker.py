@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Stream, block, graph
+from flowgraph import Case, Result, Series, Stream, block, graph
 from flowgraph.blocks.filtering import (
     LinearMeasurement,
     cubature,
@@ -27,9 +27,10 @@ from flowgraph.blocks.filtering import (
     particles,
     unscented,
 )
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.tracking import constant_velocity
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive, one_of
 from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
 
@@ -42,6 +43,16 @@ def seen_in_plane(belief: Gaussian) -> PlaneBelief:
     return PlaneBelief(position=belief.mean[..., :2], covariance=belief.covariance[..., :2, :2])
 
 
+def plane_steps(result: Result) -> Steps:
+    """Those of a run that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, seen_in_plane.step(belief), name=smoothed.name)
+
+    return steps_of(result)._replace(named=named)
+
+
 @graph
 def tracker(
     position: Stream[PlanePosition],
@@ -52,17 +63,21 @@ def tracker(
     method: Any = None,
     gate: float | None = None,
     patience: int = 5,
+    smoothing: bool = False,
 ):
     """A point whose velocity wanders, followed by its positions.
 
-    Collected at every position: `belief`, `prior`, `posterior`, `innovation` and `log_likelihood`.
+    Collected at every position: `belief`, `prior`, `posterior`, `innovation` and `log_likelihood`; with
+    `smoothing` what a smoother needs too.
     """
     motion = constant_velocity(wander)
     seen = LinearMeasurement(motion.space, np.eye(2, 4), noise=position_noise**2)
     belief = filtered(
-        motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience
-    )
-    return {"belief": seen_in_plane(belief), "posterior": belief}
+        motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience,
+        smoothing=smoothing,
+    )  # fmt: skip
+    posterior = {} if smoothing else {"posterior": belief}  # then the filter collects it
+    return {"belief": seen_in_plane(belief), **posterior}
 
 
 @on_flight(tracker, "position", ranged=False)
@@ -75,7 +90,7 @@ def for_flight(
     position_noise: Positive | None = None,
     cloud: Particles,
     gated: Gated,
-    scored: Scored,
+    scored: Smoothed,
 ) -> Case:
     """Start the filter at the first position of a flight in the plane, such as `sim:plane`.
 
@@ -102,10 +117,11 @@ def for_flight(
     noise = on.noise("position_noise", position_noise)
     first = on.inputs["position"]["position"][0]
     return on.case(
-        scored.score(on, plane_errors),
+        scored.score(on, plane_errors, steps=plane_steps),
         start=motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0)),
         wander=wander,
         position_noise=noise,
         method=chosen,
+        smoothing=scored.smoothed,
         **gated.gating(),
     )

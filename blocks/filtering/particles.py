@@ -365,6 +365,11 @@ class Particles(Method):
             {"effective_sample_size": size},
         )
 
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> dict[str, Any]:
+        return {"cloud": found.kept}
+
 
 def particles(
     count: int,

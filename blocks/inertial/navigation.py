@@ -12,7 +12,7 @@ secs. 2.4 (gravity, the Earth's turn), 5.4 (a local frame), 14.2 (the states of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ __all__ = [
     "earth_at",
     "extended",
     "gravity_at",
+    "navigation_crossing",
     "places",
     "predict_navigation",
 ]
@@ -147,42 +148,10 @@ def predict_navigation(
 
     Fires when its inputs do. No state of its own.
     """
-    kind = belief.position.dtype
-    rate = imu.gyro - belief.gyro_bias
-    force = imu.specific_force - belief.accelerometer_bias
-    raw = {"gyro_scale": rate, "accelerometer_scale": force}
-    where = places(estimated)
-    if "gyro_scale" in where:
-        rate = rate * (1.0 - belief.parameters[..., where["gyro_scale"]])
-    if "accelerometer_scale" in where:
-        force = force * (1.0 - belief.parameters[..., where["accelerometer_scale"]])
-    pull = xp.asarray(gravity, dtype=kind)
-    if earth is not None:
-        turn = xp.asarray(earth.turn, dtype=kind)
-        R = to_matrix(belief.attitude, xp=xp)
-        rate = rate - (R.mT @ turn[..., None])[..., 0]
-        strength = math.sqrt(sum(g * g for g in gravity)) / earth.radius
-        fades = xp.asarray(np.diag([-strength, -strength, 2.0 * strength]), dtype=kind)
-        swing = xp.asarray(-2.0 * _cross(earth.turn), dtype=kind)
-        pull = pull + (fades @ belief.position[..., None] + swing @ belief.velocity[..., None])[..., 0]
-    values, F = carried(belief, rate, force, pull, dt=dt, xp=xp)
-    more = sum(PARAMETERS[name].size for name in estimated)
-    if more:
-        columns = []
-        for name in estimated:
-            size = PARAMETERS[name].size
-            if name in raw:  # as the bias of its axis does, times the reading
-                at = 9 if name == "gyro_scale" else 12
-                upper = F[..., :9, at : at + 3] * raw[name][..., None, :]
-                columns.append(xp.concat([upper, 0.0 * F[..., 9:, :3]], axis=-2))
-            else:
-                columns.append(0.0 * F[..., :, :size])
-        below = xp.concat(
-            [0.0 * F[..., :more, :], 0.0 * F[..., :more, :more] + xp.eye(more, dtype=kind)], axis=-1
-        )
-        F = xp.concat([xp.concat([F, *columns], axis=-1), below], axis=-2)
+    values, F = _carried(belief, imu, gravity, earth, estimated, dt, xp)
+    if estimated:
         values["parameters"] = belief.parameters
-    Q = xp.asarray(_power(noise, estimated), dtype=kind) * (0.5 * dt)
+    Q = xp.asarray(_power(noise, estimated), dtype=belief.position.dtype) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
     return type(belief)(
         **values,
@@ -190,6 +159,63 @@ def predict_navigation(
         accelerometer_bias=belief.accelerometer_bias,
         covariance=0.5 * (P + P.mT),
     )
+
+
+def navigation_crossing(
+    gravity: tuple[float, float, float], earth: Earth | None, estimated: tuple[str, ...]
+) -> Callable[[Any, Imu, Any, Any], Array]:
+    """What `cross_covariance` asks of a filter that predicts with `predict_navigation`."""
+
+    def crossing(belief: Any, imu: Imu, dt: Any, xp: Any) -> Array:
+        return belief.covariance @ _carried(belief, imu, gravity, earth, estimated, dt, xp)[1].mT
+
+    return crossing
+
+
+def _carried(
+    belief: Any,
+    imu: Imu,
+    gravity: tuple[float, float, float],
+    earth: Earth | None,
+    estimated: tuple[str, ...],
+    dt: Any,
+    xp: Any,
+) -> tuple[dict[str, Array], Array]:
+    """Position, velocity and attitude after a step, by name, and the Jacobian of all that is estimated."""
+    kind = belief.position.dtype
+    rate = imu.gyro - belief.gyro_bias
+    force = imu.specific_force - belief.accelerometer_bias
+    raw = {"gyro_scale": rate, "accelerometer_scale": force}
+    where = places(estimated)
+    gyro, pushed = imu.gyro, imu.specific_force
+    if "gyro_scale" in where:
+        gyro = gyro - rate * belief.parameters[..., where["gyro_scale"]]
+    if "accelerometer_scale" in where:
+        pushed = pushed - force * belief.parameters[..., where["accelerometer_scale"]]
+    pull = xp.asarray(gravity, dtype=kind)
+    if earth is not None:
+        turn = xp.asarray(earth.turn, dtype=kind)
+        R = to_matrix(belief.attitude, xp=xp)
+        gyro = gyro - (R.mT @ turn[..., None])[..., 0]
+        strength = math.sqrt(sum(g * g for g in gravity)) / earth.radius
+        fades = xp.asarray(np.diag([-strength, -strength, 2.0 * strength]), dtype=kind)
+        swing = xp.asarray(-2.0 * _cross(earth.turn), dtype=kind)
+        pull = pull + (fades @ belief.position[..., None] + swing @ belief.velocity[..., None])[..., 0]
+    values, F = carried(belief, Imu(gyro=gyro, specific_force=pushed), pull, dt, xp)
+    more = sum(PARAMETERS[name].size for name in estimated)
+    if not more:
+        return values, F
+    columns = []
+    for name in estimated:
+        if name in raw:  # as the bias of its axis does, times the reading
+            at = 9 if name == "gyro_scale" else 12
+            upper = F[..., :9, at : at + 3] * raw[name][..., None, :]
+            columns.append(xp.concat([upper, 0.0 * F[..., 9:, :3]], axis=-2))
+        else:
+            columns.append(0.0 * F[..., :, : PARAMETERS[name].size])
+    corner = 0.0 * F[..., :more, :more] + xp.eye(more, dtype=kind)
+    below = xp.concat([0.0 * F[..., :more, :], corner], axis=-1)
+    return values, xp.concat([xp.concat([F, *columns], axis=-1), below], axis=-2)
 
 
 def _power(noise: ImuNoise, estimated: Sequence[str]) -> np.ndarray:

@@ -256,6 +256,11 @@ class Smoothed(Scored):
     smooth: Annotated[str, one_of("none", "rts")] = "none"
     lag: NotNegative | None = None
 
+    @property
+    def smoothed(self) -> bool:
+        """Whether a graph is to collect what a smoother needs."""
+        return self.smooth != "none" or self.lag is not None
+
     def _smoother(self) -> tuple[str, float | None]:
         return self.smooth, self.lag
 

@@ -28,6 +28,8 @@ SMOOTHED = (
     "position_max_m",
     "velocity_rmse_mps",
     "attitude_rmse_deg",
+    "tilt_rmse_deg",
+    "heading_rmse_deg",
     "nees_mean",
     "nees_inside",
 )

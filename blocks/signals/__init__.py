@@ -13,7 +13,9 @@ from flowgraph.blocks.signals.beliefs import (
     AttitudeRateBelief,
     Bank,
     Belief,
+    CrossCovariance,
     EulerAngles,
+    FilterStep,
     Gaussian,
     GaussianRoot,
     HeadingBelief,
@@ -23,6 +25,7 @@ from flowgraph.blocks.signals.beliefs import (
     PointBelief,
     PoseBelief,
     QuaternionBelief,
+    SmoothedBelief,
 )
 from flowgraph.blocks.signals.calibration import (
     Alignment,
@@ -120,6 +123,9 @@ __all__ = [
     "Gaussian",
     "GaussianRoot",
     "Bank",
+    "CrossCovariance",
+    "FilterStep",
+    "SmoothedBelief",
     "KalmanInnovation",
     "Innovation",
     "Belief",
