@@ -6,11 +6,12 @@ P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-from flowgraph import Stream, collect, delay, graph, latest
+from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.inertial.navigation import Earth, predict_navigation
+from flowgraph.blocks.inertial.navigation import Earth, navigation_crossing, predict_navigation
 from flowgraph.blocks.inertial.outdoors import (
     Antenna,
     Resting,
@@ -22,7 +23,13 @@ from flowgraph.blocks.inertial.outdoors import (
     aid_wheels,
     standing,
 )
+from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.metrics.navigation import antenna_errors
+from flowgraph.blocks.models.inertial_pose import navigation_steps
+from flowgraph.blocks.scoring.cases import OnFlight, on_flight
+from flowgraph.blocks.scoring.outdoors import Outdoors
+from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -62,12 +69,14 @@ def gnss_ins(
     held: Held | None = None,
     invariant: bool = False,
     patience: int = PATIENCE,
+    smoothing: bool = False,
 ):
     """Error-state Kalman filter of 15 states and more, aided by whichever of its sensors there are.
 
     State: position, velocity, attitude, gyroscope and accelerometer bias, and what is `estimated` beside them.
     Every tick predicts to now; each measurement that is there then corrects, one after the other, and each has a
-    gate and a way back of its own. Collected: `belief` at every tick, and the innovation of each sensor.
+    gate and a way back of its own. Collected: `belief` at every tick, and the innovation of each sensor; with
+    `smoothing` what a smoother needs too.
     """
     aids = {
         "gnss": gnss, "gnss_velocity": gnss_velocity, "heading": heading, "magnetometer": magnetometer,
@@ -82,6 +91,9 @@ def gnss_ins(
         belief, control, noise=noise, gravity=gravity, earth=earth, estimated=estimated, name="predict"
     )
     now = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
+    if smoothing:
+        crossing = navigation_crossing(gravity, earth, estimated)
+        collect_steps(belief, now, control, crossing=crossing, held=held)
 
     def told(corrected: tuple[Any, Any], name: str) -> Any:
         posterior, innovation = corrected
@@ -124,3 +136,50 @@ def gnss_ins(
         collect(innovation, "rest_innovation")
     belief.feed(now)
     return {"belief": now}
+
+
+@on_flight(gnss_ins, told=with_imu)
+def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
+    """Start and tune the filter for a flight with an inertial unit and any of the other sensors.
+
+    The start is the truth's, or that of a body at rest, or of an alignment in motion, which finds the heading by
+    the first seconds of positions. Where the truth is positions alone it is that of the antenna, and the estimate
+    is compared there.
+
+    Args:
+        flight: with the stream `imu` and any of `gnss`, `gps`, `rtk` (positions, in m or as latitude, longitude and
+            height, with a covariance or none), `gnss_velocity`, `heading`, `magnetometer`, `barometer`, `wheels`.
+        gyro_factor, accelerometer_factor: on the densities of the flight's IMU. If left out, 15 and 20 for a
+            real unit, whose data sheet knows nothing of vibration, aliasing and held samples; 1 for simulated
+            noise, which is what it says.
+
+    Raises:
+        DataError: where the flight lacks a stream.
+        DeclarationError, UnknownNameError: for a setting that is out of range.
+    """
+    inputs, world, name = filter.inputs(on)
+    antenna, known = filter.antenna(on, name)
+    estimated = filter.estimated(on, inputs, known)
+    start, inputs, invariant = filter.started(on, inputs, world, estimated, antenna)
+    simulated = "noise" in on.flight.info or "still" in on.flight.info
+    errors = partial(antenna_errors, antenna=antenna, estimated=estimated)
+    return on.case(
+        filter.score(on, errors, steps=partial(navigation_steps, estimated=estimated)),
+        inputs=inputs,
+        start=start,
+        noise=filter.imu_noise(on, (1.0, 1.0) if simulated else (15.0, 20.0)),
+        antenna=antenna,
+        estimated=estimated,
+        north=filter.north(on, world) if "magnetometer" in inputs else 0.0,
+        compass_noise=filter.compass_noise,
+        height_noise=filter.height_noise,
+        speed_noise=filter.speed_noise,
+        slip=filter.slip,
+        resting=filter.resting(),
+        gravity=world.gravity,
+        earth=world.earth,
+        held=filter.held(on, inputs["imu"], inputs),
+        invariant=invariant,
+        smoothing=filter.smoothed,
+        **filter.gating(),
+    )

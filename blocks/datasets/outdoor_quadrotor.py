@@ -52,7 +52,7 @@ SETTINGS: Mapping[str, str] = {
 }
 """The settings of `load` and what they mean."""
 
-NOISE = ImuNoise(gyro=1.2e-4, accelerometer=1.2e-3, gyro_bias=1e-4, accelerometer_bias=1e-3)
+NOISE = ImuNoise(gyro=1.2e-4, accelerometer=6e-3, gyro_bias=1e-5, accelerometer_bias=1e-4)
 """Densities of the unit by its maker's sheet; of the walks of its biases, which it leaves out, those of units of
 its kind."""
 
