@@ -111,13 +111,14 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         world = World(None, on.gravity, None)
         if "latitude" in series.leaves:
             table = np.stack([series[n] for n in ("latitude", "longitude", "height")], axis=-1)
-            first = table[int(np.argmax(np.isfinite(table).all(axis=-1)))]
+            first = on.flight.info.get("origin", table[int(np.argmax(np.isfinite(table).all(axis=-1)))])
             latitude, longitude, height = (float(x) for x in first)
             origin = latitude, longitude, height
             world = World(origin, gravity_at(latitude, height), earth_at(latitude))
             place = to_enu(table, origin)
             said = f"{math.degrees(latitude):.7f}, {math.degrees(longitude):.7f} degrees, {height:.2f} m"
-            on.note("info", f"the world is east, north, up about the first fix, {said}")
+            whose = "the flight's origin" if "origin" in on.flight.info else "the first fix"
+            on.note("info", f"the world is east, north, up about {whose}, {said}")
         else:
             place = series["position"]
         return Series(
