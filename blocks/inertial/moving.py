@@ -28,6 +28,7 @@ from flowgraph.blocks.signals import Belief
 __all__ = ["Motion", "align_moving"]
 
 _STEPS = 15  # of Gauss and Newton, at most
+_VAGUE = np.diag([0.0] * 6 + [3.0 / np.pi**2] * 3 + [0.0] * 6)  # of an attitude of which nothing is known
 
 
 class Motion(NamedTuple):
@@ -168,7 +169,7 @@ class _Fit:
         r, s, B = self.residual(b)
         J = self.jacobian(b, r, s, B)
         for _ in range(_STEPS):
-            A = J.T @ J
+            A = J.T @ J + _VAGUE
             d = -np.linalg.solve(A + damping * 1e-3 * np.diag(np.diag(A)), J.T @ r)
             moved = b.replace(
                 position=b.position + d[:3],
@@ -188,7 +189,7 @@ class _Fit:
                 break
         off = r[:-6] * self.noise
         more = max(1.0, float(np.sqrt(off @ off / max(len(off) - 9, 1))) / self.noise)
-        P = np.linalg.inv(J.T @ J) * more**2
+        P = np.linalg.inv(J.T @ J / more**2 + _VAGUE)
         up = to_matrix(b.attitude, xp=np)[2]
         return Motion(
             b.replace(covariance=0.5 * (P + P.T)),

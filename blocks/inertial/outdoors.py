@@ -276,10 +276,11 @@ def standing(  # type: ignore[no-untyped-def]
     A body that moves steadily reads the same: so none is taken for resting that the belief has moving.
 
     Fires when its inputs do. State: the mean of the readings over `seconds`, and for how long they have been
-    near it.
+    near it, 0 before the first.
     """
     reading = xp.concat([imu.gyro, imu.specific_force], axis=-1)
     share = xp.minimum(1.0 + 0.0 * state["calm"], (dt + 0.0 * state["calm"]) / resting.seconds)
+    share = xp.where(state["begun"] > 0.0, share, 1.0 + 0.0 * share)
     mean = state["mean"] + (reading - state["mean"]) * share
     off = xp.abs(reading - mean)
     bound = xp.asarray([resting.rate] * 3 + [resting.force] * 3, dtype=reading.dtype)
@@ -290,12 +291,12 @@ def standing(  # type: ignore[no-untyped-def]
     zero = 0.0 * belief.velocity
     velocity = xp.where(still[..., None], zero, zero + xp.asarray(math.nan, dtype=zero.dtype))
     S = xp.eye(3, dtype=zero.dtype) * resting.noise**2
-    return {"mean": mean, "calm": calm}, GnssVelocity(velocity=velocity, covariance=S)
+    return {"mean": mean, "calm": calm, "begun": 1.0 + 0.0 * calm}, GnssVelocity(velocity=velocity, covariance=S)
 
 
 @standing.init
 def _moving(*_: Any, **__: Any) -> dict[str, Any]:
-    return {"mean": np.zeros(6), "calm": np.float64(0.0)}
+    return {"mean": np.zeros(6), "calm": np.float64(0.0), "begun": np.float64(0.0)}
 
 
 def _directed(
