@@ -127,12 +127,14 @@ def gnss_ins(
         now = told(aided, "barometer")
     if wheels is not None:
         aided = aid_wheels(
-            now, wheels, control, noise=speed_noise, slip=slip, at=axle, gate=gate, name="fuse_wheels"
+            now, wheels, control, noise=speed_noise, slip=slip, axle=axle, gate=gate, name="fuse_wheels"
         )
         now = told(aided, "wheels")
     if resting is not None:
-        still = standing(now, imu, resting=resting, name="standing")
-        now, innovation = aid_gnss_velocity(now, still, control, estimated=(), name="fuse_rest")
+        still = standing(now, control, resting=resting, name="standing")
+        now, innovation = aid_gnss_velocity(
+            now, still, control, antenna=None, estimated=estimated, name="fuse_rest"
+        )
         collect(innovation, "rest_innovation")
     belief.feed(now)
     return {"belief": now}

@@ -28,6 +28,7 @@ from flowgraph.blocks.signals import Belief
 __all__ = ["Motion", "align_moving"]
 
 _STEPS = 15  # of Gauss and Newton, at most
+_LOST = 0.7  # rad, of a heading that is no guess for more
 _VAGUE = np.diag([0.0] * 6 + [3.0 / np.pi**2] * 3 + [0.0] * 6)  # of an attitude of which nothing is known
 
 
@@ -85,8 +86,8 @@ def align_moving(
     while True:
         part = fixes[ends <= seconds + 1e-6]
         fit = _Fit(readings, part, gravity, noise, np.repeat([rate, force], 3))
-        if found is None:
-            guesses = fit.guesses(8 if seconds > 2.0 * least else 1)
+        if found is None or found.heading > _LOST:
+            guesses = fit.guesses(8 if seconds > 2.0 * least or found is not None else 1)
         else:
             guesses = [found.belief]
         found = min((fit.solved(guess) for guess in guesses), key=lambda motion: motion.residual)

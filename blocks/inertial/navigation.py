@@ -69,10 +69,15 @@ def extended(
 ) -> Belief | NavigationBelief:
     """A belief to start from, with parameters of zero, or the `lever` as far as it is known (m).
 
+    The position of the start is taken for that of the antenna, so that it is less sure, and hangs together with the
+    lever, where that is estimated.
+
     Args:
         estimated: names of `PARAMETERS`; with none it is the belief as it is.
         deviations: by name, where they are others than those of `PARAMETERS`.
     """
+    R = to_matrix(start.attitude, xp=np)
+    start = start.replace(position=start.position - R @ np.asarray(lever, dtype=float))
     if not estimated:
         return start
     spread = np.concatenate(
@@ -85,6 +90,12 @@ def extended(
     P = np.zeros((15 + len(spread),) * 2)
     P[:15, :15] = start.covariance
     P[15:, 15:] = np.diag(spread**2)
+    if "lever" in where:
+        columns = slice(15 + where["lever"].start, 15 + where["lever"].stop)
+        variance = spread[where["lever"]] ** 2
+        P[:3, :3] += R @ np.diag(variance) @ R.T
+        P[:3, columns] = -R * variance
+        P[columns, :3] = P[:3, columns].T
     kept = {n: getattr(start, n) for n in start._fields if n != "covariance"}
     return NavigationBelief(**kept, parameters=values, covariance=P)
 

@@ -94,7 +94,7 @@ def aid_gnss_velocity(
     fix: GnssVelocity | None,
     imu: Imu,
     *,
-    antenna: Antenna = Antenna(),
+    antenna: Antenna | None = Antenna(),
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
     invariant: bool = False,
@@ -107,18 +107,21 @@ def aid_gnss_velocity(
 
     Args:
         imu: the last reading.
-        prior, fix, antenna, estimated, gate, invariant: as in `aid_gnss_position`.
+        antenna: what is known of it; None where it is the unit itself of which the velocity is known.
+        prior, fix, estimated, gate, invariant: as in `aid_gnss_position`.
     """
     if fix is None:
         return prior, None
     kind = prior.position.dtype
     R = to_matrix(prior.attitude, xp=xp)
-    arm, _ = _antenna(prior, antenna, estimated, kind, xp)
+    arm, _ = _antenna(prior, antenna or Antenna(), estimated, kind, xp)
+    if antenna is None:
+        arm = 0.0 * arm
     rate = imu.gyro - prior.gyro_bias
     swing = (skew(rate, xp=xp) @ arm[..., None])[..., 0]
     zero = 0.0 * R
     one = zero + xp.eye(3, dtype=kind)
-    parts = {"lever": R @ skew(rate, xp=xp)}
+    parts = {} if antenna is None else {"lever": R @ skew(rate, xp=xp)}
     H = [zero, one, -R @ skew(swing, xp=xp), R @ skew(arm, xp=xp), zero, *_more(estimated, parts, zero)]
     apart = fix.velocity - prior.velocity - (R @ swing[..., None])[..., 0]
     return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp)
@@ -218,25 +221,25 @@ def aid_wheels(
     *,
     noise: float,
     slip: float,
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    axle: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with how a vehicle rolls: its speed by the wheels, and that it moves along its x axis.
 
-    z = (speed, 0, 0) = R^T v + w x at + noise. A speed that is NaN leaves the two others.
+    z = (speed, 0, 0) = R^T v + w x axle + noise. A speed that is NaN leaves the two others.
 
     Args:
         imu: the last reading.
         noise: standard deviation of the speed, m/s. slip: of what is across, m/s.
-        at: the point that moves along x, such as the middle of the rear axle, m, body.
+        axle: the point that moves along x, such as the middle of the rear axle, m, body.
         prior, gate: as in `aid_gnss_position`.
     """
     if wheels is None:
         return prior, None
     kind = prior.position.dtype
     R = to_matrix(prior.attitude, xp=xp)
-    arm = xp.asarray(at, dtype=kind)
+    arm = xp.asarray(axle, dtype=kind)
     speed = (R.mT @ prior.velocity[..., None])[..., 0]
     rate = imu.gyro - prior.gyro_bias
     zero = 0.0 * R

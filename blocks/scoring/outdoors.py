@@ -224,7 +224,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         if begin.told and on.flight.truth is not None and "velocity" in on.flight.truth.leaves:
             row = int(np.argmin(np.abs(on.flight.truth.time - begin.time)))
             velocity = on.flight.truth["velocity"][row]
-        if begin.unknown and "gnss" in kept and rest_seconds(imu) < 1.0:
+        if begin.unknown and "gnss" in kept:
             size = max(0.3, float(np.sqrt(np.median(kept["gnss"]["covariance"][:, 0, 0]))))
             moving = align_moving(imu, kept["gnss"], gravity=world.gravity, noise=size)
             if moving is not None and moving.heading < 0.7:
@@ -255,7 +255,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         self._said(on, spread.tilt, spread.velocity, spread.heading)
         levelled = None if begin.told and velocity.any() else force
         belief = start_belief(position, begin.attitude, specific_force=levelled, velocity=velocity, spread=spread)
-        return extended(belief, estimated, lever=antenna.lever), kept, spread.heading >= UNKNOWN_HEADING
+        arm = (0.0, 0.0, 0.0) if begin.told and "lever" not in estimated else antenna.lever
+        return extended(belief, estimated, lever=arm), kept, spread.heading >= UNKNOWN_HEADING
 
     def _said(self, on: OnFlight, tilt: float, velocity: float, heading: float | None = None) -> None:
         """A note on how sure the start is."""

@@ -136,7 +136,7 @@ AIDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
         aid_antennas, GnssHeading(angle=np.float64(0.4), deviation=np.float64(0.1)), {"baseline": (1.0, 0.4, 0.1)},
     ),
     "wheels": (
-        aid_wheels, WheelSpeed(speed=np.float64(4.0)), {"noise": 0.1, "slip": 0.2, "at": (-1.0, 0.1, 0.2)},
+        aid_wheels, WheelSpeed(speed=np.float64(4.0)), {"noise": 0.1, "slip": 0.2, "axle": (-1.0, 0.1, 0.2)},
     ),
 }  # fmt: skip
 
