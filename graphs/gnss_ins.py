@@ -25,8 +25,8 @@ from flowgraph.blocks.inertial.outdoors import (
 )
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
-from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.models.inertial_pose import navigation_steps
+from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.outdoors import Outdoors
 from flowgraph.blocks.scoring.tuning import with_imu

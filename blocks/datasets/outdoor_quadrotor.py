@@ -87,7 +87,11 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         given.setdefault("truth.time_offset", given[_SHIFT])
     inertial, satellites = _files(folder, "1" if unit is None else str(unit))
     made = Recording(
-        folder.name, policy(given, "outdoor_quadrotor"), kind="outdoor_quadrotor", given=given, place=str(folder)
+        folder.name,
+        policy(given, "outdoor_quadrotor"),
+        kind="outdoor_quadrotor",
+        given=given,
+        place=str(folder),
     )
     time, columns, where = _columns(inertial, (*_RATE, *_FORCE), made.notes)
     readings = {"gyro": np.radians(columns[:, :3]), "specific_force": columns[:, 3:]}

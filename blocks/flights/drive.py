@@ -121,11 +121,13 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
     for name in sensors:
         every = round(1e9 / values.get(f"{name}.rate", values["gps.rate"]) / period)
         rows = np.arange(0, n, max(every, 1))
-        streams[name] = Series(
-            time[rows], _sensed(name, p[rows], v[rows], q[rows], values, draw), name=name
-        )
+        streams[name] = Series(time[rows], _sensed(name, p[rows], v[rows], q[rows], values, draw), name=name)
     truth = NavigationState(
-        position=p, velocity=v, attitude=q, gyro_bias=biases["gyro"], accelerometer_bias=biases["accelerometer"]
+        position=p,
+        velocity=v,
+        attitude=q,
+        gyro_bias=biases["gyro"],
+        accelerometer_bias=biases["accelerometer"],
     )
     info = {
         "imu_noise": grade.noise,
@@ -234,7 +236,9 @@ def _half(turns: np.ndarray) -> np.ndarray:
     return np.concatenate([np.cos(angle / 4), turns * 0.25 * np.sinc(angle / 4 / np.pi)], axis=-1)
 
 
-def _sensed(name: str, p: np.ndarray, v: np.ndarray, q: np.ndarray, values: Mapping[str, Any], draw: Any) -> Any:
+def _sensed(
+    name: str, p: np.ndarray, v: np.ndarray, q: np.ndarray, values: Mapping[str, Any], draw: Any
+) -> Any:
     """What a sensor reads at some times."""
     n = len(p)
     noise = values.get(f"{name}.noise", 0.0)

@@ -294,7 +294,9 @@ def standing(  # type: ignore[no-untyped-def]
     zero = 0.0 * belief.velocity
     velocity = xp.where(still[..., None], zero, zero + xp.asarray(math.nan, dtype=zero.dtype))
     S = xp.eye(3, dtype=zero.dtype) * resting.noise**2
-    return {"mean": mean, "calm": calm, "begun": 1.0 + 0.0 * calm}, GnssVelocity(velocity=velocity, covariance=S)
+    return {"mean": mean, "calm": calm, "begun": 1.0 + 0.0 * calm}, GnssVelocity(
+        velocity=velocity, covariance=S
+    )
 
 
 @standing.init
@@ -336,4 +338,3 @@ def _antenna(
 def _more(estimated: tuple[str, ...], parts: dict[str, Array], zero: Array) -> list[Array]:
     """The columns of a Jacobian of three rows for what is estimated beside the fifteen."""
     return [parts.get(name, zero[..., :, : PARAMETERS[name].size]) for name in estimated]
-

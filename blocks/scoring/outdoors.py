@@ -209,7 +209,12 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         return Antenna(tuple(float(x) for x in lever)), True  # type: ignore[arg-type]
 
     def started(
-        self, on: OnFlight, inputs: dict[str, Series], world: World, estimated: tuple[str, ...], antenna: Antenna
+        self,
+        on: OnFlight,
+        inputs: dict[str, Series],
+        world: World,
+        estimated: tuple[str, ...],
+        antenna: Antenna,
     ) -> tuple[Any, dict[str, Series], bool]:
         """The belief to start from, the inputs from then on, and whether next to nothing is known of its heading.
 
@@ -254,14 +259,19 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
             )
         self._said(on, spread.tilt, spread.velocity, spread.heading)
         levelled = None if begin.told and velocity.any() else force
-        belief = start_belief(position, begin.attitude, specific_force=levelled, velocity=velocity, spread=spread)
+        belief = start_belief(
+            position, begin.attitude, specific_force=levelled, velocity=velocity, spread=spread
+        )
         arm = (0.0, 0.0, 0.0) if begin.told and "lever" not in estimated else antenna.lever
         return extended(belief, estimated, lever=arm), kept, spread.heading >= UNKNOWN_HEADING
 
     def _said(self, on: OnFlight, tilt: float, velocity: float, heading: float | None = None) -> None:
         """A note on how sure the start is."""
         turn = "" if heading is None else f", heading to {math.degrees(heading):.3g}"
-        on.note("info", f"the start is known to {math.degrees(tilt):.3g} degrees of tilt{turn}, {velocity:.2g} m/s")
+        on.note(
+            "info",
+            f"the start is known to {math.degrees(tilt):.3g} degrees of tilt{turn}, {velocity:.2g} m/s",
+        )
 
     def resting(self) -> Resting | None:
         """How standing still is told, where it is looked for."""

@@ -28,7 +28,9 @@ from tests.recordings import recordings
 @functools.cache
 def drive(seconds: float = 3.0, sensors: str = ",".join(SENSORS), seed: int = 1, **settings: str) -> Flight:
     named = {k.replace("__", "."): v for k, v in settings.items()}
-    return load_flight("sim:drive", seed=seed, settings={"duration": f"{seconds}", "sensors": sensors, **named})
+    return load_flight(
+        "sim:drive", seed=seed, settings={"duration": f"{seconds}", "sensors": sensors, **named}
+    )
 
 
 def scored(flight: Flight, **settings: Any) -> dict[str, float]:
@@ -125,9 +127,7 @@ def test_standing_still_is_used_where_it_is_asked_for():
 def test_a_vehicle_rolls_along_its_axis_without_wheels_that_tell():
     """Without positions for the last 30 s of 60, what is across stays known."""
     flight = drive(60.0, "gps,gps_velocity", imu__rate="25")
-    streams = {
-        n: s if n == "imu" else s[s.time < 30 * 10**9] for n, s in flight.streams.items()
-    }
+    streams = {n: s if n == "imu" else s[s.time < 30 * 10**9] for n, s in flight.streams.items()}
     cut = replace(flight, streams=streams)
     free, rolling = scored(cut), scored(cut, non_holonomic=True)
     assert rolling["position_rmse_m"] < 0.5 * free["position_rmse_m"]
@@ -138,7 +138,9 @@ def test_positions_may_be_geodetic_or_in_metres_with_covariances_or_without():
     gps = flight.streams["gps"]
     kinds = {
         "gps": gps,
-        "geodetic": Series(gps.time, GeodeticPosition(gps["latitude"], gps["longitude"], gps["height"]), name="gps"),
+        "geodetic": Series(
+            gps.time, GeodeticPosition(gps["latitude"], gps["longitude"], gps["height"]), name="gps"
+        ),
         "metres": Series(
             gps.time, Position(position=gnss_ins.case(flight).inputs["gnss"]["position"]), name="rtk"
         ),
@@ -249,7 +251,9 @@ def test_errors_by_direction():
     truth = flight.truth
     assert truth is not None
     q = truth["attitude"]
-    ahead = np.stack([1.0 - 2.0 * (q[:, 2] ** 2 + q[:, 3] ** 2), 2.0 * (q[:, 1] * q[:, 2] + q[:, 0] * q[:, 3])], -1)
+    ahead = np.stack(
+        [1.0 - 2.0 * (q[:, 2] ** 2 + q[:, 3] ** 2), 2.0 * (q[:, 1] * q[:, 2] + q[:, 0] * q[:, 3])], -1
+    )
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
     shift = np.concatenate([0.3 * ahead, np.full((len(q), 1), 0.4)], axis=-1)
     moved = Series(truth.time, truth.values.replace(position=truth["position"] + shift), name="belief")
@@ -272,7 +276,10 @@ def test_the_antenna_of_a_belief_has_a_covariance_of_its_own():
         at_antenna(Series(belief.time, _row(moved(belief[0], e))), Antenna(), names)["position"][0] for e in d
     ]
     np.testing.assert_allclose(
-        np.cov(np.transpose(draws)), there["covariance"][0, :3, :3], rtol=0.2, atol=0.15 * there["covariance"][0, :3, :3].max()
+        np.cov(np.transpose(draws)),
+        there["covariance"][0, :3, :3],
+        rtol=0.2,
+        atol=0.15 * there["covariance"][0, :3, :3].max(),
     )
 
 
@@ -290,4 +297,8 @@ def test_a_recorded_flight_with_one_fix_a_second():
     assert found["smoothed"]["position_rmse_m"] < 0.08
     assert found["filter"]["position_3sigma"] > 0.95
     assert 0.5 < found["filter"]["nis_mean"] < 1.3
-    assert found["filter"]["position_rmse_m"] < found["spline"]["position_rmse_m"] < found["linear"]["position_rmse_m"]
+    assert (
+        found["filter"]["position_rmse_m"]
+        < found["spline"]["position_rmse_m"]
+        < found["linear"]["position_rmse_m"]
+    )

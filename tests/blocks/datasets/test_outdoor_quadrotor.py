@@ -22,11 +22,15 @@ def folder(path: Path, *, seconds: float = 4.0, g: float = 9.8, imu: str = IMU, 
     """A flight of some seconds: 120 Hz, RTK at 10 Hz; north 1 m/s, east 2, and 0.5 upwards."""
     path.mkdir(exist_ok=True)
     for unit in (1, 2):
-        rows = [f"{k / 120!r},1,2,3,0.5,-0.25,{g},{10.0 * unit},-20.5,30.0" for k in range(int(seconds * 120))]
+        rows = [
+            f"{k / 120!r},1,2,3,0.5,-0.25,{g},{10.0 * unit},-20.5,30.0" for k in range(int(seconds * 120))
+        ]
         if repeat:
             rows.insert(5, rows[4])
         (path / f"IMU_{unit}.csv").write_text("\n".join([imu, *rows]) + "\n")
-    fixes = [f"{k / 10!r},9,1,250,0,0,17,{0.1 * k!r},{0.2 * k!r},{-0.05 * k!r}" for k in range(int(seconds * 10))]
+    fixes = [
+        f"{k / 10!r},9,1,250,0,0,17,{0.1 * k!r},{0.2 * k!r},{-0.05 * k!r}" for k in range(int(seconds * 10))
+    ]
     (path / "GT.csv").write_text("\n".join([GT, *fixes]) + "\n")
     return path
 

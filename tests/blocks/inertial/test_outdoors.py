@@ -11,7 +11,12 @@ import pytest
 from flowgraph import Series
 from flowgraph.blocks.flights.drive import ORIGIN, load_drive
 from flowgraph.blocks.geometry.geodetic import to_enu
-from flowgraph.blocks.geometry.rotations import from_rotation_vector, geodesic_angle, multiply, to_rotation_vector
+from flowgraph.blocks.geometry.rotations import (
+    from_rotation_vector,
+    geodesic_angle,
+    multiply,
+    to_rotation_vector,
+)
 from flowgraph.blocks.inertial.alignment import start_belief
 from flowgraph.blocks.inertial.imu import ImuNoise, predict
 from flowgraph.blocks.inertial.moving import align_moving
@@ -153,14 +158,17 @@ def test_an_aid_knows_what_every_error_does_to_what_it_measures(name):
     n, e = len(b.covariance), 1e-6
     wrapped = lambda r: (r + np.pi) % (2.0 * np.pi) - np.pi if name in ("compass", "antennas") else r
     H = -np.stack(
-        [wrapped(see(moved(b, e * np.eye(n)[k]))[1].residual - innovation.residual) / e for k in range(n)], axis=-1
+        [wrapped(see(moved(b, e * np.eye(n)[k]))[1].residual - innovation.residual) / e for k in range(n)],
+        axis=-1,
     )
     P, S = b.covariance, innovation.covariance
     R = S - H @ P @ H.T
     np.testing.assert_allclose(R, np.diag(np.diagonal(R)), atol=1e-4 * np.abs(S).max())
     K = P @ H.T @ np.linalg.inv(S)
     d = K @ innovation.residual
-    np.testing.assert_allclose(apart(posterior, moved(b, d)), np.zeros(n), atol=1e-4 * max(1.0, np.abs(d).max()))
+    np.testing.assert_allclose(
+        apart(posterior, moved(b, d)), np.zeros(n), atol=1e-4 * max(1.0, np.abs(d).max())
+    )
 
 
 def test_one_entry_of_three_corrects_alone_and_an_absent_fix_does_nothing():
