@@ -1,7 +1,9 @@
-"""Inertial navigation outdoors: a loosely coupled error-state filter, aided by satellites and what else there is.
+"""Inertial navigation outdoors: a loosely coupled error-state filter, aided by satellites and what else
+there is.
 
 Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017, secs. 5-7;
-P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed., 2013, ch. 14.
+P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed., 2013, ch.
+14.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.inertial.navigation import Earth, navigation_crossing, predict_navigation
 from flowgraph.blocks.inertial.outdoors import (
+    AT_UNIT,
     Antenna,
     Resting,
     aid_antennas,
@@ -25,7 +28,7 @@ from flowgraph.blocks.inertial.outdoors import (
 )
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
-from flowgraph.blocks.models.inertial_pose import navigation_steps
+from flowgraph.blocks.models.navigation import navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.outdoors import Outdoors
@@ -53,7 +56,7 @@ def gnss_ins(
     *,
     start: Any,
     noise: ImuNoise,
-    antenna: Antenna = Antenna(),
+    antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
     baseline: tuple[float, float, float] = (1.0, 0.0, 0.0),
     north: float = 0.0,
@@ -73,10 +76,10 @@ def gnss_ins(
 ):
     """Error-state Kalman filter of 15 states and more, aided by whichever of its sensors there are.
 
-    State: position, velocity, attitude, gyroscope and accelerometer bias, and what is `estimated` beside them.
-    Every tick predicts to now; each measurement that is there then corrects, one after the other, and each has a
-    gate and a way back of its own. Collected: `belief` at every tick, and the innovation of each sensor; with
-    `smoothing` what a smoother needs too.
+    State: position, velocity, attitude, gyroscope and accelerometer bias, and what is `estimated` beside
+    them. Every tick predicts to now; each measurement that is there then corrects, one after the other, and
+    each has a gate and a way back of its own. Collected: `belief` at every tick, and the innovation of each
+    sensor; with `smoothing` what a smoother needs too.
     """
     aids = {
         "gnss": gnss, "gnss_velocity": gnss_velocity, "heading": heading, "magnetometer": magnetometer,
@@ -144,13 +147,15 @@ def gnss_ins(
 def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
     """Start and tune the filter for a flight with an inertial unit and any of the other sensors.
 
-    The start is the truth's, or that of a body at rest, or of an alignment in motion, which finds the heading by
-    the first seconds of positions. Where the truth is positions alone it is that of the antenna, and the estimate
-    is compared there.
+    The start is the truth's, or that of a body at rest, or of an alignment in motion, which finds the
+    heading by the first seconds of positions. Where the truth is positions alone it is that of the antenna,
+    and the estimate is compared there.
 
     Args:
-        flight: with the stream `imu` and any of `gnss`, `gps`, `rtk` (positions, in m or as latitude, longitude and
-            height, with a covariance or none), `gnss_velocity`, `heading`, `magnetometer`, `barometer`, `wheels`.
+        flight: with the stream `imu` and any of `gnss`, `gps`, `rtk` (positions, in m or as latitude,
+            longitude and
+            height, with a covariance or none), `gnss_velocity`, `heading`, `magnetometer`, `barometer`,
+            `wheels`.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. If left out, 15 and 20 for a
             real unit, whose data sheet knows nothing of vibration, aliasing and held samples; 1 for simulated
             noise, which is what it says.

@@ -18,11 +18,12 @@ from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.inertial_pose import inertial_crossing, inertial_steps
+from flowgraph.blocks.models.inertial_pose import inertial_crossing, inertial_steps, stacked
+from flowgraph.blocks.models.recordings import inertial_recording
 from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.start import StartPose
-from flowgraph.blocks.scoring.tuning import with_imu
+from flowgraph.blocks.scoring.tuning import reading_of, with_imu
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
 
 SEARCHED, LONGEST, HEADINGS = 15.0, 60.0, 12
@@ -122,10 +123,13 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
     guess = Guess(begin.attitude) if begin.heading is None else Guess(begin.attitude, begin.heading, True)
     if attitude is None and (guess.invariant or filter.start_heading is not None):
         guess = _searched(on, inputs, begin, guess, force, settings)
+    start = guess.belief(begin.position, force)
+    known = {name: value for name, value in settings.items() if name not in filter.gating()}
+    recording = inertial_recording(inputs, start=stacked(start), reading=reading_of(on.flight), **known)
     return on.case(
-        filter.score(on, pose_errors, steps=inertial_steps),
+        filter.score(on, pose_errors, steps=inertial_steps, recording=recording),
         inputs=inputs,
-        start=guess.belief(begin.position, force),
+        start=start,
         invariant=guess.invariant,
         smoothing=filter.smoothed,
         **settings,

@@ -27,6 +27,7 @@ from flowgraph.blocks.filtering import (
     particles,
     unscented,
 )
+from flowgraph.blocks.filtering.batch import Recording
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.tracking import constant_velocity
@@ -41,6 +42,11 @@ METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
 def seen_in_plane(belief: Gaussian) -> PlaneBelief:
     """The position of a belief about position and velocity."""
     return PlaneBelief(position=belief.mean[..., :2], covariance=belief.covariance[..., :2, :2])
+
+
+def seen_position(noise: float) -> LinearMeasurement:
+    """The measured position; noise: standard deviation on each axis, m."""
+    return LinearMeasurement(constant_velocity(1.0).space, np.eye(2, 4), noise=noise**2)
 
 
 def plane_steps(result: Result) -> Steps:
@@ -71,7 +77,7 @@ def tracker(
     `smoothing` what a smoother needs too.
     """
     motion = constant_velocity(wander)
-    seen = LinearMeasurement(motion.space, np.eye(2, 4), noise=position_noise**2)
+    seen = seen_position(position_noise)
     belief = filtered(
         motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience,
         smoothing=smoothing,
@@ -116,9 +122,11 @@ def for_flight(
     }[method]()
     noise = on.noise("position_noise", position_noise)
     first = on.inputs["position"]["position"][0]
+    start = motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0))
+    recording = Recording(motion, {seen_position(noise): on.inputs["position"]}, start)
     return on.case(
-        scored.score(on, plane_errors, steps=plane_steps),
-        start=motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0)),
+        scored.score(on, plane_errors, steps=plane_steps, recording=recording),
+        start=start,
         wander=wander,
         position_noise=noise,
         method=chosen,

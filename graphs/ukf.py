@@ -124,6 +124,6 @@ def for_flight(
         mean: of quaternions, "markley" or "kraft".
     """
     return on_capture(
-        on, filter, start=start_state, steps=unscented_steps, smoothing=filter.smoothed,
-        points=SigmaPoints(alpha, beta, kappa, mean),
+        on, filter, start=start_state, believed=lambda start: start, steps=unscented_steps,
+        smoothing=filter.smoothed, points=SigmaPoints(alpha, beta, kappa, mean),
     )  # fmt: skip

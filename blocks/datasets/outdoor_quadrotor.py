@@ -7,9 +7,9 @@
     GT.csv     time, distance, speed, compass heading, pitch, roll, height, North, East, Down [m]  at 10 Hz
 
 The body is the unit. The world is east, north, up about the first position. `rtk` is every position, thinned
-by rtk.every, and the truth is all of them: what a filter was not given is what it is judged by. The two clocks
-of a recording are apart by up to 0.6 s, the same over a session; rtk.time_offset moves the truth too, which
-has the receiver's clock. The angles of the unit's own filter and of the autopilot are not read.
+by rtk.every, and the truth is all of them: what a filter was not given is what it is judged by. The two
+clocks of a recording are apart by up to 0.6 s, the same over a session; rtk.time_offset moves the truth too,
+which has the receiver's clock. The angles of the unit's own filter and of the autopilot are not read.
 
 Source: D. Hurwitz, I. Klein, "Quadrotor dead reckoning with multiple inertial sensors", DGON Inertial Sensors
 and Systems, 2023.
@@ -53,8 +53,8 @@ SETTINGS: Mapping[str, str] = {
 """The settings of `load` and what they mean."""
 
 NOISE = ImuNoise(gyro=1.2e-4, accelerometer=6e-3, gyro_bias=1e-5, accelerometer_bias=1e-4)
-"""Densities of the unit by its maker's sheet; of the walks of its biases, which it leaves out, those of units of
-its kind."""
+"""Densities of the unit by its maker's sheet; of the walks of its biases, which it leaves out, those of
+units of its kind."""
 
 RTK_NOISE = 0.02
 """m, an axis, of a position with its ambiguities fixed."""

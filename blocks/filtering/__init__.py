@@ -8,6 +8,17 @@ of those that believe in a Gaussian. Everything that a user's own filter needs i
 from __future__ import annotations
 
 from flowgraph.blocks.filtering.banks import Interacting, imm
+from flowgraph.blocks.filtering.batch import (
+    LOSSES,
+    Aged,
+    Derived,
+    Loss,
+    Recording,
+    cauchy,
+    estimate_batch,
+    huber,
+    loss_of,
+)
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
     Extended,
@@ -22,6 +33,7 @@ from flowgraph.blocks.filtering.methods import (
     Method,
     Seen,
     correct,
+    crossed,
     cubature,
     extended,
     linear,
@@ -41,7 +53,7 @@ from flowgraph.blocks.filtering.particles import (
     weigh_cloud,
 )
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.kalman import LinearModel
+from flowgraph.blocks.kalman import LinearModel, smooth
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.statespace import (
     DiscreteModel,
@@ -53,6 +65,12 @@ from flowgraph.blocks.statespace import (
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
+    "crossed",
+    "loss_of",
+    "Recording",
+    "Derived",
+    "Aged",
+    "LOSSES",
     "StateSpace",
     "euclidean",
     "angle",
@@ -70,6 +88,11 @@ __all__ = [
     "filtered",
     "first",
     "FirstMeasurement",
+    "smooth",
+    "estimate_batch",
+    "Loss",
+    "huber",
+    "cauchy",
     "linear",
     "extended",
     "square_root",

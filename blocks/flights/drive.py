@@ -1,12 +1,14 @@
-"""A drive over hills and around corners, `sim:drive`: a car with an inertial unit of a stated grade and satellites.
+"""A drive over hills and around corners, `sim:drive`: a car with an inertial unit of a stated grade and
+satellites.
 
-The road is a smooth curve through random places; the car goes along it, stops, and goes on. Readings of the unit
-are means over the time since the one before, made of the exact motion: what turned the body, and what changed its
-velocity but for gravity and the turning Earth. So the error of a filter is that of the unit, of its stated
-figures, and of the aids, and of nothing else.
+The road is a smooth curve through random places; the car goes along it, stops, and goes on. Readings of the
+unit
+are means over the time since the one before, made of the exact motion: what turned the body, and what
+changed its velocity but for gravity and the turning Earth. So the error of a filter is that of the unit, of
+its stated figures, and of the aids, and of nothing else.
 
-Source of the figures of the grades: P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation
-systems", 2nd ed., 2013, tables 4.1-4.3.
+Source of the figures of the grades: P. Groves, "Principles of GNSS, inertial, and multisensor integrated
+navigation systems", 2nd ed., 2013, tables 4.1-4.3.
 """
 
 from __future__ import annotations
@@ -71,8 +73,8 @@ DEFAULTS: Mapping[str, float] = {
     "wheels.rate": 10.0,
     "wheels.noise": 0.05,
 }
-"""s, Hz, and standard deviations: m an axis, m/s, rad, T, m, m/s. Positions, velocities and headings by satellites
-come together."""
+"""s, Hz, and standard deviations: m an axis, m/s, rad, T, m, m/s. Positions, velocities and headings by
+satellites come together."""
 
 ORIGIN = (math.radians(47.4), math.radians(8.55), 430.0)
 _FIELD = (0.0, 2.15e-5, -4.3e-5)  # T, east, north, up
@@ -85,15 +87,17 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
 
     Args:
         seed: of the road and of all noise.
-        settings: any of `DEFAULTS`; `unit`, of `GRADES`, consumer if left out; `sensors`, of `SENSORS`, comma-separated,
+        settings: any of `DEFAULTS`; `unit`, of `GRADES`, consumer if left out; `sensors`, of `SENSORS`,
+            comma-separated,
             gps and gps_velocity if left out.
 
     Returns:
-        A `Flight` with `imu` and the sensors; truth: `NavigationState`, east, north, up about `info["origin"]`. info:
-        `imu_noise`, `noise`, `magnetic_field`, `gps_lever`, `still` (s).
+        A `Flight` with `imu` and the sensors; truth: `NavigationState`, east, north, up about
+        `info["origin"]`. info: `imu_noise`, `noise`, `magnetic_field`, `gps_lever`, `still` (s).
 
     Raises:
-        UnknownNameError: for a setting, a unit or a sensor that is not there; DeclarationError: for one out of range.
+        UnknownNameError: for a setting, a unit or a sensor that is not there; DeclarationError: for one out
+            of range.
     """
     values, grade, sensors = _settings(dict(settings or {}))
     period = round(1e9 / values["imu.rate"])
@@ -216,7 +220,8 @@ class _Road:
 
 
 def _read(p: np.ndarray, v: np.ndarray, q: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """What an ideal unit reads over each step: rate (n, 3) and force (n, 3); the first stands for a step at rest."""
+    """What an ideal unit reads over each step: rate (n, 3) and force (n, 3); the first stands for a step at
+    rest."""
     earth, gravity = earth_at(ORIGIN[0]), np.asarray(gravity_at(ORIGIN[0], ORIGIN[2]))
     turn = np.asarray(earth.turn)
     R = to_matrix(q, xp=np)

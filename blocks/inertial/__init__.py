@@ -4,9 +4,9 @@
 error-state Kalman filter's prediction, and `ImuNoise`, the densities by which all filters here know a unit.
 `aiding` corrects that belief by measured positions and attitudes. `alignment` finds the attitude and biases
 to start from, `calibration` takes out what a unit reads too much while it rests, and `imu_calibration` finds
-what a count of its converters is worth by what a motion capture saw. Over the Earth, `navigation` predicts where it
-turns and is round, and estimates more; `outdoors` aids by satellites, heights, directions and wheels; `moving` aligns
-a body in motion by the positions that come after.
+what a count of its converters is worth by what a motion capture saw. Over the Earth, `navigation` predicts
+where it turns and is round, and estimates more; `outdoors` aids by satellites, heights, directions and
+wheels; `moving` aligns a body in motion by the positions that come after.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ from flowgraph.blocks.inertial.navigation import (
     predict_navigation,
 )
 from flowgraph.blocks.inertial.outdoors import (
+    AT_UNIT,
     Antenna,
     Resting,
     aid_antennas,
@@ -100,6 +101,7 @@ __all__ = [
     "navigation_crossing",
     "places",
     "predict_navigation",
+    "AT_UNIT",
     "Antenna",
     "Resting",
     "aid_antennas",

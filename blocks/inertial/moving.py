@@ -1,4 +1,5 @@
-"""Alignment in motion: the attitude at a time, of which nothing was known, by positions that were measured after.
+"""Alignment in motion: the attitude at a time, of which nothing was known, by positions that were measured
+after.
 
 Seen from the body as it was at the start, the unit tells how the specific force went on: C(t) f(t), with the
 turn C(t) since then. Twice integrated that is where the body went, but for gravity, the velocity it had, and
@@ -7,12 +8,12 @@ the attitude it had, which is one rotation for all:
     p(t) - gravity t^2/2 = p0 + v0 t + R0 s(t)        s(t) = integral of integral of C f
 
 What p0 and v0 do is linear and falls out of both sides; R0 then is the rotation that takes one set of vectors
-into the other (Wahba's problem), with no guess to start from. From there least squares find attitude, velocity
-and the unit's biases together, and say how sure they are. A body that only stands or moves steadily shows its
-tilt in this way, and no heading.
+into the other (Wahba's problem), with no guess to start from. From there least squares find attitude,
+velocity and the unit's biases together, and say how sure they are. A body that only stands or moves steadily
+shows its tilt in this way, and no heading.
 
-Source: Y. Wu, X. Pan, "Velocity/position integration formula part I: application to in-flight coarse alignment",
-IEEE Trans. on Aerospace and Electronic Systems 49(2), 2013; G. Wahba, SIAM Review 7(3), 1965.
+Source: Y. Wu, X. Pan, "Velocity/position integration formula part I: application to in-flight coarse
+alignment", IEEE Trans. on Aerospace and Electronic Systems 49(2), 2013; G. Wahba, SIAM Review 7(3), 1965.
 """
 
 from __future__ import annotations
@@ -58,8 +59,9 @@ def align_moving(
     force: float = 0.3,
     rate: float = 0.02,
 ) -> Motion | None:
-    """The motion at the first of the positions, by those of the seconds after it: of `least` at first, and of half
-    as many more again and again until the heading is known to `sure`, which what was found before is the guess for.
+    """The motion at the first of the positions, by those of the seconds after it: of `least` at first, and
+    of half as many more again and again until the heading is known to `sure`, which what was found before is
+    the guess for.
 
     Args:
         imu: a series of `Imu`. position: of a signal with `position`, m.
@@ -126,8 +128,8 @@ class _Fit:
         return found[:, :3], found[:, 3:].reshape(-1, 3, 3)
 
     def guesses(self, headings: int) -> list[Belief]:
-        """The rotation by Wahba's problem; and turned about the vertical, where gyroscope biases have hidden what
-        the motion has to say of the heading."""
+        """The rotation by Wahba's problem; and turned about the vertical, where gyroscope biases have hidden
+        what the motion has to say of the heading."""
         s, _ = self.course(np.zeros(3))
         projector = np.eye(len(self.t)) - self.line @ np.linalg.pinv(self.line)
         u, _, vt = np.linalg.svd((projector @ self.free).T @ (projector @ s))

@@ -1,12 +1,13 @@
-"""Navigation over the Earth: the prediction of `imu` where the Earth turns and is round, with more to estimate.
+"""Navigation over the Earth: the prediction of `imu` where the Earth turns and is round, with more to
+estimate.
 
 The world is east, north, up about a place. It turns with the Earth, and gravity points to the Earth's middle
 and fades with height. Beside the fifteen numbers of a `Belief` a filter may estimate, as chosen when it is
 built, numbers that stay or walk slowly: where the antenna sits, scale factors of the unit, by how much fixes
 are late, the level of a barometer.
 
-Source: P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed., 2013,
-secs. 2.4 (gravity, the Earth's turn), 5.4 (a local frame), 14.2 (the states of an integration).
+Source: P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed.,
+2013, secs. 2.4 (gravity, the Earth's turn), 5.4 (a local frame), 14.2 (the states of an integration).
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ __all__ = [
 
 
 class Parameter(NamedTuple):
-    """A number, or a few, that a filter may estimate: how many, their deviation at the start, and how fast they
-    walk, per sqrt(s)."""
+    """A number, or a few, that a filter may estimate: how many, their deviation at the start, and how fast
+    they walk, per sqrt(s)."""
 
     size: int
     deviation: float
@@ -69,8 +70,8 @@ def extended(
 ) -> Belief | NavigationBelief:
     """A belief to start from, with parameters of zero, or the `lever` as far as it is known (m).
 
-    The position of the start is taken for that of the antenna, so that it is less sure, and hangs together with the
-    lever, where that is estimated.
+    The position of the start is taken for that of the antenna, so that it is less sure, and hangs together
+    with the lever, where that is estimated.
 
     Args:
         estimated: names of `PARAMETERS`; with none it is the belief as it is.
@@ -147,8 +148,8 @@ def predict_navigation(
         w = (gyro - gyro_bias) (1 - gyro_scale) - R^T turn       f = (specific_force - bias) (1 - scale)
         a = R f + gravity(p) - 2 turn x v,   gravity(p) = |gravity| (-x/r, -y/r, -(1 - 2 z/r))
 
-    Scale factors are of each axis. What gravity and the Earth's turn do to errors is left out of the Jacobian:
-    over the seconds between fixes it is below 1e-3 of them.
+    Scale factors are of each axis. What gravity and the Earth's turn do to errors is left out of the
+    Jacobian: over the seconds between fixes it is below 1e-3 of them.
 
     Args:
         belief: `Belief`, or with anything `estimated` a `NavigationBelief`.

@@ -1,10 +1,11 @@
-"""Aiding outdoors: correct an inertial belief with satellites, heights, directions, wheels and standing still.
+"""Aiding outdoors: correct an inertial belief with satellites, heights, directions, wheels and standing
+still.
 
 Each block takes a prior and an optional measurement, as those of `aiding` do: without one the prior passes
 through and there is no innovation; an entry that is NaN was not measured.
 
-Source: P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed., 2013,
-secs. 14.3 (loosely coupled integration), 15.1 (standing still), 6.1 (headings), 16.3 (wheels).
+Source: P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation systems", 2nd ed.,
+2013, secs. 14.3 (loosely coupled integration), 15.1 (standing still), 6.1 (headings), 16.3 (wheels).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from flowgraph.blocks.signals import (
 )
 
 __all__ = [
+    "AT_UNIT",
     "Antenna",
     "Resting",
     "aid_antennas",
@@ -43,10 +45,15 @@ __all__ = [
 
 
 class Antenna(NamedTuple):
-    """Where an antenna sits (m, body), and by how much its fixes are late (s), where these are not estimated."""
+    """Where an antenna sits (m, body), and by how much its fixes are late (s), where these are not
+    estimated."""
 
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
     late: float = 0.0
+
+
+AT_UNIT = Antenna()
+"""One that sits at the unit and is never late."""
 
 
 @block
@@ -54,7 +61,7 @@ def aid_gnss_position(
     prior: Any,
     fix: GnssPosition | None,
     *,
-    antenna: Antenna = Antenna(),
+    antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
     invariant: bool = False,
@@ -94,7 +101,7 @@ def aid_gnss_velocity(
     fix: GnssVelocity | None,
     imu: Imu,
     *,
-    antenna: Antenna | None = Antenna(),
+    antenna: Antenna | None = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
     invariant: bool = False,

@@ -11,6 +11,7 @@ not said here: see `models`.
 from __future__ import annotations
 
 from flowgraph.blocks.kalman.backward import (
+    Crossing,
     backwards,
     collect_steps,
     cross_covariance,
@@ -34,6 +35,7 @@ from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_ext
 from flowgraph.blocks.kalman.smoothing import (
     Steps,
     fixed_lag,
+    gone_back,
     lag_ticks,
     rauch_tung_striebel,
     smooth,
@@ -45,6 +47,8 @@ from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semid
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "Crossing",
+    "gone_back",
     "noise_matrix",
     "observation_matrix",
     "PATIENCE",

@@ -9,7 +9,7 @@ become constants of the graph.
 
 from __future__ import annotations
 
-from flowgraph.blocks.metrics.bound import posterior_bound
+from flowgraph.blocks.metrics.bound import posterior_bound, smoothing_bound
 from flowgraph.blocks.metrics.chi_square import (
     chi_square,
     chi_square_band,
@@ -36,6 +36,7 @@ from flowgraph.blocks.metrics.truth import known, truth_remarks
 
 __all__ = [
     "posterior_bound",
+    "smoothing_bound",
     "chi_square",
     "chi_square_band",
     "chi_square_gate",

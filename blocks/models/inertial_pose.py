@@ -17,11 +17,10 @@ from flowgraph import Array, Result, Series
 from flowgraph.blocks.geometry.groups import SE_2
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, error_jacobian
-from flowgraph.blocks.inertial.navigation import PARAMETERS
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.models.pose import POSE
 from flowgraph.blocks.models.unscented_pose import carry_pose, imu_density, see_pose
-from flowgraph.blocks.signals import Belief, Gaussian, Imu, NavigationBelief
+from flowgraph.blocks.signals import Belief, Gaussian, Imu
 from flowgraph.blocks.statespace import MeasurementModel, MotionModel
 
 __all__ = [
@@ -31,8 +30,8 @@ __all__ = [
     "inertial_crossing",
     "inertial_motion",
     "inertial_steps",
-    "navigation_steps",
     "pose_seen",
+    "stacked",
 ]
 
 INERTIAL = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion())
@@ -108,38 +107,14 @@ def inertial_crossing(belief: Belief, imu: Imu, dt: Any, xp: Any) -> Array:
 
 def inertial_steps(result: Result) -> Steps:
     """Those of a run of `ins_eskf` that was wired for a smoother; over `INERTIAL_BIASED`."""
-    prior, posterior = (_stacked(result[name]) for name in ("prior", "belief"))
+    prior, posterior = (Series(s.time, stacked(s.values)) for s in (result["prior"], result["belief"]))
     return Steps(prior, posterior, result["cross"], INERTIAL_BIASED, _beliefs)
 
 
-def navigation_steps(result: Result, *, estimated: tuple[str, ...]) -> Steps:
-    """Those of a run of `gnss_ins` that was wired for a smoother; over `INERTIAL_BIASED` and the parameters."""
-    if not estimated:
-        return inertial_steps(result)
-    more = sum(PARAMETERS[name].size for name in estimated)
-    space = StateSpace(
-        position=euclidean(3),
-        velocity=euclidean(3),
-        attitude=quaternion(),
-        gyro_bias=euclidean(3),
-        accelerometer_bias=euclidean(3),
-        parameters=euclidean(more),
-    )
-    prior, posterior = (_stacked(result[name], "parameters") for name in ("prior", "belief"))
-
-    def named(smoothed: Series) -> Series:
-        p, v, q, b_g, b_a, rest = np.split(smoothed["mean"], (3, 6, 10, 13, 16), axis=-1)
-        belief = NavigationBelief(p, v, q, b_g, b_a, rest, smoothed["covariance"])
-        return Series(smoothed.time, belief, name=smoothed.name)
-
-    return Steps(prior, posterior, result["cross"], space, named)
-
-
-def _stacked(series: Series, *more: str) -> Series:
-    """A series of `Belief` as `Gaussian` over `INERTIAL_BIASED`, and what stands behind it."""
-    parts = ("position", "velocity", "attitude", "gyro_bias", "accelerometer_bias", *more)
-    mean = np.concatenate([series[part] for part in parts], axis=-1)
-    return Series(series.time, Gaussian(mean=mean, covariance=series["covariance"]), name=series.name)
+def stacked(belief: Belief) -> Gaussian:
+    """A belief, or one at each tick, over `INERTIAL_BIASED`."""
+    mean = np.concatenate([getattr(belief, part) for part in INERTIAL_BIASED.names], axis=-1)
+    return Gaussian(mean=mean, covariance=np.asarray(belief.covariance))
 
 
 def _beliefs(smoothed: Series) -> Series:

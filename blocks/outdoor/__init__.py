@@ -2,8 +2,8 @@
 
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
-on the same sensors, with the same knowledge, so that the two can be compared. `errors` judges navigation by the path of an antenna, and by
-directions.
+on the same sensors, with the same knowledge, so that the two can be compared. `errors` judges navigation by
+the path of an antenna, and by directions.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
     predict_clone,
     start_outdoor,
 )
@@ -43,6 +45,8 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "clone_crossing",
+    "outdoor_steps",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",

@@ -1,8 +1,9 @@
 """Errors of navigation outdoors: of the antenna where it is its path that is known, and by directions.
 
-Where the truth is a path alone, it is that of an antenna by the clock of its receiver, and an estimate is compared
-there: p + R lever - v late, with the covariance of that point. Errors are split into east, north and up, and into
-those along and across the way over the ground.
+Where the truth is a path alone, it is that of an antenna by the clock of its receiver, and an estimate is
+compared
+there: p + R lever - v late, with the covariance of that point. Errors are split into east, north and up, and
+into those along and across the way over the ground.
 """
 
 from __future__ import annotations
@@ -78,8 +79,8 @@ def directed_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
     """Position errors by direction, root mean squares in m.
 
     Returns:
-        east_rmse_m, north_rmse_m, up_rmse_m; and, while the body moves, along_rmse_m and across_rmse_m of its way
-        over the ground. Nothing for a truth without positions.
+        east_rmse_m, north_rmse_m, up_rmse_m; and, while the body moves, along_rmse_m and across_rmse_m of
+        its way over the ground. Nothing for a truth without positions.
     """
     if "position" not in truth.leaves:
         return {}

@@ -6,8 +6,8 @@ noise that a filter is told, in its settings or in the flight, and `covariances`
 makes the streams that it asks for out of those that a flight has. `scorer` compares a run with the truth:
 errors, consistency, and the same for the smoothed run; `orientation` counts only the times that a recording
 says count, and `calibration` how well one explains its windows. `outdoors` has the
-streams and the start of a flight with satellites. `settings`, `point`, `euler` and `calibration` are imported by
-their own names.
+streams and the start of a flight with satellites. `settings`, `point`, `euler` and `calibration` are
+imported by their own names.
 """
 
 from __future__ import annotations

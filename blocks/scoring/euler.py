@@ -24,6 +24,7 @@ from flowgraph.blocks.models.euler_ins import (
     start_gaussian,
     with_heading,
 )
+from flowgraph.blocks.models.recordings import euler_recording
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
     Factors,
@@ -98,8 +99,16 @@ class EulerModel(ScaledFactors, Scored):
 
     order: EulerOrder = "zxy"
 
-    def judge(self, on: OnFlight) -> EulerScore:
-        """The score of a run on that flight."""
+    def judge(
+        self, on: OnFlight, inputs: Mapping[str, Series], start: Any, known: Mapping[str, Any]
+    ) -> EulerScore:
+        """The score of a run on that flight.
+
+        Args:
+            inputs: by source.
+            start: what the graph starts from.
+            known: settings of the graph itself.
+        """
         return euler_score(on, self, self.order)
 
     def case(
@@ -113,16 +122,15 @@ class EulerModel(ScaledFactors, Scored):
             inputs: by source; those that were needed if left out.
             settings: of the graph itself, beside noise, order and start.
         """
-        return on.case(
-            self.judge(on),
-            inputs=inputs,
-            start=start,
-            noise=self.imu_noise(on),
-            order=self.order,
-            reading=reading_of(on.flight),
-            gravity=on.gravity,
+        known = {
+            "noise": self.imu_noise(on),
+            "order": self.order,
+            "reading": reading_of(on.flight),
+            "gravity": on.gravity,
             **settings,
-        )
+        }
+        given_ = on.inputs if inputs is None else inputs
+        return on.case(self.judge(on, given_, start, known), inputs=inputs, start=start, **known)
 
 
 @dataclass(frozen=True)
@@ -178,10 +186,14 @@ class EulerPose(EulerModel, PoseAided):
 class EulerFilter(EulerKalman, EulerPose, SmoothedPoseFilter):
     """What is set of a Kalman filter with Euler angles that is corrected by measured poses."""
 
-    def judge(self, on: OnFlight) -> EulerScore:
+    def judge(
+        self, on: OnFlight, inputs: Mapping[str, Series], start: Any, known: Mapping[str, Any]
+    ) -> EulerScore:
         """The score of a run, and of the smoothed one."""
         steps = partial(euler_steps, order=self.order)
-        return EulerScore(self.score(on, pose_errors, steps=steps), self.order)
+        told = ("noise", "order", "reading", "gravity", "R", "lever", "held")
+        recording = euler_recording(inputs, start=start, **{name: known[name] for name in told})
+        return EulerScore(self.score(on, pose_errors, steps=steps, recording=recording), self.order)
 
 
 @dataclass(frozen=True)

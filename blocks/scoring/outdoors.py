@@ -1,4 +1,5 @@
-"""What a flight outdoors has for `gnss_ins`: its streams in one form, a local world about the first fix, a start.
+"""What a flight outdoors has for `gnss_ins`: its streams in one form, a local world about the first fix, a
+start.
 
 A recording gives positions as latitude, longitude and height or as metres, with a covariance of each or none.
 Here all become positions and velocities with covariances, in a world of east, north, up about the first fix,
@@ -40,7 +41,8 @@ _RIDE = 100_000_000  # ns, between two looks at how a vehicle rolls, where no wh
 
 
 class World(NamedTuple):
-    """The local world: where its origin is (latitude, longitude in rad, height in m), or None; and its gravity."""
+    """The local world: where its origin is (latitude, longitude in rad, height in m), or None; and its
+    gravity."""
 
     origin: tuple[float, float, float] | None
     gravity: tuple[float, float, float]
@@ -55,9 +57,9 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         position_noise, velocity_noise: m and m/s, standard deviations of fixes that bring no covariance; the
             flight's own if left out.
         estimate: what is estimated beside pose, velocity and biases, of lever, gyro_scale,
-            accelerometer_scale, time_offset and height_offset, joined by +, or none. If left out, the lever and
-            the time offset where fixes are good to half a metre and nobody says the lever; and the level of a
-            barometer.
+            accelerometer_scale, time_offset and height_offset, joined by +, or none. If left out, the lever
+            and the time offset where fixes are good to half a metre and nobody says the lever; and the level
+            of a barometer.
         compass_noise: rad, of the heading by a magnetometer.
         declination: degrees, of magnetic north, to the east.
         date: year-month-day of the flight, in place of the declination, which then is that of the place.
@@ -216,10 +218,11 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
         estimated: tuple[str, ...],
         antenna: Antenna,
     ) -> tuple[Any, dict[str, Series], bool]:
-        """The belief to start from, the inputs from then on, and whether next to nothing is known of its heading.
+        """The belief to start from, the inputs from then on, and whether next to nothing is known of its
+        heading.
 
-        The truth's, or what the file shows at rest; else that of an alignment in motion, of which the heading is
-        as sure as the motion makes it; else a level body with a heading of which nothing is known.
+        The truth's, or what the file shows at rest; else that of an alignment in motion, of which the
+        heading is as sure as the motion makes it; else a level body with a heading of which nothing is known.
         """
         begin = self.pose(on, inputs, position=inputs.get("gnss"))
         kept = begin.inputs

@@ -1,4 +1,5 @@
-"""What navigation outdoors reads and believes: fixes of satellites with their own covariance, heights, wheels."""
+"""What navigation outdoors reads and believes: fixes of satellites with their own covariance, heights,
+wheels."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ __all__ = [
 
 
 class GnssFix(Signal):
-    """A position on the Earth (WGS84) as a receiver gives it, with its own covariance (m^2) east, north, up."""
+    """A position on the Earth (WGS84) as a receiver gives it, with its own covariance (m^2) east, north,
+    up."""
 
     latitude: Array = real(unit="rad", frame="WGS84")
     longitude: Array = real(unit="rad", frame="WGS84")

@@ -12,7 +12,7 @@ exact numbers, and stays positive in single precision.
 
 Source: E. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000;
 on manifolds C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound
-state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; of smoothing S.
+state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; S.
 Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE TAC 53(3), 2008.
 """
 
@@ -130,7 +130,7 @@ def motion_cross(
 
 
 def unscented_crossing(
-    move: Callable[..., Array], noise: npt.ArrayLike, space: StateSpace, points: SigmaPoints
+    move: Callable[..., Array], noise: npt.ArrayLike | None, space: StateSpace | None, points: SigmaPoints
 ) -> Callable[..., Array]:
     """What `cross_covariance` asks of a filter that predicts with `predict_unscented`.
 
@@ -139,7 +139,7 @@ def unscented_crossing(
     """
 
     def crossing(belief: Gaussian, control: Any, dt: Any, xp: Any) -> Array:
-        shaken = _shaken(noise, dt, belief.mean.dtype, xp)
+        shaken = None if noise is None else _shaken(noise, dt, belief.mean.dtype, xp)
         carry = lambda x, w: move(x, control, w, dt, xp)
         return motion_cross(belief.mean, belief.covariance, carry, shaken, space=space, points=points, xp=xp)
 

@@ -1,13 +1,14 @@
 """`flowgraph bench outdoor`: satellites and an inertial unit on recorded flights of a quadrotor.
 
-The receiver's RTK positions are thinned to one a second, or one in five, and those left out judge what is found
-between: by `gnss_ins` as it runs, smoothed over the whole flight, and by curves through the positions alone. One
-configuration serves all flights; no heading and no place of the antenna is given. In an outage, fixes of one a
-second stop for 10 s in the middle of the flight, and only these 10 s are judged.
+The receiver's RTK positions are thinned to one a second, or one in five, and those left out judge what is
+found
+between: by `gnss_ins` as it runs, smoothed over the whole flight, and by curves through the positions alone.
+One configuration serves all flights; no heading and no place of the antenna is given. In an outage, fixes of
+one a second stop for 10 s in the middle of the flight, and only these 10 s are judged.
 
-The clocks of unit and receiver are apart by a constant of each recording. It is found first, by all positions: for
-each of a row of offsets an alignment in motion says how well readings and positions fit, and the filter, which
-estimates what is left of it, says the rest.
+The clocks of unit and receiver are apart by a constant of each recording. It is found first, by all
+positions: for each of a row of offsets an alignment in motion says how well readings and positions fit, and
+the filter, which estimates what is left of it, says the rest.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ class Judged(NamedTuple):
 def outdoor(
     *, data: str | None = None, imu: str = "1", flights: str = "", aids: str = "", engine: str = "python"
 ) -> Report:
-    """Flights with RTK thinned to 1 Hz, 0.2 Hz and with an outage: position errors, a row a flight, aid and method.
+    """Flights with RTK thinned to 1 Hz, 0.2 Hz and with an outage: position errors, a row a flight, aid and
+    method.
 
     Args:
         data: the folder of the flights, or one that holds outdoor_quadrotor/.
@@ -111,7 +113,8 @@ def clock_offset(folder: Path, unit: str) -> float:
 
 
 def _unlike(imu: Series, rtk: Series, offset: float, starts: list[float]) -> float:
-    """How badly readings and positions fit with such an offset: the mean square residual of alignments, m^2."""
+    """How badly readings and positions fit with such an offset: the mean square residual of alignments,
+    m^2."""
     moved = Series(rtk.time + round(offset * 1e9), rtk.values, name=rtk.name)
     moved = moved[moved.time >= imu.time[0]]
     found = []
@@ -151,8 +154,8 @@ def _rows(
 
 
 def judging(truth: Series, rtk: Series, fixes: Series, span: tuple[int, int] | None) -> Series:
-    """The rows of the truth that were no aid, between the first fix, and `SETTLE`, and the last; of an outage those
-    in its span."""
+    """The rows of the truth that were no aid, between the first fix, and `SETTLE`, and the last; of an
+    outage those in its span."""
     t = truth.time
     first, last = span or (int(fixes.time[0]) + round(SETTLE * 1e9), int(fixes.time[-1]))
     return truth[(t >= first) & (t <= last) & ~np.isin(t, rtk.time)]

@@ -1,4 +1,5 @@
-"""gnss_ins: any of its sensors, from any start, in every engine; how good it is, on drives and on real flights."""
+"""gnss_ins: any of its sensors, from any start, in every engine; how good it is, on drives and on real
+flights."""
 
 from __future__ import annotations
 
@@ -207,8 +208,8 @@ def test_a_unit_of_navigation_grade_goes_on_alone_on_a_turning_earth():
 
 @functools.cache
 def flown() -> tuple[Flight, Any, Any]:
-    """A minute of a drive with a centimetre's positions of an antenna at (0.4, -0.2, 0.6) m whose stamps are 50 ms
-    late, and its truth: the antenna's path alone."""
+    """A minute of a drive with a centimetre's positions of an antenna at (0.4, -0.2, 0.6) m whose stamps are
+    50 ms late, and its truth: the antenna's path alone."""
     flight = drive(60.0, "gps", imu__rate="50", gps__rate="50")
     truth = flight.truth
     assert truth is not None
@@ -289,7 +290,8 @@ def _row(belief: Any) -> Any:
 
 @pytest.mark.slow
 def test_a_recorded_flight_with_one_fix_a_second():
-    """The heading, the clocks and the place of the antenna found by itself; better than a spline by a good deal."""
+    """The heading, the clocks and the place of the antenna found by itself; better than a spline by a good
+    deal."""
     folder = recordings("outdoor_quadrotor")
     rows = outdoor(data=str(folder), flights="path_13", aids="1 Hz").rows
     found = {r["method"]: r for r in rows if r["flight"] == "path_13"}

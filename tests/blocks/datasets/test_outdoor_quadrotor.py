@@ -1,4 +1,5 @@
-"""Flights of the outdoor quadrotor: units, axes, the two clocks, thinning, and what is wrong with a folder."""
+"""Flights of the outdoor quadrotor: units, axes, the two clocks, thinning, and what is wrong with a
+folder."""
 
 from __future__ import annotations
 

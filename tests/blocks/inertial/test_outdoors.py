@@ -1,4 +1,5 @@
-"""Aids outdoors and the prediction over the Earth: Jacobians against differences, gravity, a start in motion."""
+"""Aids outdoors and the prediction over the Earth: Jacobians against differences, gravity, a start in
+motion."""
 
 from __future__ import annotations
 
@@ -126,8 +127,8 @@ def test_with_nothing_more_it_is_the_prediction_of_ins_eskf():
 ANTENNA = Antenna((0.3, -0.2, 0.1), 0.05)
 AIDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "position": (
-        aid_gnss_position, GnssPosition(position=np.array([9.0, 8.0, 7.0]), covariance=np.diag([1.0, 2.0, 3.0])),
-        {"antenna": ANTENNA, "estimated": ALL},
+        aid_gnss_position, GnssPosition(position=np.array([9.0, 8.0, 7.0]), covariance=np.diag([1.0, 2.0,
+        3.0])), {"antenna": ANTENNA, "estimated": ALL},
     ),
     "velocity": (
         aid_gnss_velocity, GnssVelocity(velocity=np.array([1.0, 2.0, 3.0]), covariance=np.eye(3)),
@@ -138,7 +139,8 @@ AIDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
         aid_compass, MagneticField(field=np.array([2e-5, 1e-5, -4e-5])), {"north": 0.3, "noise": 0.1},
     ),
     "antennas": (
-        aid_antennas, GnssHeading(angle=np.float64(0.4), deviation=np.float64(0.1)), {"baseline": (1.0, 0.4, 0.1)},
+        aid_antennas, GnssHeading(angle=np.float64(0.4), deviation=np.float64(0.1)), {"baseline": (1.0, 0.4,
+        0.1)},
     ),
     "wheels": (
         aid_wheels, WheelSpeed(speed=np.float64(4.0)), {"noise": 0.1, "slip": 0.2, "axle": (-1.0, 0.1, 0.2)},
