@@ -28,11 +28,11 @@ from flowgraph.blocks.inertial.outdoors import (
 )
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
-from flowgraph.blocks.models.navigation import navigation_steps
+from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.outdoors import Outdoors
-from flowgraph.blocks.scoring.tuning import with_imu
+from flowgraph.blocks.scoring.tuning import reading_of, with_imu
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -169,24 +169,31 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
     estimated = filter.estimated(on, inputs, known)
     start, inputs, invariant = filter.started(on, inputs, world, estimated, antenna)
     simulated = "noise" in on.flight.info or "still" in on.flight.info
-    errors = partial(antenna_errors, antenna=antenna, estimated=estimated)
+    known: dict[str, Any] = {
+        "start": start,
+        "noise": filter.imu_noise(on, (1.0, 1.0) if simulated else (15.0, 20.0)),
+        "antenna": antenna,
+        "estimated": estimated,
+        "height_noise": filter.height_noise,
+        "gravity": world.gravity,
+        "earth": world.earth,
+        "held": filter.held(on, inputs["imu"], inputs),
+    }
     return on.case(
-        filter.score(on, errors, steps=partial(navigation_steps, estimated=estimated)),
+        filter.score(
+            on,
+            partial(antenna_errors, antenna=antenna, estimated=estimated),
+            steps=partial(navigation_steps, estimated=estimated),
+            recording=navigation_recording(inputs, reading=reading_of(on.flight), **known),
+        ),
         inputs=inputs,
-        start=start,
-        noise=filter.imu_noise(on, (1.0, 1.0) if simulated else (15.0, 20.0)),
-        antenna=antenna,
-        estimated=estimated,
         north=filter.north(on, world) if "magnetometer" in inputs else 0.0,
         compass_noise=filter.compass_noise,
-        height_noise=filter.height_noise,
         speed_noise=filter.speed_noise,
         slip=filter.slip,
         resting=filter.resting(),
-        gravity=world.gravity,
-        earth=world.earth,
-        held=filter.held(on, inputs["imu"], inputs),
         invariant=invariant,
         smoothing=filter.smoothed,
+        **known,
         **filter.gating(),
     )

@@ -34,7 +34,7 @@ from flowgraph.graphs.gnss_ins import gnss_ins
 AIDS: Mapping[str, str] = {"1 Hz": "1", "0.2 Hz": "5", "outage 10 s": "1"}
 """By name, s between fixes."""
 
-METHODS = ("filter", "smoothed", "linear", "spline")
+METHODS = ("filter", "smoothed", "batch", "linear", "spline")
 OUTAGE = 10.0
 SETTLE = 1.0
 """s, after the first fix, that are left out of the errors."""
@@ -166,7 +166,8 @@ def _found(case: Case, fixes: Series, time: np.ndarray, engine: str) -> dict[str
     result = simulate(case.graph, case.inputs, engine=engine)
     errors, steps = case.score.errors, case.score.steps  # type: ignore[attr-defined]
     prior, posterior, cross, space, named = steps(result)
-    smoothed = named(rauch_tung_striebel(prior, posterior, cross, space=space))
+    smoothed = rauch_tung_striebel(prior, posterior, cross, space=space)
+    batch = case.score.recording(smoothed, None)  # type: ignore[attr-defined]
     place = lambda series: at_antenna(
         series, antenna=errors.keywords["antenna"], estimated=errors.keywords["estimated"]
     )
@@ -176,7 +177,8 @@ def _found(case: Case, fixes: Series, time: np.ndarray, engine: str) -> dict[str
     p = fixes["position"]
     return {
         "filter": _between(place(result["belief"]), time, nis),
-        "smoothed": _between(place(smoothed), time),
+        "smoothed": _between(place(named(smoothed)), time),
+        "batch": _between(place(named(batch)), time),
         "linear": Judged(np.stack([np.interp(at, t, column) for column in p.T], axis=-1)),
         "spline": Judged(CubicSpline(t, p)(at)),
     }
