@@ -55,7 +55,8 @@ def _row(series: Series) -> dict[str, Any]:
 
 def graphs_for(flight: Flight) -> list[str]:
     """The installed graphs that are made ready for the first seconds of a flight as it is, without a
-    setting.""" short = _beginning(flight)
+    setting."""
+    short = _beginning(flight)
     graphs, _ = installed("flowgraph.graphs")
     return [name for name, graph in graphs.items() if _fits(graph, short)]
 
