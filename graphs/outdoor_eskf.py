@@ -33,6 +33,7 @@ from flowgraph.blocks.outdoor.belief import (
     observe_flow,
     outdoor_pose,
     outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
@@ -74,13 +75,17 @@ def outdoor_eskf(
     now = predict_clone(belief, drive, noise=s.imu, name="predict")
     now = bridged(belief, now, imu, held=held, position=0, velocity=3, attitude=6)
     if smoothing:
-        collect_steps(belief, now, drive, crossing=clone_crossing, held=held)
+        taken = delay(start, name="taken")
+        collect_steps(taken, now, drive, crossing=clone_crossing, held=held)
 
     def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return now
-        return find_back(now, innovation, patience=patience, moving=9, name=f"find_back_{name}")
+        lost: dict[str, Any] = {"moving": 9, "attitude": 6, "shown": name == "optical_flow"}
+        if name == "magnetometer":
+            lost = {"moving": (6, 9), "attitude": 6}
+        return find_back(now, innovation, patience=patience, name=f"find_back_{name}", **lost)
 
     readings: dict[str, tuple[Stream, Any, float]] = {
         "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),
@@ -105,11 +110,12 @@ def outdoor_eskf(
         R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
     )  # fmt: skip
     now = told(now, innovation, "optical_flow")
+    if smoothing:  # what is smoothed has the clone that its readings were measured from
+        collect(now, "posterior")
+        taken.feed(picture_cross(now, optical_flow, name="picture_cross"))
     now = new_picture(now, optical_flow, name="picture")
     last.feed(control)
     belief.feed(now)
-    if smoothing:
-        collect(now, "posterior")
     return {"belief": outdoor_pose(now)}
 
 

@@ -34,6 +34,7 @@ from flowgraph.blocks.models.tracking import constant_velocity
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive, one_of
 from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
+from flowgraph.errors import DeclarationError
 
 METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
 
@@ -123,6 +124,14 @@ def for_flight(
     noise = on.noise("position_noise", position_noise)
     first = on.inputs["position"]["position"][0]
     start = motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0))
+    if method == "particles" and scored.smoothed:
+        raise DeclarationError(
+            "particles have no smoother that goes back over their run",
+            path="tracker.method",
+            expected="linear, extended, unscented or cubature, with smooth or lag",
+            got="particles",
+            fix='smooth the clouds of a run of your own: smoothed_cloud(result["cloud"], motion)',
+        )
     recording = Recording(motion, {seen_position(noise): on.inputs["position"]}, start)
     return on.case(
         scored.score(on, plane_errors, steps=plane_steps, recording=recording),

@@ -66,7 +66,7 @@ class GaussianMethod(abc.ABC):
         raise DeclarationError(
             "this method has no smoother that goes back over its run",
             path=f"filtered.{type(self).__name__}",
-            expected="linear(), extended(), square_root(), unscented() or cubature()",
+            expected="linear(), extended(), square_root(), information(), unscented() or cubature()",
             got=repr(self),
             fix="leave smoothing out, or use another method",
         )

@@ -17,12 +17,10 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
-import functools
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from flowgraph import Array, block
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
     from_rotation_vector,
@@ -31,7 +29,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import accepts, masked
+from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
 __all__ = ["aid_attitude", "aid_position", "correct_belief"]
@@ -43,16 +41,8 @@ ORIGIN = (0.0, 0.0, 0.0)
 ALIGNED = (1.0, 0.0, 0.0, 0.0)
 
 
-@functools.lru_cache
-def _reset_table(n: int) -> np.ndarray:
-    """(3, n^2): maps an attitude correction d to -skew(d)/2 in the attitude block of an n x n matrix."""
-    table = np.zeros((3, n, n))
-    table[0, 7, 8], table[0, 8, 7] = 0.5, -0.5
-    table[1, 8, 6], table[1, 6, 8] = 0.5, -0.5
-    table[2, 6, 7], table[2, 7, 6] = 0.5, -0.5
-    flat = table.reshape(3, n * n)
-    flat.flags.writeable = False
-    return flat
+STATE = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6))
+"""Of a belief with biases, and of its errors."""
 
 
 @block
@@ -159,10 +149,31 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
     return to_rotation_vector(multiply(conjugate(q, xp=xp), measured, xp=xp), xp=xp)
 
 
+class _Group(NamedTuple):
+    """The error as one of the group SE_2(3), at an attitude: that of position and velocity turns with it, and
+    `more` numbers behind the fifteen stay."""
+
+    attitude: Array
+    more: int = 0
+
+    def reset(self, d: Array, xp: Any) -> Array:
+        """The Jacobian (15, 15) of the error when the state moves by d, as `StateSpace.reset` gives it."""
+        _, swing = _carried(self.attitude, d[..., 6:9], xp)
+        none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=d.dtype)
+        diagonal = (swing, swing, stay, stay, stay)
+        rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
+        found = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+        if not self.more:
+            return found
+        side, corner = 0.0 * found[..., :, : self.more], 0.0 * found[..., : self.more, : self.more]
+        below = xp.concat([side.mT, corner + xp.eye(self.more, dtype=d.dtype)], axis=-1)
+        return xp.concat([xp.concat([found, side], axis=-1), below], axis=-2)
+
+
 def correct_belief(
     prior: Any, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
 ) -> tuple[Any, KalmanInnovation]:
-    """The update every measurement shares: the posterior and the innovation, of the known entries.
+    """The correction that every Kalman filter shares, folded into the nominal state.
 
     Args:
         prior: a `Belief`, or a `NavigationBelief`.
@@ -170,57 +181,32 @@ def correct_belief(
         H: (m, n), the Jacobian by the error of the belief. R: (m, m), the covariance of the noise.
         gate, invariant: as in `aid_position`.
     """
-    P = prior.covariance
-    n = P.shape[-1]
-    present = ~xp.isnan(apart)
-    residual = xp.where(present, apart, 0.0)
-    H, R = masked(H, R, present, xp)
-    HP = H @ P
-    S = HP @ H.mT + R
-    column = residual[..., None]
-    solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
-    nis = (column.mT @ solved[..., n:])[..., 0, 0]
-    accepted = accepts(nis, gate, present, xp)
-    K = solved[..., :n].mT
-    if gate is not None:
-        K = K * xp.astype(accepted, K.dtype)[..., None, None]
-    d = (K @ column)[..., 0]
-    turn = d[..., 6:9]
+    more = prior.covariance.shape[-1] - 15
+    space = _Group(prior.attitude, more) if invariant else _space(more)
+    found = correct(prior.covariance, apart, H, R, gate=gate, space=space, xp=xp)
+    d, turn = found.shift, found.shift[..., 6:9]
+    to_place, to_speed = d[..., 0:3], d[..., 3:6]
     if invariant:
-        push, swing = _carried(prior.attitude, turn, xp)
-        moved = push @ xp.concat([d[..., 0:3, None], d[..., 3:6, None]], axis=-1)
+        push, _ = _carried(prior.attitude, turn, xp)
+        moved = push @ xp.concat([to_place[..., None], to_speed[..., None]], axis=-1)
         to_place, to_speed = moved[..., 0], moved[..., 1]
-        none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=P.dtype)
-        diagonal = (swing, swing, stay, stay, stay)
-        rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
-        reset = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
-        if n > 15:
-            reset = _extended(reset, n - 15, xp)
-    else:
-        to_place, to_speed = d[..., 0:3], d[..., 3:6]
-        one = xp.eye(n, dtype=P.dtype)
-        reset = xp.reshape(turn @ xp.asarray(_reset_table(n), dtype=P.dtype), (*d.shape[:-1], n, n)) + one
-    gain = reset @ K
-    A = reset - gain @ H
-    P = A @ P @ A.mT + gain @ R @ gain.mT
     values = {
         "position": prior.position + to_place,
         "velocity": prior.velocity + to_speed,
         "attitude": multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
         "gyro_bias": prior.gyro_bias + d[..., 9:12],
         "accelerometer_bias": prior.accelerometer_bias + d[..., 12:15],
-        "covariance": 0.5 * (P + P.mT),
+        "covariance": found.covariance,
     }
-    if n > 15:
+    if more:
         values["parameters"] = prior.parameters + d[..., 15:]
-    posterior = type(prior)(**values)
-    parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
-    innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
-    return posterior, innovation
+    return type(prior)(**values), found.innovation
 
 
-def _extended(reset: Array, more: int, xp: Any) -> Array:
-    """A matrix (15, 15) and the identity of so many numbers behind it."""
-    side, corner = 0.0 * reset[..., :, :more], 0.0 * reset[..., :more, :more]
-    below = xp.concat([side.mT, corner + xp.eye(more, dtype=reset.dtype)], axis=-1)
-    return xp.concat([xp.concat([reset, side], axis=-1), below], axis=-2)
+def _space(more: int) -> StateSpace:
+    """`STATE`, with so many numbers behind it."""
+    if not more:
+        return STATE
+    return StateSpace(
+        position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6 + more)
+    )

@@ -15,7 +15,7 @@ Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to T
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,13 @@ __all__ = [
 
 Vector = Annotated[Any, real("m")]
 """A control or a measurement: m real numbers."""
+
+
+class Resets(Protocol):
+    """What says how an error turns when its state is moved: a `StateSpace`, for one."""
+
+    def reset(self, d: Array, xp: Any) -> Array | None:
+        """The Jacobian (..., t, t) of the error when the state moves by d (..., t); None where it is I."""
 
 
 class Correction(NamedTuple):
@@ -154,7 +161,7 @@ def correct(
     *,
     present: Array | None = None,
     gate: float | None = None,
-    space: StateSpace | None = None,
+    space: Resets | None = None,
     xp: Any,
 ) -> Correction:
     """The correction that every Kalman filter shares, linear or extended, in Joseph form.
@@ -165,7 +172,8 @@ def correct(
         H: Jacobian (..., m, t).
         R: covariance of the noise (..., m, m).
         present: (..., m) which entries there are; None: all.
-        gate, space: as in `update_linear`.
+        gate: as in `update_linear`.
+        space: of the state, or what else says how the error turns when the state is corrected.
     """
     if present is None:
         present = ~xp.isnan(residual)
@@ -177,12 +185,16 @@ def correct(
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
-    K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
+    K = solved[..., :-1].mT
+    if gate is not None:
+        K = K * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
-    rest = xp.eye(P.shape[-1], dtype=P.dtype) - K @ H
-    if turn is not None:
-        rest, K = turn @ rest, turn @ K
+    if turn is None:
+        turn = xp.eye(P.shape[-1], dtype=P.dtype)
+    else:
+        K = turn @ K
+    rest = turn - K @ H
     innovation = KalmanInnovation(
         residual=residual,
         covariance=S,

@@ -2,8 +2,8 @@
 
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
-on the same sensors, with the same knowledge, so that the two can be compared. `errors` judges navigation by
-the path of an antenna, and by directions.
+on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
+sensor does to it. `errors` judges navigation by the path of an antenna, and by directions.
 """
 
 from __future__ import annotations
@@ -20,20 +20,23 @@ from flowgraph.blocks.outdoor.belief import (
     observe_flow,
     outdoor_pose,
     outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
-    correct_distance,
-    correct_field,
-    correct_flow,
-    correct_position,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
+)
+from flowgraph.blocks.outdoor.corrections import (
+    correct_distance,
+    correct_field,
+    correct_flow,
+    correct_position,
 )
 from flowgraph.blocks.outdoor.errors import antenna_errors, at_antenna, directed_errors
 from flowgraph.blocks.outdoor.flight import (
@@ -47,6 +50,7 @@ from flowgraph.blocks.outdoor.flight import (
 __all__ = [
     "clone_crossing",
     "outdoor_steps",
+    "picture_cross",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",

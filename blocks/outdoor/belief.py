@@ -43,6 +43,7 @@ __all__ = [
     "observe_flow",
     "outdoor_pose",
     "outdoor_steps",
+    "picture_cross",
     "predict_clone",
     "start_outdoor",
 ]
@@ -208,6 +209,17 @@ def new_picture(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gauss
     p, v, q, _, _ = _parts(belief.mean)
     T = xp.asarray(_TAKEN, dtype=p.dtype)
     return Gaussian(mean=xp.concat([p, v, q, p, q], axis=-1), covariance=T @ belief.covariance @ T.mT)
+
+
+@block
+def picture_cross(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gaussian:
+    """What `new_picture` makes of a mean, and in place of a covariance P that of the belief before it (rows)
+    with the one after, P T^T: what a smoother goes back by."""
+    if flow is None:
+        return belief
+    p, v, q, _, _ = _parts(belief.mean)
+    T = xp.asarray(_TAKEN, dtype=p.dtype)
+    return Gaussian(mean=xp.concat([p, v, q, p, q], axis=-1), covariance=belief.covariance @ T.mT)
 
 
 @block

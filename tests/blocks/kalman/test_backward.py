@@ -11,6 +11,7 @@ from flowgraph.blocks.filtering import (
     extended,
     first,
     imm,
+    information,
     linear,
     particles,
     square_root,
@@ -46,11 +47,13 @@ def test_every_gaussian_method_is_smoothed(method):
 
 def test_forms_of_one_filter_are_smoothed_alike():
     seen, _ = driven(60)
-    plain, rooted = (
-        smooth(simulate(built(m), {"position": seen}), TURNING) for m in (extended(), square_root())
+    plain, *others = (
+        smooth(simulate(built(method), {"position": seen}), TURNING)
+        for method in (extended(), square_root(), information())
     )
-    for leaf in LEAVES:
-        np.testing.assert_allclose(plain[leaf], rooted[leaf], atol=1e-9)
+    for other in others:
+        for leaf in LEAVES:
+            np.testing.assert_allclose(plain[leaf], other[leaf], atol=1e-9)
 
 
 def curved(n: int) -> tuple[StateSpace, Series, Series, Series]:
