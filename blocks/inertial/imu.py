@@ -25,7 +25,7 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.blocks.signals import GRAVITY, Belief, Imu
 
-__all__ = ["GRAVITY", "ImuNoise", "error_jacobian", "predict"]
+__all__ = ["GRAVITY", "ImuNoise", "carried", "error_jacobian", "predict"]
 
 
 @dataclass(frozen=True)
@@ -137,21 +137,29 @@ def predict(
 
     Fires when its inputs do. No state of its own.
     """
-    kind = belief.position.dtype
-    by_half, middle, R, back, force = _turned(belief, imu, dt, xp)
-    acceleration = (R @ force[..., None])[..., 0] + xp.asarray(gravity, dtype=kind)
-    step = acceleration * dt
-    F = _jacobian(R, back, force, dt, xp)
-    Q = xp.asarray(_density(noise), dtype=kind) * (0.5 * dt)
+    pull = xp.asarray(gravity, dtype=belief.position.dtype)
+    values, F = carried(belief, imu, pull, dt, xp)
+    Q = xp.asarray(_density(noise), dtype=pull.dtype) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
     return Belief(
-        position=belief.position + (belief.velocity + 0.5 * step) * dt,
-        velocity=belief.velocity + step,
-        attitude=normalize((by_half @ middle)[..., 0], xp=xp),
+        **values,
         gyro_bias=belief.gyro_bias,
         accelerometer_bias=belief.accelerometer_bias,
         covariance=0.5 * (P + P.mT),
     )
+
+
+def carried(belief: Any, imu: Imu, gravity: Array, dt: Any, xp: Any) -> tuple[dict[str, Array], Array]:
+    """Position, velocity and attitude of `predict`, by name, and F (15, 15)."""
+    by_half, middle, R, back, force = _turned(belief, imu, dt, xp)
+    acceleration = (R @ force[..., None])[..., 0] + gravity
+    step = acceleration * dt
+    values = {
+        "position": belief.position + (belief.velocity + 0.5 * step) * dt,
+        "velocity": belief.velocity + step,
+        "attitude": normalize((by_half @ middle)[..., 0], xp=xp),
+    }
+    return values, _jacobian(R, back, force, dt, xp)
 
 
 def error_jacobian(belief: Belief, imu: Imu, dt: Any, xp: Any) -> Array:

@@ -50,6 +50,15 @@ from flowgraph.blocks.signals.motion import (
     WorldAcceleration,
     WorldForce,
 )
+from flowgraph.blocks.signals.navigation import (
+    GnssFix,
+    GnssHeading,
+    GnssPosition,
+    GnssVelocity,
+    Height,
+    NavigationBelief,
+    WheelSpeed,
+)
 from flowgraph.blocks.signals.particles import (
     Ancestors,
     Cloud,
@@ -151,4 +160,11 @@ __all__ = [
     "Window",
     "NormalEquations",
     "vector_of",
+    "GnssFix",
+    "GnssHeading",
+    "GnssPosition",
+    "GnssVelocity",
+    "Height",
+    "NavigationBelief",
+    "WheelSpeed",
 ]
