@@ -8,7 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Array, LoweringError, Pipeline, Stream, block, delay, graph, lower, real, simulate
+from flowgraph import (
+    Array,
+    LoweringError,
+    Pipeline,
+    Signal,
+    Stream,
+    block,
+    delay,
+    graph,
+    lower,
+    real,
+    simulate,
+)
 from flowgraph.errors import PipelineError
 from flowgraph.pipeline.costs.operations import depth, operations
 from flowgraph.recorder.loop import Loop
@@ -17,6 +29,12 @@ from flowgraph.recorder.replay import Body
 from flowgraph.recorder.specs import Spec
 from flowgraph.recorder.trace import Trace
 from tests.support import all_engines
+
+
+class Happened(Signal):
+    """What happened at each place of a ring."""
+
+    rows: Array = real(5, 3)
 
 
 def instruction(value: int, op: str, args: list[int], shape: list[int], **attrs: Any) -> dict[str, Any]:
@@ -50,12 +68,13 @@ def test_turns_go_around_the_ring_in_all_engines(first, count):
     """Once where the history lies, and once beside it, where it is read elsewhere too."""
 
     @block
-    def turned(history: Any, rows: Any, *, loop: Any, first: int, count: int, xp: Any):
+    def turned(history: Any, happened: Any, *, loop: Any, first: int, count: int, xp: Any):
+        rows = happened.rows
         at = xp.astype(rows[0, 0] * 0.0, xp.int32)
         return loop(history, rows, at + np.int32(first), at + np.int32(count), xp=xp)
 
     @graph
-    def kept(rows: Stream[real(5, 3)]):
+    def kept(rows: Stream[Happened]):
         history = delay(RING, name="history")
         new = turned(history, rows, loop=Loop(BODY), first=first, count=count)
         history.feed(new)
@@ -65,7 +84,7 @@ def test_turns_go_around_the_ring_in_all_engines(first, count):
         other.feed(alone)
         return {"new": new, "beside": beside, "alone": alone}
 
-    found = all_engines(kept.build(), {"rows": (np.arange(2), np.stack([ROWS, ROWS]))})
+    found = all_engines(kept.build(), {"rows": (np.arange(2), Happened(rows=np.stack([ROWS, ROWS])))})
     once = by_hand(RING, first, count)
     for name in ("new", "beside", "alone"):
         np.testing.assert_array_equal(found[name].value, [once, by_hand(once, first, count)])
@@ -113,17 +132,18 @@ def test_arguments_that_do_not_fit_are_refused():
 
 def test_a_turn_that_was_changed_in_a_file_is_refused(tmp_path):
     @block
-    def turned(rows: real(5, 3), *, loop: Any, xp: Any) -> Array:
+    def turned(happened: Happened, *, loop: Any, xp: Any) -> Array:
+        rows = happened.rows
         at = xp.astype(rows[0, 0], xp.int32)
         return loop(RING + rows[0, 0], rows, at, at + np.int32(2), xp=xp)
 
     @graph
-    def made(rows: Stream[real(5, 3)]):
+    def made(rows: Stream[Happened]):
         return turned(rows, loop=Loop(BODY))
 
     built = made.build()
     plain = lower(built).to_json()
-    inputs = {"rows": (np.arange(1), ROWS[None])}
+    inputs = {"rows": (np.arange(1), Happened(rows=ROWS[None]))}
     wanted = simulate(built, inputs).output.value
     np.testing.assert_array_equal(Pipeline.from_json(plain).run(inputs).output.value, wanted)
     broken = copy.deepcopy(plain)
