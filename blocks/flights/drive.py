@@ -87,7 +87,8 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
 
     Args:
         seed: of the road and of all noise.
-        settings: any of `DEFAULTS`; `unit`, of `GRADES`, consumer if left out; `sensors`, of `SENSORS`,
+        settings: any of `DEFAULTS`; `road`, its number, that of the seed if left out;
+            `unit`, of `GRADES`, consumer if left out; `sensors`, of `SENSORS`,
             comma-separated,
             gps and gps_velocity if left out.
 
@@ -103,7 +104,7 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
     period = round(1e9 / values["imu.rate"])
     time = np.arange(0, round(values["duration"] * 1e9) + 1, period, dtype=np.int64)
     draw = lambda name, *shape: generator(seed, f"drive.{name}").standard_normal(shape)
-    road = _Road(seed, values["duration"])
+    road = _Road(seed if values["road"] < 0.0 else round(values["road"]), values["duration"])
     p, v, q = road.at(time * 1e-9)
     dt = period * 1e-9
     n = len(time)
@@ -157,7 +158,8 @@ def _settings(given: dict[str, Any]) -> tuple[dict[str, Any], Grade, list[str]]:
     for name in sensors:
         if name not in SENSORS:
             raise UnknownNameError("sensor", name, ["imu", *SENSORS], path="sim:drive")
-    values: dict[str, Any] = {**DEFAULTS, "unit": unit}
+    road = given.pop("road", -1)
+    values: dict[str, Any] = {**DEFAULTS, "unit": unit, "road": _number_of(road)}
     for name, value in given.items():
         if name not in DEFAULTS:
             raise UnknownNameError("setting", name, ["unit", "sensors", *DEFAULTS], path="sim:drive")
@@ -174,6 +176,23 @@ def _settings(given: dict[str, Any]) -> tuple[dict[str, Any], Grade, list[str]]:
                 fix=f"for example {name}={DEFAULTS[name]:g}",
             )
     return values, GRADES[unit], sensors
+
+
+def _number_of(road: Any) -> int:
+    """The number of a road; -1 for that of the seed.
+
+    Raises:
+        DeclarationError: for what is none.
+    """
+    if str(road) == "-1" or str(road).isdecimal():
+        return int(road)
+    raise DeclarationError(
+        "setting 'road' is not usable",
+        path="sim:drive",
+        expected="a whole number, not negative",
+        got=repr(road),
+        fix="for example road=0",
+    )
 
 
 class _Road:

@@ -47,6 +47,7 @@ capture in m and rad."""
 
 SETTINGS: Mapping[str, str | float] = {
     **drive.DEFAULTS,
+    "road": "of a drive: its number, that of the seed if left out",
     "unit": "of a drive: " + ", ".join(drive.GRADES),
     **worlds.SETTINGS,
     **plane.DEFAULTS,
