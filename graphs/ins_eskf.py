@@ -225,5 +225,5 @@ def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
         return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
     streams = on.need("imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
     vicon = streams["vicon"]
-    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude", gaps=vicon.gaps)
+    turns = vicon.holding(Attitude(attitude=vicon["attitude"]), "attitude")
     return {"imu": streams["imu"], "position": positions(vicon), "attitude": turns}, "vicon_lever"

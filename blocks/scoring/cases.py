@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Series, clocks_of
+from flowgraph import Case, Flight, Result, Series
 from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
@@ -28,6 +28,7 @@ from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.recordings import pose_recording
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
@@ -66,12 +67,14 @@ class OnFlight:
         flight: as it was loaded, or as `told` has completed it.
         inputs: the streams that were needed, by name.
         notes: what is assumed while the case is made; see `note`.
+        rewind: s, as the setting of `Late`.
     """
 
     graph: GraphFunction
     flight: Flight
     inputs: dict[str, Series]
     notes: list[str] = field(default_factory=list)
+    rewind: float | None = None
 
     @property
     def name(self) -> str:
@@ -153,7 +156,9 @@ class OnFlight:
         for name in noted:
             self.usual_step(inputs[name])
         self.notes.extend(gap_notes(inputs, noted))
-        built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
+        smoothed = getattr(score, "smoothing", False)
+        built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
+        self.notes.extend(said_of_late)
         return Case(
             built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
         )
@@ -186,7 +191,7 @@ def on_flight(
     """
 
     def register(function: Callable[..., Case]) -> Callable[..., Case]:
-        known = spliced(function, **({"ranges": Ranges} if ranged else {}))
+        known = spliced(function, **({"ranges": Ranges} if ranged else {}), late=Late)
         flown = inspect.Parameter("flight", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Flight)
         signature = inspect.Signature([flown, *known.parameters], return_annotation=Case)
 
@@ -204,7 +209,8 @@ def on_flight(
             groups = known.grouped(values)
             flight, notes = taken(flight, groups.pop("ranges", Ranges()), graph.name, measured)
             inputs = flight.need(graph.name, *needs, fix=fix)
-            return function(OnFlight(graph, flight, inputs, notes), **groups)
+            late = groups.pop("late")
+            return function(OnFlight(graph, flight, inputs, notes, late.rewind), **groups)
 
         prepare.__signature__ = signature  # type: ignore[attr-defined]
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
