@@ -11,6 +11,7 @@ says count, and `calibration` how well one explains its windows. `own` makes a c
 
 from __future__ import annotations
 
+from flowgraph.blocks.scoring.capture import on_capture
 from flowgraph.blocks.scoring.cases import (
     Factors,
     Gated,
@@ -23,7 +24,6 @@ from flowgraph.blocks.scoring.cases import (
     Scored,
     Smoothed,
     SmoothedPoseFilter,
-    on_capture,
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six

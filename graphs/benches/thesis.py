@@ -245,13 +245,13 @@ def thesis(
     for code in codes:
         noise = Noise.of(code)
         flown = [fly(seed + k, noise, duration=duration) for k in range(flights)]
-        bound = _bound(flown, noise)
+        bound = bound_of(flown, noise)
         for name in names:
             errors = _errors(FILTERS[name], flown, noise, particles, engine)
             rows.append(_row(code, name, errors, bound))
-        least = _bound(flown, noise, smoothing=True) if better else bound
+        least = bound_of(flown, noise, smoothing=True) if better else bound
         for name in better:
-            errors = _smoothed_errors(name, flown, noise, engine)
+            errors = smoothed_errors(name, flown, noise, engine)
             rows.append(_row(code, f"{name}_smoothed", errors, least))
     figures = {"thesis.png": lambda path: draw(rows, path)}
     return Report(rows, figures, (f"{flights} flights of {duration:g} s, {particles} particles, {engine}",))
@@ -270,7 +270,7 @@ class Errors:
     nees: np.ndarray
 
 
-def _bound(flown: list[Flight], noise: Noise, *, smoothing: bool = False) -> tuple[float, float]:
+def bound_of(flown: list[Flight], noise: Noise, *, smoothing: bool = False) -> tuple[float, float]:
     """The root mean squares below which no filter's errors are, or no smoother's; m and rad."""
     squares = []
     for first in range(0, len(flown), AT_ONCE):
@@ -320,7 +320,7 @@ def _errors(make: Any, flown: list[Flight], noise: Noise, particles: int, engine
     return Errors(*np.array(parts).T)
 
 
-def _smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) -> Errors:
+def smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) -> Errors:
     """Those of the smoothed runs of a filter; all flights go back together."""
     stream, signal, gaussian, space = SMOOTHED[name]
     make, parts = FILTERS[name], []
