@@ -90,7 +90,7 @@ def test_what_has_no_batch_says_so():
 
 @pytest.mark.slow
 def test_smoothed_runs_are_honest_and_at_their_bound():
-    """Over 12 flights of the thesis, a mean NEES each: 9 within their spread (over 24: 9.2, deviation 0.25)."""
+    """Over 12 flights of the thesis, a mean NEES each: 9 within their spread (over 24, 9.2 and 0.25)."""
     noise = Noise.of("HHH")
     flown = [fly(seed, noise) for seed in range(12)]
     errors = smoothed_errors("eskf", flown, noise, engine_of("auto", many=True))
