@@ -1,6 +1,7 @@
-"""Filters of a pose without biases, on an IMU and a motion capture: where they start, and what they are told.
+"""A case of a filter on an inertial unit and a motion capture, which begins where the capture first sees it.
 
-The extended and the unscented filter differ in what they start from, and in nothing else of the flight.
+Filters without biases have it in common: they start at the capture's first pose and at rest, and are told the
+noise of both sensors, where the capture's markers sit, and what the unit's readings stand for.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from flowgraph import Case, Result
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.recordings import pose_recording
-from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter
+from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter
 from flowgraph.blocks.scoring.start import StartPose
 from flowgraph.blocks.scoring.tuning import reading_of, unbiased_factors
 from flowgraph.blocks.signals import Gaussian
@@ -22,7 +23,7 @@ __all__ = ["on_capture"]
 
 def on_capture(
     on: OnFlight,
-    filter: SmoothedPoseFilter,
+    filter: PoseFilter,
     *,
     start: Callable[..., Any],
     believed: Callable[[Any], Gaussian],
