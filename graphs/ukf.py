@@ -80,7 +80,8 @@ def ukf(
     last = delay(Imu.at_rest(gravity), name="last_control")
     control = latest(imu, init=Imu.at_rest(gravity), at=imu | vicon, name="control")
     drive = driving(last, control, reading)
-    moving = {"move": carry_pose(gravity), "noise": imu_density(noise), "space": STATE, "points": points}
+    moving: dict[str, Any] = {"move": carry_pose(gravity), "noise": imu_density(noise), "space": STATE}
+    moving["points"] = points
     prior = predict_unscented(belief, drive, **moving)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = update_unscented(

@@ -106,7 +106,7 @@ def cauchy(width: float = 2.385) -> Loss:
 
 def loss_of(name: str) -> Loss | None:
     """That of a name of `LOSSES`; None for none."""
-    return {"none": lambda: None, "huber": huber, "cauchy": cauchy}[name]()
+    return {"huber": huber(), "cauchy": cauchy()}.get(name)
 
 
 class Moves(Protocol):

@@ -37,7 +37,7 @@ from flowgraph.blocks.models.unscented_pose import STATE, start_state
 from flowgraph.blocks.particles.cloud import start_cloud
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.tuning import WEIGHTLESS, reading_of, with_imu
-from flowgraph.blocks.signals import Attitude, Gaussian, PoseEstimate
+from flowgraph.blocks.signals import Attitude, Belief, Gaussian, PoseEstimate
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
@@ -198,11 +198,12 @@ FILTERS: Mapping[str, Callable[[Flight, Noise, int], Trial]] = {
 }
 """By name: what runs the filter on a flight, told the noise, with a number of particles."""
 
-SMOOTHED: Mapping[str, tuple[str, Callable[[Any], Gaussian], StateSpace]] = {
-    "eskf": ("belief", stacked, INERTIAL_BIASED),
-    "ukf": ("posterior", lambda belief: belief, STATE),
+SMOOTHED: Mapping[str, tuple[str, Any, Callable[[Any], Gaussian], StateSpace]] = {
+    "eskf": ("belief", Belief, stacked, INERTIAL_BIASED),
+    "ukf": ("posterior", Gaussian, lambda belief: belief, STATE),
 }
-"""Those whose runs can be smoothed: the stream of their beliefs, these as Gaussians, and over what space."""
+"""Those whose runs can be smoothed: the stream of their beliefs and its signal, these as Gaussians, and over
+what space."""
 
 SMOOTHED_AT_ONCE = 10
 """Flights whose covariances, priors and cross-covariances are held in memory together."""
@@ -244,13 +245,13 @@ def thesis(
     for code in codes:
         noise = Noise.of(code)
         flown = [fly(seed + k, noise, duration=duration) for k in range(flights)]
-        bound = _bound(flown, noise)
+        bound = bound_of(flown, noise)
         for name in names:
             errors = _errors(FILTERS[name], flown, noise, particles, engine)
             rows.append(_row(code, name, errors, bound))
-        least = _bound(flown, noise, smoothing=True) if better else bound
+        least = bound_of(flown, noise, smoothing=True) if better else bound
         for name in better:
-            errors = _smoothed_errors(name, flown, noise, engine)
+            errors = smoothed_errors(name, flown, noise, engine)
             rows.append(_row(code, f"{name}_smoothed", errors, least))
     figures = {"thesis.png": lambda path: draw(rows, path)}
     return Report(rows, figures, (f"{flights} flights of {duration:g} s, {particles} particles, {engine}",))
@@ -269,7 +270,7 @@ class Errors:
     nees: np.ndarray
 
 
-def _bound(flown: list[Flight], noise: Noise, *, smoothing: bool = False) -> tuple[float, float]:
+def bound_of(flown: list[Flight], noise: Noise, *, smoothing: bool = False) -> tuple[float, float]:
     """The root mean squares below which no filter's errors are, or no smoother's; m and rad."""
     squares = []
     for first in range(0, len(flown), AT_ONCE):
@@ -313,15 +314,15 @@ def _errors(make: Any, flown: list[Flight], noise: Noise, particles: int, engine
         )
         found = batch[output]
         for k, flight in enumerate(some):
-            pose = (found[name][k] for name in ("position", "velocity", "attitude"))
+            p, v, q = (found[name][k] for name in ("position", "velocity", "attitude"))
             P = found["covariance"][k][:, :9, :9] if "covariance" in found.leaves else None
-            parts.append(_compared(found.time, _truth(flight), *pose, P))
+            parts.append(_compared(found.time, _truth(flight), p, v, q, P))
     return Errors(*np.array(parts).T)
 
 
-def _smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) -> Errors:
+def smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) -> Errors:
     """Those of the smoothed runs of a filter; all flights go back together."""
-    stream, gaussian, space = SMOOTHED[name]
+    stream, signal, gaussian, space = SMOOTHED[name]
     make, parts = FILTERS[name], []
     graph = make(flown[0], noise, 1).graph(smoothing=True)
     for first in range(0, len(flown), SMOOTHED_AT_ONCE):
@@ -337,8 +338,8 @@ def _smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) 
             runs_at_once=len(trials),
         )
         before, after = (
-            gaussian(graph_type(**{leaf: np.swapaxes(batch[of][leaf], 0, 1) for leaf in batch[of].leaves}))
-            for of, graph_type in (("prior", _class_of(graph, "prior")), (stream, _class_of(graph, stream)))
+            gaussian(signal(**{leaf: np.swapaxes(batch[of][leaf], 0, 1) for leaf in batch[of].leaves}))
+            for of in ("prior", stream)
         )
         cross = np.swapaxes(batch["cross"]["covariance"], 0, 1)
         gains = np.asarray(smoother_gain(cross[1:], np.asarray(before.covariance)[1:], np))
@@ -346,15 +347,9 @@ def _smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) 
             gains, before.mean, before.covariance, after.mean, after.covariance, space
         )
         for k, flight in enumerate(some):
-            pose = np.split(mean[:, k], (3, 6, 10), axis=-1)[:3]
-            parts.append(_compared(batch[stream].time, _truth(flight), *pose, P[:, k, :9, :9]))
+            p, v, q, _ = np.split(mean[:, k], (3, 6, 10), axis=-1)
+            parts.append(_compared(batch[stream].time, _truth(flight), p, v, q, P[:, k, :9, :9]))
     return Errors(*np.array(parts).T)
-
-
-def _class_of(graph: Graph, output: str) -> Any:
-    """The signal of a collected stream."""
-    wire = next(c.wire for c in graph.collected if c.name == output)
-    return graph.port(wire).type.cls
 
 
 def _compared(
