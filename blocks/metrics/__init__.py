@@ -9,7 +9,7 @@ after a run, but for the limits of a gate, which become constants of the graph.
 
 from __future__ import annotations
 
-from flowgraph.blocks.metrics.bound import posterior_bound
+from flowgraph.blocks.metrics.bound import posterior_bound, smoothing_bound
 from flowgraph.blocks.metrics.chi_square import (
     chi_square,
     chi_square_band,
@@ -40,6 +40,7 @@ __all__ = [
     "StateErrors",
     "true_parts",
     "posterior_bound",
+    "smoothing_bound",
     "chi_square",
     "chi_square_band",
     "chi_square_gate",

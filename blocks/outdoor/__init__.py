@@ -13,11 +13,14 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
@@ -44,6 +47,9 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "clone_crossing",
+    "outdoor_steps",
+    "picture_cross",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",

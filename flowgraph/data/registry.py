@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.arrival import LATENCY, delayed_flight
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
@@ -199,7 +200,8 @@ def load_flight(
             "csv:imu.csv+csv:mocap.csv".
         seed: of what is simulated.
         settings: of the loaders by name. Of several parts, each takes those that it has; `2.NAME` is for the
-            second alone.
+            second alone. Every kind has `STREAM.latency`, the seconds after which a stream arrives; LOW:HIGH
+            for random ones.
         truth: a SPEC whose truth, or only stream of poses, is the flight's truth; its settings have the
             number after the last part.
 
@@ -209,12 +211,19 @@ def load_flight(
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong, or
             parts do not fit together.
     """
+    late = {k: v for k, v in (settings or {}).items() if k.endswith(LATENCY)}
+    rest = {k: v for k, v in (settings or {}).items() if k not in late}
+    flight = _load(spec, seed, rest, truth)
+    return delayed_flight(flight, late, seed=seed) if late else flight
+
+
+def _load(spec: str, seed: int, settings: Mapping[str, str], truth: str | None) -> Flight:
     specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
     kinds = [_kind(s) for s in specs]
-    each = [dict(settings or {})]
+    each = [dict(settings)]
     if len(specs) > 1:
         names = [kind.settings for kind in kinds]
-        given = of_a_truth(settings or {}, names) if truth is not None else settings or {}
+        given = of_a_truth(settings, names) if truth is not None else settings
         each = shared(specs, names, [kind.claims for kind in kinds], given)
     found = [_read(kind, s, seed, given) for kind, s, given in zip(kinds, specs, each, strict=True)]
     if truth is None:
@@ -271,4 +280,4 @@ def flight_settings(spec: str, truth: str | None = None, *, run: bool = True) ->
         settings_by_text(kind) if is_in_file(kind) and not run else _kind(one).settings
         for kind, one in zip(kinds, specs, strict=True)
     ]
-    return names[0] if len(names) == 1 else numbered(names)
+    return [*(names[0] if len(names) == 1 else numbered(names)), "STREAM" + LATENCY]

@@ -296,7 +296,10 @@ def _worst(rows: Sequence[Mapping[str, Any]], names: list[str], metric: str, sto
             file = store.trajectory_file(row["key"]).relative_to(store.folder)
             line["trajectory"] = _Raw(f'<a href="{_safe(file.as_posix())}">{_safe(row["key"][:8])}.npz</a>')
         lines.append(line)
-    return _table(_shown(lines)) if lines else "<p>None.</p>"
+    if not lines:
+        return "<p>None.</p>"
+    words = "With <code>--html worst.html --beside</code> after each of them, they are compared on one page."
+    return f"<p>{words}</p>{_table(_shown(lines))}"
 
 
 def _setting(row: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def test_a_setting_that_is_not_there_is_refused_in_code_and_in_words():
         registered().case(a_flight(), gian=1.0)
     prepare = registered().prepare
     assert prepare is not None
-    assert setting_names(prepare) == ["gain", "settle", "gyro_range", "specific_force_range"]
+    assert setting_names(prepare) == ["gain", "settle", "gyro_range", "specific_force_range", "rewind"]
     with pytest.raises(UnknownNameError, match="did you mean 'gain'"):
         parsed_settings(prepare, {"gian": "1"}, also=(), path="doubled")
     with pytest.raises(DeclarationError, match="finite float"):
