@@ -14,6 +14,7 @@ to a table as a logger would, and runs the filter on it.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from flowgraph import Array, Flight, Series, Signal, Stream, graph, load_flight, real, simulate, write_table
 from flowgraph.blocks.filtering import (
     MeasurementModel,
+    Method,
     MotionModel,
     StateSpace,
     angle,
@@ -56,7 +58,11 @@ class Car(Signal):
 
 CAR = StateSpace(position=euclidean(2), heading=angle(), speed=euclidean(1))
 START = CAR.gaussian(position=((0.0, 0.0), 1.0), heading=(0.3, 0.1), speed=(5.0, 0.5))
-METHODS = {"extended": extended, "unscented": unscented, "particles": lambda: particles(500)}
+METHODS: dict[str, Callable[[], Method]] = {
+    "extended": extended,
+    "unscented": unscented,
+    "particles": lambda: particles(500),
+}
 
 
 def moved(x, u: Steering, w, dt, xp):

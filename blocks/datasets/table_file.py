@@ -145,11 +145,11 @@ def _fields(sheet: Sheet, clock: int, mapped: Mapping[str, list[str]]) -> dict[t
         stream, _, field = name.partition(".")
         found[stream, field] = [sheet.column(c) for c in columns]
     taken = {clock, *(k for group in found.values() for k in group)}
-    told = {s for s, _ in found}
+    told, named = {s for s, _ in found}, set(found)
     for k, column in enumerate(sheet.names):
         stream, _, rest = split_unit(column)[0].partition(".")
         field, _, part = rest.partition(".")
-        if k in taken or not _WORD.fullmatch(stream) or (stream, field or "value") in mapped:
+        if k in taken or not _WORD.fullmatch(stream) or (stream, field or "value") in named:
             continue
         if rest and not (_WORD.fullmatch(field) and (not part or _PART.fullmatch(part))):
             continue
@@ -186,8 +186,8 @@ def _shaped(sheet: Sheet, columns: np.ndarray, group: list[int]) -> np.ndarray:
             fix="name each entry once",
         )
     whole = np.empty((len(columns), *shape))
-    for k, place in enumerate(places):
-        whole[(slice(None), *place)] = columns[:, k]
+    for k, (i, j) in enumerate(places):
+        whole[:, i, j] = columns[:, k]
     return whole
 
 

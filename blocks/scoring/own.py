@@ -176,8 +176,16 @@ def fitted(series: Series, type_: Type, name: str) -> Series:
                 path=f"{series.name}.{k}", expected=t.dtype, got=str(leaf[leaf != np.rint(leaf)].flat[0]),
                 fix="mend the data, or declare the field real(...)",
             )  # fmt: skip
-    kinds = {"int64": np.int64, "int32": np.int32, "uint32": np.uint32, "bool": np.bool_, "real": np.float64}
-    cast = [leaf.astype(kinds[t.dtype]) for leaf, t in zip(leaves, wanted.values(), strict=True)]
+    kinds: dict[str, Any] = {
+        "int64": np.int64,
+        "int32": np.int32,
+        "uint32": np.uint32,
+        "bool": np.bool_,
+        "real": np.float64,
+    }
+    cast: list[np.ndarray] = [
+        leaf.astype(kinds[t.dtype]) for leaf, t in zip(leaves, wanted.values(), strict=True)
+    ]
     values = unflatten(type_, iter(cast))
     return Series(series.time, values, type=type_, name=name, gaps=series.gaps)
 

@@ -49,7 +49,7 @@ def calibrate(
 
     found = search(
         graph,
-        [Fit(name, *numbers) for name, numbers in (span(f, "--find") for f in find)],
+        [Fit(*span(f, "--find")) for f in find],
         [Recording(d, seed) for d in data],
         measure=by,
         metric=metric,

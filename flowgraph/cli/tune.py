@@ -68,8 +68,10 @@ def tune(
     from flowgraph.study.tune import Fit, Recording, placed
     from flowgraph.study.tune import tune as search
 
-    fits = [Fit(name, *numbers, scale="linear") if placed(name) else Fit(name, *numbers)
-            for name, numbers in map(span, fit)]  # fmt: skip
+    fits = [
+        Fit(name, low, high, start, "linear" if placed(name) else "log")
+        for name, low, high, start in map(span, fit)
+    ]
     train = [Recording(d, s) for d in data for s in range(seeds)]
     later = [Recording(d, s) for d in data for s in range(seeds, seeds + held_out_seeds)]
     judges = later + [Recording(d) for d in held_out or []]
@@ -214,7 +216,7 @@ def _report(found: Tuned) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def span(given: str, option: str = "--fit") -> tuple[str, list[float]]:
+def span(given: str, option: str = "--fit") -> tuple[str, float, float, float | None]:
     name, _, span = given.partition("=")
     try:
         numbers = [float(x) for x in span.split(":")]
@@ -228,4 +230,4 @@ def span(given: str, option: str = "--fit") -> tuple[str, list[float]]:
             got=repr(given),
             fix=f"write {option} position_noise=0.001:0.1",
         ) from None
-    return name, numbers
+    return name, numbers[0], numbers[1], numbers[2] if len(numbers) > 2 else None

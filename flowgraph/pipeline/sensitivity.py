@@ -206,7 +206,7 @@ class _Differentiated:
             if place in self._changes:
                 shape = (self._p, *cell.shape)
                 write = self._change(cell.write, cell.shape)
-                zero = np.zeros(shape, DTYPES["real"])
+                zero: np.ndarray = np.zeros(shape)
                 cells.append(Cell(f"{cell.name}{CHANGE}", self._changes[place], write, shape, "real", zero))
         return replace(register, cells=tuple(cells))
 

@@ -158,7 +158,7 @@ def _vertex(
     f: Fit, width: float, found: Mapping[str, Parameter], tried: _Tried
 ) -> tuple[float, float | None, bool]:
     """Where a parabola through the measure has its least, its deviation, and whether it has one there."""
-    middle = float(found[f.name])  # type: ignore[arg-type]
+    middle = float(found[f.name])
     width = min(width, 0.5 * (f.high - f.low))
     middle = min(max(middle, f.low + width), f.high - width)
     steps = np.linspace(-1.0, 1.0, _POINTS) * width

@@ -82,9 +82,9 @@ class Coordinates:
 
     def _encoded(self, f: Fit, value: np.ndarray) -> np.ndarray:
         if f.scale == "linear":
-            return np.atleast_1d((value - f.low) / (f.high - f.low)).ravel()
+            return np.asarray(np.atleast_1d((value - f.low) / (f.high - f.low)).ravel())
         if value.ndim < 2:
-            return np.log(np.maximum(np.atleast_1d(value), f.low))
+            return np.asarray(np.log(np.maximum(np.atleast_1d(value), f.low)))
         L = np.linalg.cholesky(value)
         return np.concatenate([np.log(np.diag(L)), (L / np.diag(L)[:, None])[np.tril_indices(len(L), -1)]])
 

@@ -43,8 +43,8 @@ def _absolute(spec: str, folder: Path) -> str:
     kind, colon, rest = spec.partition(":")
     if is_in_file(kind_and_place(spec)[0]):
         own, place = kind_and_place(spec)
-        further = _path(folder, place) if _is_in(folder, place) else place
-        return _absolute_name(own, folder) + (f":{further}" if place else "")
+        there = _path(folder, place) if _is_in(folder, place) else place
+        return _absolute_name(own, folder) + (f":{there}" if place else "")
     if not rest or not _has_place(kind):
         return spec
     whole, more = rest, ""

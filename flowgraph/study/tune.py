@@ -240,7 +240,7 @@ def check_fits(
         numbers = [fit.low, fit.low if fit.start is None or np.ndim(fit.start) else fit.start, fit.high]
         least = -math.inf if fit.scale == "linear" else 0.0
         if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers) or not (
-            least < fit.low < fit.high and fit.low <= numbers[1] <= fit.high  # type: ignore[operator]
+            least < fit.low < fit.high and fit.low <= numbers[1] <= fit.high
         ):
             expected = "0 < low" if fit.scale == "log" else "low"
             raise _wrong(f"fit {fit.name}", f"{expected} <= start <= high, low < high", fit)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from flowgraph import DeclarationError, PluginError, UnknownNameError, find_graph, load_flight
+from flowgraph import DeclarationError, FlowgraphError, PluginError, UnknownNameError, find_graph, load_flight
 from flowgraph.study import Study, read_table, run_study
 from flowgraph.study.report import write_report
 from tests.cli.test_cli import invoke
@@ -83,12 +84,16 @@ def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neithe
 
 
 def test_a_run_of_a_study_is_done_anew_when_the_file_says_something_else(here: Path):
-    given = {"graphs": ["own_tracker.py:tracker"], "data": ["own_tracker.py:drive"], "engine": "reference"}
+    given: dict[str, Any] = {
+        "graphs": ["own_tracker.py:tracker"],
+        "data": ["own_tracker.py:drive"],
+        "engine": "reference",
+    }
     study = Study(**given, parameters={"duration": 2})
     assert run_study(study, here / "out").done == 1
     file = here / "own_tracker.py"
     file.write_text(file.read_text().replace("return x.position + v", "return x.position + 1.0 + v"))
-    assert run_study(Study(**given, parameters={"duration": 2}), here / "out").done == 1
+    assert run_study(Study(**given), here / "out").done == 1
 
 
 @pytest.mark.parametrize(
@@ -106,7 +111,12 @@ def test_a_run_of_a_study_is_done_anew_when_the_file_says_something_else(here: P
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file_is_said_with_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spec: str, text: str | None, error: type, said: list[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    spec: str,
+    text: str | None,
+    error: type[FlowgraphError],
+    said: list[str],
 ):
     monkeypatch.chdir(tmp_path)
     if text is not None:

@@ -114,7 +114,7 @@ def test_coordinates_come_back_and_keep_their_bounds():
     fits = [
         Fit("a", 0.1, 10.0), Fit("S", 1e-3, 1e3), Fit("v", 0.01, 5.0), Fit("o", -1.0, 3.0, scale="linear"),
     ]  # fmt: skip
-    start = {"a": 0.7, "S": S, "v": np.array([0.2, 4.0]), "o": -0.25}
+    start: dict[str, Any] = {"a": 0.7, "S": S, "v": np.array([0.2, 4.0]), "o": -0.25}
     at = Coordinates(fits, start)
     assert at.owners == ["a", *["S"] * 6, "v", "v", "o"]
     back = at.decode(at.start)

@@ -20,7 +20,7 @@ from flowgraph import (
     simulate,
 )
 from flowgraph.cli import app
-from flowgraph.study import trials
+from flowgraph.study import slopes, trials
 from flowgraph.study.search import first_steps
 from flowgraph.study.tune import Fit, Recording, start_of_fit, surprise, tune
 from tests.blocks.datasets.test_datasets import course
@@ -250,6 +250,7 @@ def test_what_fails_at_every_point_is_said_and_not_searched(monkeypatch, engine)
 
     for name in ("run_graph", "simulate_together"):
         monkeypatch.setattr(trials, name, missing)
+    monkeypatch.setattr(slopes, "play", missing)
     with pytest.raises(MissingDependencyError, match="C compiler"):
         tune("ekf", NOISES[:1], [Recording("sim")], settings={"imu.rate": 50}, engine=engine, most=2)
 

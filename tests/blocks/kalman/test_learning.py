@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,17 @@ from flowgraph import DataError, DeclarationError
 from flowgraph.blocks.kalman.learning import LEARNT, LinearGaussian, learn
 from flowgraph.errors import UnknownNameError
 
-BEGIN = LinearGaussian(
+
+def model(*given: Any, **named: Any) -> LinearGaussian:
+    """Of lists."""
+    return LinearGaussian(*given, **named)
+
+
+BEGIN = model(
     F=[[1.0, 0.3], [-0.1, 0.9]], Q=np.eye(2), H=[[1.0, 0.2]], R=[[1.0]], mean=[0.5, -0.5],
     covariance=np.eye(2),
 )  # fmt: skip
-TRUE = LinearGaussian(
+TRUE = model(
     F=[[0.95, 0.25], [-0.2, 0.9]], Q=[[0.3, 0.05], [0.05, 0.1]], H=[[1.0, 0.2]], R=[[0.2]], mean=[1.0, 0.0],
     covariance=0.5 * np.eye(2),
 )  # fmt: skip
@@ -48,7 +56,7 @@ def test_five_rounds_are_those_of_a_peer(what, lost):
 
 def test_no_round_explains_the_recording_worse_and_the_noise_that_was_put_in_is_found():
     z = measured(1500)
-    begin = LinearGaussian(TRUE.F, 4.0 * np.eye(2), TRUE.H, [[2.0]], TRUE.mean, TRUE.covariance)
+    begin = model(TRUE.F, 4.0 * np.eye(2), TRUE.H, [[2.0]], TRUE.mean, TRUE.covariance)
     found = learn(begin, z, rounds=60, what=("Q", "R"))
     assert np.diff(found.log_likelihoods).min() > -1e-9
     assert len(found.log_likelihoods) == 61
@@ -66,4 +74,4 @@ def test_what_cannot_be_learnt_is_refused():
     with pytest.raises(DataError, match="nothing can be learnt"):
         learn(BEGIN, measured(1))
     with pytest.raises(DeclarationError, match="R does not fit"):
-        LinearGaussian(np.eye(2), np.eye(2), [[1.0, 0.0]], [1.0], [0.0, 0.0], np.eye(2))
+        model(np.eye(2), np.eye(2), [[1.0, 0.0]], [1.0], [0.0, 0.0], np.eye(2))

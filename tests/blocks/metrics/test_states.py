@@ -134,6 +134,7 @@ def test_what_is_drawn_has_the_band_of_the_covariance_and_the_truth_where_it_is_
     assert list(by_name) == ["position 0", "position 1", "heading", "bias"]
     heading = by_name["heading"]
     assert (heading.unit, heading.turns) == ("deg", True)
+    assert heading.deviation is not None
     np.testing.assert_allclose(heading.deviation, np.rad2deg(0.1))
     assert heading.truth is not None
     assert np.isfinite(heading.truth[:40]).all()
