@@ -41,9 +41,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 ALIGNED = (1.0, 0.0, 0.0, 0.0)
 
 
-STATE = StateSpace(
-    position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6)
-)
+STATE = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6))
 """Of a belief with biases, and of its errors."""
 
 
