@@ -22,6 +22,7 @@ from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.pose import (
     driving,
+    in_tangent_space,
     pose_belief,
     pose_steps,
     predict_pose,
@@ -67,7 +68,7 @@ def ekf(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=10)
+        posterior = find_back(posterior, innovation, patience=patience, moving=10, attitude=6)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
@@ -84,4 +85,4 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
     """
-    return on_capture(on, filter, start=start_pose, steps=pose_steps)
+    return on_capture(on, filter, start=start_pose, believed=in_tangent_space, steps=pose_steps)

@@ -23,7 +23,7 @@ from flowgraph.blocks.inertial.alignment import (
     usable,
 )
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, error_jacobian, predict
 from flowgraph.blocks.inertial.imu_calibration import (
     CountsCalibration,
     calibrated,
@@ -40,6 +40,7 @@ __all__ = [
     "usable",
     "GRAVITY",
     "ImuNoise",
+    "error_jacobian",
     "predict",
     "aid_attitude",
     "aid_position",

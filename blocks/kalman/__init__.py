@@ -4,11 +4,22 @@
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open. `smoothing` goes back over a run and adds to each
-state what later measurements say of it. What moves and what is measured is not said here: see `models`.
+state what later measurements say of it; `backward` is that as a graph, and `learning` finds the linear model
+that explains a recording. What moves and what is measured is not said here: see `models`.
 """
 
 from __future__ import annotations
 
+from flowgraph.blocks.kalman.backward import (
+    Crossing,
+    backwards,
+    collect_steps,
+    cross_covariance,
+    forwards,
+    go_back,
+    sizes_of,
+    smoother,
+)
 from flowgraph.blocks.kalman.filters import (
     Correction,
     Vector,
@@ -17,26 +28,59 @@ from flowgraph.blocks.kalman.filters import (
     update_extended,
     update_linear,
 )
+from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, aged, bridge, bridged, find_back, stay
+from flowgraph.blocks.kalman.lost import (
+    FARTHEST,
+    PATIENCE,
+    UNKNOWN_TURN,
+    Held,
+    aged,
+    bridge,
+    bridged,
+    find_back,
+    in_doubt,
+    lost_variances,
+    stay,
+)
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
-from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.kalman.smoothing import (
+    Steps,
+    fixed_lag,
+    gone_back,
+    lag_ticks,
+    rauch_tung_striebel,
+    smooth,
+    smoother_gain,
+    smoothing_pass,
+    steps_of,
+)
 from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "Crossing",
+    "gone_back",
     "noise_matrix",
     "observation_matrix",
+    "FARTHEST",
     "PATIENCE",
+    "UNKNOWN_TURN",
     "Held",
     "aged",
     "bridge",
     "bridged",
     "stay",
     "find_back",
+    "in_doubt",
+    "lost_variances",
     "covariance_root",
     "LinearModel",
+    "LinearGaussian",
+    "Learned",
+    "LEARNT",
+    "learn",
     "Correction",
     "Vector",
     "correct",
@@ -53,6 +97,17 @@ __all__ = [
     "fixed_lag",
     "lag_ticks",
     "rauch_tung_striebel",
+    "smooth",
+    "smoother_gain",
+    "smoothing_pass",
+    "steps_of",
+    "backwards",
+    "collect_steps",
+    "cross_covariance",
+    "forwards",
+    "go_back",
+    "sizes_of",
+    "smoother",
     "Gaussian",
     "KalmanInnovation",
 ]

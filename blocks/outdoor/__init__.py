@@ -2,7 +2,8 @@
 
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
-on the same sensors, with the same knowledge, so that the two can be compared.
+on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
+sensor does to it.
 """
 
 from __future__ import annotations
@@ -12,25 +13,30 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
-    correct_distance,
-    correct_field,
-    correct_flow,
-    correct_position,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
+)
+from flowgraph.blocks.outdoor.corrections import (
+    correct_distance,
+    correct_field,
+    correct_flow,
+    correct_position,
 )
 from flowgraph.blocks.outdoor.flight import (
     STREAMS,
@@ -41,6 +47,9 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "clone_crossing",
+    "outdoor_steps",
+    "picture_cross",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",

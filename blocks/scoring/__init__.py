@@ -5,8 +5,8 @@ graphs do; `point` does so for linear filters, and `euler` for those with Euler 
 noise that a filter is told, in its settings or in the flight, and `covariances` reads a whole one; `streams`
 makes the streams that it asks for out of those that a flight has. `scorer` compares a run with the truth:
 errors, consistency, and the same for the smoothed run; `orientation` counts only the times that a recording
-says count, and `calibration` how well one explains its windows. `settings`, `point`, `euler` and
-`calibration` are imported by their own names.
+says count, and `calibration` how well one explains its windows. `own` makes a case where nobody says how.
+`settings`, `point`, `euler`, `own` and `calibration` are imported by their own names.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ __all__ = [
     "settings",
     "point",
     "euler",
+    "own",
     "calibration",
     "Covariance",
     "six_by_six",

@@ -148,7 +148,8 @@ def _finite(name: str, series: Series, entries: bool) -> tuple[Series, list[str]
         kept = np.hstack(known).any(axis=1) & (np.arange(n) >= int(np.argmax(whole))) & whole.any()
         leaves = (np.where(np.isfinite(leaf), leaf, np.nan) for leaf in series.leaves.values())
         values = unflatten(series.type, leaves)
-        series = Series(series.time, values, type=series.type, name=series.name, gaps=True)
+        stamp = series.stamp if series.is_late else None
+        series = Series(series.time, values, type=series.type, name=series.name, gaps=True, stamp=stamp)
     said, part = [], int((kept & ~whole).sum())
     if not kept.all():
         said.append(note("skipped", f"{name}: {int((~kept).sum())} of {n} readings are not finite"))

@@ -13,7 +13,9 @@ from flowgraph.blocks.signals.beliefs import (
     AttitudeRateBelief,
     Bank,
     Belief,
+    CrossCovariance,
     EulerAngles,
+    FilterStep,
     Gaussian,
     GaussianInformation,
     GaussianRoot,
@@ -24,6 +26,7 @@ from flowgraph.blocks.signals.beliefs import (
     PointBelief,
     PoseBelief,
     QuaternionBelief,
+    SmoothedBelief,
 )
 from flowgraph.blocks.signals.calibration import (
     Alignment,
@@ -115,6 +118,9 @@ __all__ = [
     "GaussianRoot",
     "GaussianInformation",
     "Bank",
+    "CrossCovariance",
+    "FilterStep",
+    "SmoothedBelief",
     "KalmanInnovation",
     "Innovation",
     "Belief",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from flowgraph.cli import bench, filters, lower, study, tune  # noqa: F401  each adds its commands
+from flowgraph.cli import bench, calibrate, filters, lower, study, tune, watch  # noqa: F401  each adds its commands
 from flowgraph.cli.app import app
 from flowgraph.cli.terminal import give_up
 

@@ -45,10 +45,16 @@ class PythonEngine(BlockEngine):
             )
 
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
+        return self.driven(graph, inputs, options, lambda run: run.to_end(options.progress))
+
+    def driven(
+        self, graph: Graph, inputs: Inputs, options: RunOptions, drive: Callable[[Run], object]
+    ) -> Result:
+        """A run that `drive` takes to its end in its own way, and what is to be said of it."""
         given, kept = _kept(inputs)
         run, error = _started(graph, given, options), None
         try:
-            run.to_end(options.progress)
+            drive(run)
         except FifoOverflowError as full:
             error = full
         result = run.result()
