@@ -78,9 +78,9 @@ def models(
         together), `nees_mean` (right: `dimension`), `dimension`, `log_likelihood` (of a run), `peer` (all
         that have the method), `peer_difference` (the largest of means, relative to max(1, |x|), and
         covariances, relative to the deviations; None without a peer), `peer_error`, and `c_us`, the time a
-        tick of the engine's loop in the quickest run (of `engine`, "c" if left out). Of a method that draws, `peer` is an exact
-        filter where there is one, "linear" or a "grid", `peer_difference` the mean difference of the
-        log-likelihood and `peer_error` its standard error.
+        tick of the engine's loop in the quickest run (of `engine`, "c" if left out). Of a method that draws,
+        `peer` is an exact filter where there is one, "linear" or a "grid", `peer_difference` the mean
+        difference of the log-likelihood and `peer_error` its standard error.
 
     Raises:
         UnknownNameError: for a problem or method that is not there; DeclarationError: for a number out of
