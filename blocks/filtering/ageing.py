@@ -27,7 +27,7 @@ from flowgraph.blocks.kalman.lost import Held, aged
 from flowgraph.blocks.statespace import Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.recorder.derivatives import jacobian
-from flowgraph.types import Type, flatten, leaves_of, type_of, unflatten
+from flowgraph.types import ArrayType, Type, flatten, leaves_of, type_of, unflatten
 
 __all__ = ["Ageing", "AgedMotion", "doubt_control"]
 
