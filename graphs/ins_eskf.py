@@ -194,7 +194,8 @@ def _searched(
             break
         seconds *= 2.0
     if begin.unknown:
-        on.note("warning", "the measurements do not tell the heading at the start: it stays unknown")
+        sentence = "it stays unknown, however sure the filter grows of it"
+        on.note("warning", f"the measurements do not tell the heading at the start: {sentence}")
     return guess
 
 

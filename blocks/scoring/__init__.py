@@ -11,6 +11,7 @@ says count, and `calibration` how well one explains its windows. `own` makes a c
 
 from __future__ import annotations
 
+from flowgraph.blocks.scoring.capture import on_capture
 from flowgraph.blocks.scoring.cases import (
     Factors,
     Gated,
@@ -23,10 +24,10 @@ from flowgraph.blocks.scoring.cases import (
     Scored,
     Smoothed,
     SmoothedPoseFilter,
-    on_capture,
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
+from flowgraph.blocks.scoring.late import Late, built_for, late_streams, places, rewound_graph
 from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
 from flowgraph.blocks.scoring.readings import Ranges, gap_notes, pause, taken
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
@@ -102,4 +103,9 @@ __all__ = [
     "counted",
     "counted_errors",
     "scored_errors",
+    "Late",
+    "built_for",
+    "late_streams",
+    "places",
+    "rewound_graph",
 ]

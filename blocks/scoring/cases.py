@@ -25,16 +25,14 @@ from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.smoothing import Steps
-from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.recordings import pose_recording
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
-from flowgraph.blocks.scoring.start import Started, StartPose
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
-from flowgraph.blocks.signals import GRAVITY, Gaussian
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
+from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
 from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
@@ -51,7 +49,6 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
-    "on_capture",
     "on_flight",
 ]
 
@@ -406,53 +403,3 @@ class Particles(Settings):
     def resampling(self) -> dict[str, Any]:
         """What is a setting of the graph itself, by name."""
         return {"resample_below": self.resample_below, "scheme": self.scheme}
-
-
-# -- filters on an IMU and a motion capture --------------------------------------------------------------
-
-
-def on_capture(
-    on: OnFlight,
-    filter: PoseFilter,
-    *,
-    start: Callable[..., Any],
-    believed: Callable[[Any], Gaussian],
-    steps: Callable[[Result], Steps] | None = None,
-    **settings: Any,
-) -> Case:
-    """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.
-
-    Args:
-        on: with both streams.
-        filter: its factors, where they are left out, are those of `unbiased_factors`.
-        start: `(position, attitude)`, makes what the graph starts from.
-        believed: of that, the belief over position, velocity and attitude.
-        steps: what a smoother needs of a result.
-        settings: of the graph itself.
-    """
-    vicon, info = on.inputs["vicon"], on.flight.info
-    pose = filter.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file")
-    begun = _started(start, pose)
-    known: dict[str, Any] = {
-        "noise": filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
-        **filter.measured(on),
-        "lever": tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
-        "reading": reading_of(on.flight),
-        "gravity": on.gravity,
-        "held": filter.held(on, pose.inputs["imu"]),
-    }
-    recording = pose_recording(pose.inputs, start=believed(begun), **known)
-    return on.case(
-        filter.score(on, pose_errors, steps=steps, recording=recording),
-        inputs=pose.inputs,
-        start=begun,
-        **known,
-        **filter.gating(),
-        **settings,
-    )
-
-
-def _started(start: Callable[..., Any], pose: StartPose) -> Any:
-    """What the graph starts from; with a heading of which nothing is known, as wide about all axes."""
-    more = {} if pose.heading is None else {"attitude_deviation": pose.heading}
-    return start(pose.position, pose.attitude, **more)

@@ -1,4 +1,9 @@
-"""What becomes of late measurements of a flight: they are taken for fresh, which is said, or rewound."""
+"""What becomes of late measurements of a flight: they are taken for fresh, which is said, or rewound.
+
+A stream of a flight may say when its values were true (`Series.stamp`). Where that was before they came, the
+case of any graph has a note of it; with the setting `rewind` the graph is built over a history instead, of as
+many places as the stamps ask for.
+"""
 
 from __future__ import annotations
 

@@ -353,6 +353,7 @@ def test_a_way_far_from_the_origin_is_in_the_picture(page, pages, tmp_path) -> N
     page.slide(0.5)
     time.sleep(0.3)
     picture = cv2.imdecode(np.frombuffer(page.find(".frame3d canvas").screenshot_as_png, np.uint8), 1)
+    assert picture is not None
     blue = (picture[..., 0].astype(int) - picture[..., 2] > 60).sum()  # the line of the estimate
     assert blue > 100
 

@@ -232,7 +232,7 @@ def test_after_a_gap_of_the_imu_a_filter_is_where_it_was(name, gap, gate):
     assert score["position_rmse_m"] < 3.0 * usual["position_rmse_m"] + 0.05
     longest = max(b - a for a, b in gap)
     (said,) = [n for n in case.remarks(result) if n.startswith("bridged:")]
-    assert f"{longest:g} s (median step 0.005 s)" in said
+    assert f"{longest:g} s (usual step 0.005 s)" in said
 
 
 @pytest.mark.slow

@@ -302,5 +302,5 @@ class Meaning:
         return made
 
     def do_stamp(self, n, a):
-        (source,) = [k for k, s in enumerate(self.streams) if s is a]
+        source = next(k for k, s in enumerate(self.streams) if s is a)
         return [(t, float(t - late)) for (t, _), late in zip(a, self.late[source], strict=True)]
