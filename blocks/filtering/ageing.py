@@ -14,6 +14,7 @@ the control, or by a control of its own for each particle.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from flowgraph.blocks.kalman.lost import Held, aged
 from flowgraph.blocks.statespace import Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.recorder.derivatives import jacobian
-from flowgraph.types import Type, flatten, leaves_of, type_of, unflatten
+from flowgraph.types import ArrayType, Type, flatten, leaves_of, type_of, unflatten
 
 __all__ = ["Ageing", "AgedMotion", "doubt_control"]
 
@@ -45,7 +46,7 @@ class Ageing(NamedTuple):
 
 
 @functools.cache
-def doubted(type_: Type) -> type[Signal]:
+def doubted(type_: Type) -> Any:
     """The type of a control of that type with the doubt about it: the variance of its error, in spreads."""
     fields = {"__annotations__": {"control": type_, "doubt": Array}, "doubt": real(), "__doc__": "A control."}
     return type("DoubtedControl", (Signal,), fields)
@@ -150,7 +151,7 @@ def aged_motion(motion: Motion, type_: Type, ageing: Ageing) -> AgedMotion:
     Raises:
         DeclarationError: where the ageing does not fit the control.
     """
-    m = sum(int(np.prod(kind.shape)) for _, kind in leaves_of(type_) if kind.dtype == "real")
+    m = sum(_size(kind) for _, kind in leaves_of(type_) if kind.dtype == "real")
     spread = np.asarray(ageing.spread, dtype=float)
     good = spread.shape in ((), (m,)) and np.isfinite(spread).all() and (spread >= 0.0).all()
     if not good or not ageing.after > 0.0:
@@ -166,6 +167,10 @@ def aged_motion(motion: Motion, type_: Type, ageing: Ageing) -> AgedMotion:
     return AgedMotion(motion, spread)
 
 
+def _size(kind: ArrayType) -> int:
+    return math.prod(int(n) for n in kind.shape)
+
+
 def _off(told: Any, c: Array, xp: Any) -> Any:
     """The control with errors c (..., m) added to its real numbers, one control a row."""
     type_, at, leaves = type_of(told), 0, []
@@ -173,7 +178,7 @@ def _off(told: Any, c: Array, xp: Any) -> Any:
         if kind.dtype != "real":
             leaves.append(leaf)
             continue
-        size = int(np.prod(kind.shape))
+        size = _size(kind)
         part, at = c[..., at : at + size], at + size
         leaves.append(leaf + (part if kind.shape else part[..., 0]))
     return unflatten(type_, iter(leaves))
@@ -183,9 +188,9 @@ def _made(type_: Type, numbers: np.ndarray, xp: Any) -> Any:
     """A control of these real numbers."""
     at, leaves = 0, []
     for _, kind in leaves_of(type_):
-        size = int(np.prod(kind.shape))
+        size = _size(kind)
         real_ = kind.dtype == "real"
         part = numbers[at : at + size] if real_ else np.zeros(size)
         at += size if real_ else 0
-        leaves.append(xp.asarray(part.reshape(kind.shape)))
+        leaves.append(xp.asarray(np.reshape(part, [int(n) for n in kind.shape])))
     return unflatten(type_, iter(leaves))

@@ -158,7 +158,8 @@ def _proposed(
     z = measurement.vector(message, xp)
     mean, C = propose(motion.space.view(x, xp), control, z=z, dt=dt, xp=xp)
     goes = xp.asarray(dt, dtype=kind) > 0.0
-    root, one = motion.noise_root(control, dt, kind, xp), xp.eye(e.shape[-1], dtype=kind)
+    root: Any = motion.noise_root(control, dt, kind, xp)
+    one = xp.eye(e.shape[-1], dtype=kind)
     safe = xp.where(goes, root, one)
     mean, C = xp.broadcast_to(mean, (n, e.shape[-1])), xp.broadcast_to(C, (n, *one.shape))
     L = xp.linalg.cholesky(xp.where(goes, C, one))

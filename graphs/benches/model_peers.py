@@ -9,7 +9,7 @@ step, which is the same set of sigma points.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -219,7 +219,7 @@ PEERS: dict[tuple[str, str], list[tuple[str, Peer]]] = {
     ("point", "unscented"): [_POINTS, _DYNAMAX[1]],
     ("point", "cubature"): [_CUBATURE],
     **{
-        (problem, method): peers
+        (problem, method): cast(list[tuple[str, Peer]], peers)
         for problem in ("radar", "ranges", "turn", "bicycle", "pendulum")
         for method, peers in (
             ("extended", [_EXTENDED]),

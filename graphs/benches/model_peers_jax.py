@@ -40,8 +40,9 @@ def control_at(run: Drawn, k: int) -> Any:
 @contextlib.contextmanager
 def _double() -> Iterator[Any]:
     """JAX in double precision, for as long as a peer runs."""
-    import jax  # of the extra `xla`, and of the peers themselves
+    import jax as library  # of the extra `xla`, and of the peers themselves
 
+    jax: Any = library
     before = jax.config.jax_enable_x64
     jax.config.update("jax_enable_x64", True)
     try:
@@ -59,7 +60,8 @@ def linearised(problem: Problem) -> tuple[Callable[..., Any], Callable[..., Any]
         jnp = jax.numpy
 
         def moved(c: Any, x: Any, after: Any, told: dict[str, Any] | None) -> Any:
-            u = None if told is None else problem.control_type(**told)
+            makes: Any = problem.control_type
+            u = None if told is None else makes(**told)
             start = space.plus(x[None, :], c[None, :t], jnp)
             return space.minus(motion.carry(start, u, c[None, t:], dt, jnp), after[None, :], jnp)[0]
 

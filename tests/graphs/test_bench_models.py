@@ -18,6 +18,7 @@ KEYS = (
     "log_likelihood",
     "peer",
     "peer_difference",
+    "peer_error",
     "c_us",
 )
 
@@ -25,20 +26,27 @@ KEYS = (
 @pytest.mark.parametrize(
     ("problem", "method", "peer"),
     [
-        ("point", "linear", "filterpy"),
-        ("point", "unscented", "filterpy"),
-        ("radar", "extended", "filterpy"),
-        ("ranges", "unscented", "stonesoup"),
-        ("ranges", "cubature", "stonesoup"),
+        ("point", "square_root", "filterpy, pykalman"),
+        ("point", "information", "filterpy"),
+        ("radar", "iterated", "stonesoup"),
+        ("ranges", "cubature", "filterpy, stonesoup"),
+        ("turn", "unscented", "filterpy"),
+        ("bicycle", "extended", "filterpy"),
+        ("pendulum", "cubature", "filterpy"),
+        pytest.param("point", "linear", "filterpy, pykalman, dynamax", marks=pytest.mark.slow),
+        pytest.param("radar", "extended", "filterpy, dynamax", marks=pytest.mark.slow),
+        pytest.param("pose", "extended", "filterpy", marks=pytest.mark.slow),
     ],
 )
 def test_a_peer_with_the_same_method_agrees(problem, method, peer):
-    pytest.importorskip(peer)
+    for name in (*peer.split(", "), "jax"):
+        pytest.importorskip(name)
     (row,) = models(problem=problem, method=method, runs=1, engine="reference").rows
     assert tuple(row) == KEYS
     assert row["peer"] == peer
     assert row["peer_difference"] < 1e-9
     assert 0.3 * row["dimension"] < row["nees_mean"] < 3.0 * row["dimension"]
+    assert row["peer_error"] is None
 
 
 def test_particles_have_the_likelihood_of_the_exact_filter():

@@ -30,6 +30,7 @@ from flowgraph.errors import FlowgraphError, MissingDependencyError, OutputError
 FLAGS = (
     "-std=c99",
     "-O3",
+    "-fno-tree-slp-vectorize",  # gcc 12.2 with AVX-512 puts elements of one row into the next by it
     "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
     "-march=native",
     "-fno-math-errno",

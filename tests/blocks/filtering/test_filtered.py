@@ -540,3 +540,19 @@ def test_angles_are_measured_around_the_circle():
 
         found = simulate(turned.build(), inputs)["output"]["mean"][0, 2]
         assert abs(found) > 3.1
+
+
+@pytest.mark.slow
+def test_sigma_points_of_a_turn_are_the_same_in_c():
+    """Eleven rows move alike and six are shaken: a compiler that packs scalars put one row into the next."""
+    bearing = MeasurementModel(TURNING, lambda x, xp: x.position, noise=4.0)
+    start = TURNING.gaussian(position=((100.0, 150.0), 5.0), velocity=((10.0, 0.0), 1.0), rate=(0.1, 0.05))
+
+    @graph
+    def turning(spot: Stream[Spot]):
+        """A turn that is seen in place."""
+        motion = coordinated_turn(0.3, 0.01)
+        return filtered(motion, {bearing: spot}, start=start, method=unscented())
+
+    inputs = spots(10)
+    same(simulate(turning.build(), inputs), simulate(turning.build(), inputs, engine="c"), exact=False)
