@@ -220,7 +220,7 @@ def gaps(series: Series, *, control: bool = True) -> tuple[np.ndarray, float]:
 def usual_step(steps: np.ndarray) -> float:
     """The median of steps (s), or where readings come in bursts the step in which half of the time lies.
 
-    A reading is as old as the wait between two bursts over and over again, so that is the sensor's own period.
+    A reading is as old as the wait between two bursts each time, so that is the sensor's own period.
     Waits that are fewer than a fiftieth of all steps are no bursts.
     """
     if not len(steps):
