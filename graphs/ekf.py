@@ -29,7 +29,8 @@ from flowgraph.blocks.models.pose import (
     start_pose,
     update_pose,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.capture import on_capture
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 

@@ -194,7 +194,8 @@ def _searched(
             break
         seconds *= 2.0
     if begin.unknown:
-        on.note("warning", "the measurements do not tell the heading at the start: it stays unknown")
+        sentence = "it stays unknown, however sure the filter grows of it"
+        on.note("warning", f"the measurements do not tell the heading at the start: {sentence}")
     return guess
 
 
@@ -225,5 +226,5 @@ def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
         return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
     streams = on.need("imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
     vicon = streams["vicon"]
-    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude", gaps=vicon.gaps)
+    turns = vicon.holding(Attitude(attitude=vicon["attitude"]), "attitude")
     return {"imu": streams["imu"], "position": positions(vicon), "attitude": turns}, "vicon_lever"

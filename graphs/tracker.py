@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Result, Series, Stream, block, graph
+from flowgraph import Case, DataError, Result, Series, Stream, block, graph
 from flowgraph.blocks.filtering import (
     LinearMeasurement,
     cubature,
@@ -110,7 +110,8 @@ def for_flight(
         position_noise: standard deviation in m; the flight's own if left out.
 
     Raises:
-        DataError: where the flight lacks the stream; DeclarationError: for a setting that is out of range.
+        DataError: where the flight lacks the stream, or is not in a plane.
+        DeclarationError: for a setting that is out of range.
     """
     motion = constant_velocity(wander)
     chosen = {
@@ -123,6 +124,12 @@ def for_flight(
     }[method]()
     noise = on.noise("position_noise", position_noise)
     first = on.inputs["position"]["position"][0]
+    if first.shape != (2,):
+        raise DataError(
+            "the tracker follows a point in a plane", path=f"{on.flight.name}: position",
+            expected="positions of two numbers", got=f"of {len(first)}",
+            fix="choose a flight such as sim:plane",
+        )  # fmt: skip
     start = motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0))
     if method == "particles" and scored.smoothed:
         raise DeclarationError(

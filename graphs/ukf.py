@@ -37,7 +37,8 @@ from flowgraph.blocks.models.unscented_pose import (
     start_state,
     unscented_steps,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.capture import on_capture
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, Pose

@@ -2,7 +2,8 @@
 
 A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
 by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
-of those that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
+of those that believe in a Gaussian. `rewind` runs any filter over events that come late. Everything that a
+user's own filter needs is importable from here.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ from flowgraph.blocks.filtering.proposals import (
     guide_cloud,
     propose_cloud,
 )
+from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
 from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
 from flowgraph.blocks.filtering.towards import find_cloud_back
 from flowgraph.blocks.filtering.weighing import weigh_cloud
@@ -142,6 +144,9 @@ __all__ = [
     "Seen",
     "predict",
     "correct",
+    "rewind",
+    "Rewound",
+    "OLDER",
     "GaussianMethod",
     "Linear",
     "Extended",

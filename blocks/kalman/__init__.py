@@ -4,8 +4,8 @@
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open. `smoothing` goes back over a run and adds to each
-state what later measurements say of it; `backward` is that as a graph. What moves and what is measured is
-not said here: see `models`.
+state what later measurements say of it; `backward` is that as a graph, and `learning` finds the linear model
+that explains a recording. What moves and what is measured is not said here: see `models`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from flowgraph.blocks.kalman.filters import (
     update_extended,
     update_linear,
 )
+from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import (
     FARTHEST,
@@ -76,6 +77,10 @@ __all__ = [
     "lost_variances",
     "covariance_root",
     "LinearModel",
+    "LinearGaussian",
+    "Learned",
+    "LEARNT",
+    "learn",
     "Correction",
     "Vector",
     "correct",

@@ -19,21 +19,20 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Series, clocks_of
+from flowgraph import Case, Flight, Result, Series
 from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.smoothing import Steps
-from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.recordings import pose_recording
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
-from flowgraph.blocks.scoring.start import Started, StartPose
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
-from flowgraph.blocks.signals import GRAVITY, Gaussian
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
+from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
 from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
@@ -50,7 +49,6 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
-    "on_capture",
     "on_flight",
 ]
 
@@ -66,12 +64,14 @@ class OnFlight:
         flight: as it was loaded, or as `told` has completed it.
         inputs: the streams that were needed, by name.
         notes: what is assumed while the case is made; see `note`.
+        rewind: s, as the setting of `Late`.
     """
 
     graph: GraphFunction
     flight: Flight
     inputs: dict[str, Series]
     notes: list[str] = field(default_factory=list)
+    rewind: float | None = None
 
     @property
     def name(self) -> str:
@@ -153,7 +153,9 @@ class OnFlight:
         for name in noted:
             self.usual_step(inputs[name])
         self.notes.extend(gap_notes(inputs, noted))
-        built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
+        smoothed = getattr(score, "smoothing", False)
+        built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
+        self.notes.extend(said_of_late)
         return Case(
             built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
         )
@@ -186,7 +188,7 @@ def on_flight(
     """
 
     def register(function: Callable[..., Case]) -> Callable[..., Case]:
-        known = spliced(function, **({"ranges": Ranges} if ranged else {}))
+        known = spliced(function, **({"ranges": Ranges} if ranged else {}), late=Late)
         flown = inspect.Parameter("flight", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Flight)
         signature = inspect.Signature([flown, *known.parameters], return_annotation=Case)
 
@@ -204,7 +206,8 @@ def on_flight(
             groups = known.grouped(values)
             flight, notes = taken(flight, groups.pop("ranges", Ranges()), graph.name, measured)
             inputs = flight.need(graph.name, *needs, fix=fix)
-            return function(OnFlight(graph, flight, inputs, notes), **groups)
+            late = groups.pop("late")
+            return function(OnFlight(graph, flight, inputs, notes, late.rewind), **groups)
 
         prepare.__signature__ = signature  # type: ignore[attr-defined]
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
@@ -400,53 +403,3 @@ class Particles(Settings):
     def resampling(self) -> dict[str, Any]:
         """What is a setting of the graph itself, by name."""
         return {"resample_below": self.resample_below, "scheme": self.scheme}
-
-
-# -- filters on an IMU and a motion capture --------------------------------------------------------------
-
-
-def on_capture(
-    on: OnFlight,
-    filter: PoseFilter,
-    *,
-    start: Callable[..., Any],
-    believed: Callable[[Any], Gaussian],
-    steps: Callable[[Result], Steps] | None = None,
-    **settings: Any,
-) -> Case:
-    """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.
-
-    Args:
-        on: with both streams.
-        filter: its factors, where they are left out, are those of `unbiased_factors`.
-        start: `(position, attitude)`, makes what the graph starts from.
-        believed: of that, the belief over position, velocity and attitude.
-        steps: what a smoother needs of a result.
-        settings: of the graph itself.
-    """
-    vicon, info = on.inputs["vicon"], on.flight.info
-    pose = filter.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file")
-    begun = _started(start, pose)
-    known: dict[str, Any] = {
-        "noise": filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
-        **filter.measured(on),
-        "lever": tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
-        "reading": reading_of(on.flight),
-        "gravity": on.gravity,
-        "held": filter.held(on, pose.inputs["imu"]),
-    }
-    recording = pose_recording(pose.inputs, start=believed(begun), **known)
-    return on.case(
-        filter.score(on, pose_errors, steps=steps, recording=recording),
-        inputs=pose.inputs,
-        start=begun,
-        **known,
-        **filter.gating(),
-        **settings,
-    )
-
-
-def _started(start: Callable[..., Any], pose: StartPose) -> Any:
-    """What the graph starts from; with a heading of which nothing is known, as wide about all axes."""
-    more = {} if pose.heading is None else {"attitude_deviation": pose.heading}
-    return start(pose.position, pose.attitude, **more)

@@ -18,6 +18,7 @@ from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
 from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
+from flowgraph.drawing.states import Quantity, seconds_of
 from flowgraph.types import leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
@@ -113,6 +114,15 @@ class Scorer:
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
+
+    def pictured(self, result: Result) -> list[Quantity]:
+        """The numbers of the estimate, as pictures show them; none where the errors know no state."""
+        quantities = getattr(self.errors, "quantities", None)
+        estimate = result.series.get(self.estimate)
+        if quantities is None or estimate is None or not len(estimate):
+            return []
+        found: list[Quantity] = quantities(estimate, self.truth, seconds_of(estimate, result))
+        return found
 
     def _sums_up(self, leaves: Mapping[str, object]) -> bool:
         return self.innovations and "nis" in leaves

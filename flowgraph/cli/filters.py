@@ -22,10 +22,12 @@ from flowgraph.cli.options import (
     Name,
     Seed,
     Settings,
+    SettingsFile,
     Truth,
     case_of,
     graph_of,
     one_flight,
+    with_file,
 )
 from flowgraph.cli.pages import runs_before, watcher_of, write_page
 from flowgraph.cli.terminal import (
@@ -80,13 +82,14 @@ def show(
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file; an .html is a page in which it unfolds."""
     from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
     from flowgraph.pipeline.costs.places import costs_by_path
 
-    built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
+    built, _ = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
@@ -108,6 +111,7 @@ def run(
     dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     seed: Seed = 0,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A page of the run, with diagram, plots and a slider.")
@@ -132,7 +136,7 @@ def run(
                 err_console.print(f"note: {words}", markup=False)
             notes[words] = None
 
-    spec = one_flight(data) or ""
+    spec, settings = one_flight(data) or "", with_file(settings, settings_file)
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
     watcher = watcher_of(case, engine) if html is not None else None
     result, row = _measure(
@@ -269,10 +273,19 @@ def _pictures(
     # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
+    from flowgraph.drawing.states import innovations_of, plot_states
     from flowgraph.drawing.trajectory import plot_space
 
     found: dict[str, Callable[[Path], object]] = {"diagram.svg": lambda file: case.graph.draw(str(file))}
     if estimate is None:
+        return found
+    tell = getattr(case.score, "pictured", None)  # of states that only their filter knows
+    numbers = [] if tell is None else tell(result)
+    if numbers:
+        found["states.png"] = lambda file: plot_states(numbers, file, heading=case.graph.name)
+        residuals = innovations_of(result)
+        if residuals:
+            found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         seen = next((s for s in _recorded(case).values() if "position" in s.leaves and len(s)), None)

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
+from flowgraph.data.files import text_of
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.series import Flight
+from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
-Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.")]
 Data = Annotated[
     list[str],
     typer.Option(
@@ -44,6 +50,10 @@ EXAMPLES: tuple[tuple[str, Mapping[str, str]], ...] = (
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
+]
+SettingsFile = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="What tune or calibrate found; --set goes before it."),
 ]
 Seed = Annotated[
     int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
@@ -138,6 +148,41 @@ def _pair(text: str) -> tuple[str, str]:
             fix=f"write --set {key}=...",
         )
     return key.strip(), value.strip()
+
+
+def with_file(settings: list[str] | None, file: Path | None) -> list[str]:
+    """The `--set` texts, and those of a file that `tune` or `calibrate` wrote for what they do not name.
+
+    Raises:
+        DataError: where there is no such file.
+    """
+    given = list(settings or [])
+    if file is None:
+        return given
+    wrong = functools.partial(
+        DataError,
+        "these are no settings",
+        path=str(file),
+        expected='{"parameters": {KEY: {"value": ...}}}, as tune and calibrate write it',
+        fix="write it with flowgraph tune --out FILE",
+    )
+    try:
+        read = json.loads(text_of(file))
+    except (OSError, ValueError, RecursionError) as error:
+        raise wrong(got=f"{type(error).__name__}: {error}"[:200]) from None
+    parameters = read.get("parameters") if isinstance(read, dict) else None
+    if not isinstance(parameters, dict):
+        raise wrong(got="no parameters")
+    named = pairs(settings)
+    for key, one in parameters.items():
+        value = one.get("value") if isinstance(one, dict) else one
+        try:
+            word = value if isinstance(value, str) else text(np.array(value, dtype=float))
+        except (TypeError, ValueError):
+            raise wrong(got=f"{key}: {value!r}"[:200]) from None
+        if key not in named:
+            given.append(f"{key}={word}")
+    return given
 
 
 def pairs(settings: list[str] | None) -> dict[str, str]:
