@@ -220,7 +220,7 @@ FIX = (
 def autopilot(file: Path, *, scale: float = 1.0, without: str = "") -> str:
     pytest.importorskip("pyulog")
     t = [1_000_000 + 4000 * k for k in range(50)]
-    topics = {
+    topics: dict[str, tuple[str, list[tuple[Any, ...]]]] = {
         "sensor_combined": (
             "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2",
             [(k, 0.5, 0.25, -0.125, 0.5 * scale, 0.25 * scale, -9.75 * scale) for k in t],
