@@ -42,6 +42,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight, Series
     from flowgraph.engines.many import simulate_many
+    from flowgraph.engines.options import Checkpoint
     from flowgraph.engines.python.run import Run
     from flowgraph.engines.simulate import simulate
     from flowgraph.engines.state import load_state, save_state
@@ -66,6 +67,7 @@ _LATER = {
     "Flight": "flowgraph.data.series",
     "Series": "flowgraph.data.series",
     "simulate_many": "flowgraph.engines.many",
+    "Checkpoint": "flowgraph.engines.options",
     "Run": "flowgraph.engines.python.run",
     "simulate": "flowgraph.engines.simulate",
     "load_state": "flowgraph.engines.state",
@@ -112,6 +114,7 @@ __all__ = [
     "Batch",
     "Block",
     "Case",
+    "Checkpoint",
     "ClockError",
     "CycleError",
     "DataError",

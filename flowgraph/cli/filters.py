@@ -15,11 +15,11 @@ import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import (
+    SEED_HELP,
     AsJson,
-    Data,
     DataOrNone,
-    Engine,
     Name,
+    NameOrNone,
     Seed,
     Settings,
     Truth,
@@ -27,6 +27,7 @@ from flowgraph.cli.options import (
     graph_of,
     one_flight,
 )
+from flowgraph.cli.resume import kept_in, resumed
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -48,6 +49,8 @@ from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
+from flowgraph.engines.options import Checkpoint
+from flowgraph.engines.registry import engine_names
 from flowgraph.engines.simulate import simulate
 from flowgraph.errors import DataError, FlowgraphError, plain, writes
 
@@ -93,20 +96,35 @@ def show(
 @app.command()
 @reports_errors
 def run(
-    graph: Name,
-    data: Data,
+    graph: NameOrNone = None,
+    data: DataOrNone = None,
     truth: Truth = None,
-    engine: Engine = "python",
-    dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
-    seed: Seed = 0,
+    engine: Annotated[str | None, typer.Option(help=", ".join(engine_names()), show_default="python")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float64 or float32", show_default="float64")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
     diverged: Annotated[
         str, typer.Option(help="Numbers that are no longer finite: raise or count.")
     ] = "raise",
+    checkpoint: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep the run in this file now and then.")
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Of flight time, from one to the next: 60.")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Go on from a checkpoint; what is left out is as it was."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
+    command = resumed(resume, graph=graph, data=data, truth=truth, engine=engine, dtype=dtype, seed=seed,
+                      settings=settings)  # fmt: skip
+    graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
+    truth, settings = command.truth, command.settings
+    kept = kept_in(checkpoint, every, resume, command)
     if out is not None:
         make_ready(out)
     notes: dict[str, None] = {}
@@ -117,9 +135,9 @@ def run(
                 err_console.print(f"note: {words}", markup=False)
             notes[words] = None
 
-    spec = one_flight(data) or ""
+    spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
-    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged)
+    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, kept=kept)
     say(case.remarks(result))
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
@@ -161,7 +179,15 @@ def demo(
 
 
 def _measure(
-    case: Case, name: str, engine: str, dtype: str, seed: int, *, quiet: bool, diverged: str = "raise"
+    case: Case,
+    name: str,
+    engine: str,
+    dtype: str,
+    seed: int,
+    *,
+    quiet: bool,
+    diverged: str = "raise",
+    kept: Checkpoint | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -171,7 +197,14 @@ def _measure(
         else ProgressBar(f"{name} ({engine})", total=case.inputs, console=err_console) as meter
     ):
         result = simulate(
-            case.graph, case.inputs, engine=engine, dtype=dtype, seed=seed, progress=meter, diverged=diverged
+            case.graph,
+            case.inputs,
+            engine=engine,
+            dtype=dtype,
+            seed=seed,
+            progress=meter,
+            diverged=diverged,
+            checkpoint=kept,
         )
     total = perf_counter() - start
     row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}

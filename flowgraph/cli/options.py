@@ -16,6 +16,9 @@ from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+NameOrNone = Annotated[
+    str | None, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.", show_default=False)
+]
 Data = Annotated[
     list[str],
     typer.Option(
@@ -45,9 +48,8 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
 ]
-Seed = Annotated[
-    int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
-]
+SEED_HELP = "Of a simulated flight, and of the graph's draws."
+Seed = Annotated[int, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP)]
 Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 

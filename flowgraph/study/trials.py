@@ -30,7 +30,7 @@ from flowgraph.engines.parts import run_graph
 from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError
 from flowgraph.language.recording import remembering
-from flowgraph.study.keys import digest
+from flowgraph.pipeline.digests import digest
 from flowgraph.study.spec import Value
 from flowgraph.study.tasks import grouped, prepared, simulate_together
 

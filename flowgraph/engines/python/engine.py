@@ -9,8 +9,9 @@ from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape, tape
+from flowgraph.engines.checkpoint import Keeper, identity, program_digest
 from flowgraph.engines.contract import BlockEngine
-from flowgraph.engines.options import RunOptions
+from flowgraph.engines.options import Checkpoint, RunOptions
 from flowgraph.engines.python.run import Run
 from flowgraph.engines.state import load_registers
 from flowgraph.engines.subject import LoweredGraph
@@ -45,13 +46,17 @@ class PythonEngine(BlockEngine):
             )
 
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
-        given, kept = _kept(inputs)
-        run, error = _started(graph, given, options), None
-        try:
-            run.to_end(options.progress)
-        except FifoOverflowError as full:
-            error = full
-        result = run.result()
+        if options.checkpoint is not None:
+            result, given, error = _in_stretches(graph, inputs, options, options.checkpoint)
+            kept: Callable[[], Inputs] = lambda: given
+        else:
+            given, kept = _kept(inputs)
+            run, error = _started(graph, given, options), None
+            try:
+                run.to_end(options.progress)
+            except FifoOverflowError as full:
+                error = full
+            result = run.result()
         if error is None and all_finite(result):
             return result
         return settled(result, _playback(graph, kept, options), options.diverged, error)
@@ -59,6 +64,32 @@ class PythonEngine(BlockEngine):
 
 def _started(graph: Graph, inputs: Inputs, options: RunOptions) -> Run:
     return Run(graph, inputs, init=options.init, state=options.state, seed=options.seed)  # type: ignore[arg-type]
+
+
+def _in_stretches(
+    graph: Graph, inputs: Inputs, options: RunOptions, asked: Checkpoint
+) -> tuple[Result, Inputs, FifoOverflowError | None]:
+    """The run, kept now and then; also its inputs, read to their end, and what ended it before them."""
+    before = None if options.state is None else load_registers(graph, options.state)[1]
+    events = tape(prepare(graph, inputs, before), graph)
+    given = dict(zip(graph.sources, events.series, strict=True))
+    run = _started(graph, given, options)
+    which = identity(graph.name, program_digest(graph), events, run.state, run.seed, options)
+    types = {c.name: graph.port(c.wire).type for c in graph.collected}
+    keeper = Keeper(asked, which, events, types)
+    if keeper.start is not None:
+        rest = events.part(keeper.start.ticks, len(events.time)).series
+        run = Run(graph, dict(zip(graph.sources, rest, strict=True)), state=keeper.start.state)
+
+    def stretch(first: int, last: int) -> Result:
+        run.to_end(keeper.meter(options.progress, anew=False), most=last - first)
+        return run.drain()
+
+    try:
+        return keeper.play(stretch), given, None
+    except FifoOverflowError as full:
+        keeper.add(run.drain())
+        return keeper.whole(), given, full
 
 
 def _playback(graph: Graph, kept: Callable[[], Inputs], options: RunOptions) -> Playback:

@@ -10,6 +10,7 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial, wraps
 from threading import Lock, get_ident
 from time import perf_counter
@@ -70,6 +71,7 @@ class Run:
         self.graph = graph
         self.ticks = 0
         self.wall_s = 0.0
+        self._drained = 0, 0.0
         self._registers = initial_registers(graph, init)
         self._last = dict.fromkeys(graph.sources, NEVER)
         self._key = seed_words(seed)
@@ -349,6 +351,15 @@ class Run:
             for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)
         }
         return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
+
+    def drain(self) -> Result:
+        """The collected streams since the last call; the run forgets them, and its memory stays flat."""
+        found = self.result()
+        found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
+        self._drained = self.ticks, self.wall_s
+        for kept in (*self._times, *self._values):
+            kept.clear()
+        return found
 
 
 class _Reactions(dict[int, Callable[[int], None]]):
