@@ -184,12 +184,9 @@ class Keeper:
         time, first, end = self._tape.time, self._done, len(self._tape.time)
         step = round(self._asked.every * 1e9)
         while first < end:
-            due = (
-                None
-                if step is None
-                else int(time[0]) + ((int(time[first]) - int(time[0])) // step + 1) * step
-            )
-            last = end if due is None or due > int(time[-1]) else int(np.searchsorted(time, due))
+            due = int(time[0]) + ((int(time[first]) - int(time[0])) // step + 1) * step
+            cut = self._asked.file is not None and due <= int(time[-1])
+            last = int(np.searchsorted(time, due)) if cut else end
             yield first, last
             first = last
         if self._done == end and not self._parts:
