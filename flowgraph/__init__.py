@@ -41,6 +41,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight, Series
+    from flowgraph.engines.live import Live
     from flowgraph.engines.many import simulate_many
     from flowgraph.engines.options import Checkpoint
     from flowgraph.engines.python.run import Run
@@ -67,6 +68,7 @@ _LATER = {
     "Flight": "flowgraph.data.series",
     "Series": "flowgraph.data.series",
     "simulate_many": "flowgraph.engines.many",
+    "Live": "flowgraph.engines.live",
     "Checkpoint": "flowgraph.engines.options",
     "Run": "flowgraph.engines.python.run",
     "simulate": "flowgraph.engines.simulate",
@@ -125,6 +127,7 @@ __all__ = [
     "FlowgraphError",
     "Graph",
     "Held",
+    "Live",
     "LoweringError",
     "MissingDependencyError",
     "OutputError",

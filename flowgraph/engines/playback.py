@@ -88,7 +88,7 @@ def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engi
         name: int(s.time[-1]) if len(s) else before
         for (name, before), s in zip(start.last.items(), events.series, strict=True)
     }
-    state = _state(pipeline, outcome.cells, last, start.seed)
+    state = state_of(pipeline, outcome.cells, last, start.seed)
     stats = {
         f"{f.path}.{name}": int(count)
         for f in pipeline.faults
@@ -103,7 +103,8 @@ def chosen_passes(engine: PipelineEngine, options: RunOptions) -> tuple[str, ...
     return check_passes(engine.passes if options.passes is None else options.passes)
 
 
-def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
+def state_of(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
+    """The state tree of these register cells."""
     values = iter(cells)
     registers: dict[str, Any] = {}
     for register in pipeline.registers:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.checkpoint import Keeper, identity, program_digest
-from flowgraph.engines.contract import BlockEngine
+from flowgraph.engines.contract import BlockEngine, Stepper
+from flowgraph.engines.entrance import Admitted
 from flowgraph.engines.options import Checkpoint, RunOptions
 from flowgraph.engines.python.run import Run
 from flowgraph.engines.state import load_registers
@@ -19,6 +22,7 @@ from flowgraph.engines.trouble import Playback, all_finite, gaps_of, settled
 from flowgraph.errors import DeclarationError, FifoOverflowError, LoweringError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.lowering import lower
+from flowgraph.types import flatten
 
 
 class PythonEngine(BlockEngine):
@@ -60,6 +64,38 @@ class PythonEngine(BlockEngine):
         if error is None and all_finite(result):
             return result
         return settled(result, _playback(graph, kept, options), options.diverged, error)
+
+    def stepper(self, graph: Graph, options: RunOptions) -> Stepper:
+        return _SingleTicks(graph, options)
+
+
+class _SingleTicks(Stepper):
+    """A live run, tick by tick."""
+
+    def __init__(self, graph: Graph, options: RunOptions) -> None:
+        self._run = Run(graph, init=options.init, state=options.state, seed=options.seed)  # type: ignore[arg-type]
+        self._types = [graph.port(c.wire).type for c in graph.collected]
+
+    @property
+    def ticks(self) -> int:  # type: ignore[override]
+        return self._run.ticks
+
+    @property
+    def time(self) -> int:  # type: ignore[override]
+        return self._run.time
+
+    @property
+    def state(self) -> dict[str, Any]:
+        return self._run.state
+
+    def overflows(self) -> list[FifoOverflowError]:
+        return self._run.overflows()
+
+    def step(self, admitted: Admitted) -> list[tuple[Any, ...] | None]:
+        return [
+            None if not values else tuple(map(np.array, flatten(values[0], type_)))
+            for values, type_ in zip(self._run.react(admitted), self._types, strict=True)
+        ]
 
 
 def _started(graph: Graph, inputs: Inputs, options: RunOptions) -> Run:

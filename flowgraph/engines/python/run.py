@@ -150,6 +150,21 @@ class Run:
                 self._told.add(index)
                 raise error
 
+    @_alone
+    def react(self, admitted: Admitted) -> list[list[Any]]:
+        """The tick of events that were checked; what each output has of it, which the run forgets."""
+        self._react(admitted)
+        made = [list(values) for values in self._values]
+        for kept in (*self._times, *self._values):
+            kept.clear()
+        return made
+
+    def overflows(self) -> list[FifoOverflowError]:
+        """The errors of queues that were full for the first time since the last call."""
+        new = [index for index in self._full if index not in self._told]
+        self._told.update(new)
+        return [self._full[index] for index in new]
+
     def _react(self, admitted: Admitted) -> None:
         """The tick of these events; where it fails it did not happen, and the next may come."""
         assert self._pushed is not None
