@@ -68,8 +68,8 @@ IN_A_ROW = 5
 
 
 FAR, FEW, CHANCE = 4.0, 20, 1e-9
-"""By which factor a NIS per number is far from 1, of how many innovations at least it is a mean, and how rarely
-an honest filter may have as large a one by chance."""
+"""By which factor a NIS per number is far from 1, of how many innovations at least it is a mean, and how
+rarely an honest filter may have as large a one by chance."""
 
 
 def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
@@ -113,20 +113,16 @@ def _far(name: str, innovation: Series) -> tuple[str, ...]:
     front = f"{name}: " if name else ""
     mean = float(values.sum() / parts.sum())
     size = min(IN_A_ROW, len(values))
-    sums, numbers = (np.convolve(x, np.ones(size), "valid") for x in (sums, numbers))
-    limit = np.maximum(FAR, chi_square(1.0 - CHANCE, numbers) / numbers)
-    beyond = np.flatnonzero(sums > limit * numbers)
+    sums, numbers = (np.convolve(x, np.ones(size), "valid") for x in (values, parts))
+    beyond = np.flatnonzero(sums > np.maximum(FAR * numbers, chi_square(1.0 - CHANCE, numbers)))
     if len(beyond):
-        first, worst = int(beyond[0]), float((sums / numbers).max())
-        since = (int(time[first]) - int(innovation.time[0])) * 1e-9
-        return (
-            note(
-                "warning",
-                f"{front}the NIS is far from 1, from {since:.3g} s after the first on: up to {worst:.3g} a number"
-                f" over {size} innovations, {mean:.3g} over all: the noise, the clock, the start or the sensor is"
-                " not as told",
-            ),
+        since = (int(time[beyond[0]]) - int(innovation.time[0])) * 1e-9
+        said = (
+            f"{front}the NIS is far from 1, from {since:.3g} s after the first on: up to"
+            f" {(sums / numbers).max():.3g} a number over {size} innovations, {mean:.3g} over all;"
+            " the noise, the clock, the start or the sensor is not as told"
         )
+        return (note("warning", said),)
     if mean < 1.0 / FAR and len(values) >= FEW:
         said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
         return (note("warning", said),)
