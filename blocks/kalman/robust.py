@@ -1,4 +1,4 @@
-"""Measurements that are not as told: outliers that count for less, and a noise that is learned as it goes.
+"""Outliers that count for less.
 
 A Kalman filter trusts a measurement as far as its noise is told, however far off it is. A gate takes it whole
 or not at all. A robust correction weighs it: the noise of one that lies far from what is left after the
@@ -12,23 +12,19 @@ maximum of the posterior under a noise with heavier tails.
 Where nothing else tells the state, an outlier fits itself: the prior must be sharper than the outlier is far.
 
 Sources: P. Huber, "Robust estimation of a location parameter", 1964; M. Roth, E. Özkan, F. Gustafsson, "A
-Student's t filter for heavy tailed process and measurement noise", ICASSP 2013; for the learned noise A. Mohamed and
-K. Schwarz, "Adaptive Kalman filtering for INS/GPS", J. Geodesy 73, 1999.
+Student's t filter for heavy tailed process and measurement noise", ICASSP 2013.
 """
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
-from flowgraph import Array, block, real
-from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph import Array
 from flowgraph.errors import DeclarationError
 
-__all__ = ["Robust", "huber", "learned_noise", "reweighted", "student_t"]
+__all__ = ["Robust", "huber", "reweighted", "student_t"]
 
 
 class Robust(abc.ABC):
@@ -38,7 +34,7 @@ class Robust(abc.ABC):
 
     @abc.abstractmethod
     def weight(self, square: Array, parts: Array, xp: Any) -> Array:
-        """The weight (...) of one whose remaining error has this square (...) in deviations, of `parts` numbers."""
+        """The weight (...) of one with this squared error (...), in deviations, of so many parts."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +82,15 @@ def student_t(freedom: float = 4.0, *, rounds: int = 5) -> Robust:
 def _need_positive(path: str, value: float) -> None:
     if not value > 0:
         raise DeclarationError(
-            "this must be positive", path=path, expected="a number above 0", got=str(value), fix="leave it out"
+            "this must be positive",
+            path=path,
+            expected="a number above 0",
+            got=str(value),
+            fix="leave it out",
         )
 
 
-def reweighted(
-    robust: Robust, spread: Array, residual: Array, R: Array, parts: Array, xp: Any
-) -> Array:
+def reweighted(robust: Robust, spread: Array, residual: Array, R: Array, parts: Array, xp: Any) -> Array:
     """The noise R (..., m, m), divided by the weight of the measurement.
 
     Args:
@@ -109,34 +107,3 @@ def reweighted(
         square = (left.mT @ xp.linalg.solve(R, left))[..., 0, 0]
         noise = R / robust.weight(square, parts, xp)[..., None, None]
     return noise
-
-
-Noise = Annotated[Any, real("m", "m")]
-Vector = Annotated[Any, real("m")]
-
-
-@block
-def learned_noise(noise: Noise, innovation: KalmanInnovation | None, *, memory: float, xp: Any) -> Noise:
-    """The covariance of a measurement's noise, learned from what is left after each correction.
-
-        e = R S^-1 r        R' = R + (e e^T - R S^-1 R) / memory
-
-    It stays positive, and stands still where the innovations are as large as they were expected. What was
-    refused by a gate, and a measurement of which entries are missing, teach nothing. Feed it back through a
-    delay: `noise = delay(R0)`, then `update_learned(prior, measured, noise, ...)`.
-
-    Args:
-        noise: R (m, m), by which the innovation was made.
-        innovation: of this tick; or absent.
-        memory: how many measurements it remembers, about.
-
-    Source: Mohamed and Schwarz 1999, eq. 18, with the covariance after the correction, H P' H^T = R - R S^-1 R.
-    """
-    if innovation is None:
-        return noise
-    solved = xp.linalg.solve(innovation.covariance, xp.concat([innovation.residual[..., None], noise], axis=-1))
-    left = noise @ solved[..., :1]
-    change = (left @ left.mT - noise @ solved[..., 1:]) / memory
-    whole = innovation.accepted & (innovation.parts == float(noise.shape[-1]))
-    made = noise + xp.where(whole[..., None, None], change, 0.0)
-    return 0.5 * (made + made.mT)

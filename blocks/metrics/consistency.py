@@ -67,16 +67,16 @@ IN_A_ROW = 5
 """Refusals in a row from which on a gate may be shut upon an honest sensor."""
 
 
-FAR, FEW, CHANCE = 4.0, 20, 1e-9
-"""By which factor a NIS per number is far from 1, of how many innovations at least it is a mean, and how
-rarely an honest filter may have as large a one by chance."""
+FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
+"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over all of a
+run; of how many innovations at least such a mean is; and how rarely an honest filter has as large a one."""
 
 
 def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
     """Notes where a gate refused `IN_A_ROW` measurements or more in a row, and where the NIS is far from 1.
 
-    A NIS far from 1 is one whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and
-    more than chance allows; or whose mean over all of them, if these are `FEW` or more, is below 1 / `FAR`.
+    A NIS is far from 1 whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and more
+    than chance allows; or, over all of them, if these are `FEW` or more, above `APART` or below 1 / `FAR`.
 
     Args:
         name: of what was measured; empty where there is one kind.
@@ -122,6 +122,10 @@ def _far(name: str, innovation: Series) -> tuple[str, ...]:
             f" {(sums / numbers).max():.3g} a number over {size} innovations, {mean:.3g} over all;"
             " the noise, the clock, the start or the sensor is not as told"
         )
+        return (note("warning", said),)
+    total = float(parts.sum())
+    if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
+        said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too small, or a clock is off"
         return (note("warning", said),)
     if mean < 1.0 / FAR and len(values) >= FEW:
         said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"

@@ -53,7 +53,7 @@ def faults_of(flight: Flight) -> Iterator[Fault]:
     controls = {n for n, s in flight.streams.items() if _class(s) in CONTROLS}
     measured = {n for n, s in flight.streams.items() if _class(s) in MEASURED}
     for name in (*sorted(controls), *sorted(measured)):
-        for length in (1.0, 3.0, 10.0, 30.0):
+        for length in (1.0, 10.0, 30.0):
             yield Fault(f"dropout {name} {length:g} s", _of(name, _gap, length), length)
         yield Fault(f"nan {name} 0.5 s", _of(name, _nan, 0.5), 0.5)
         yield Fault(f"spikes {name}", _of(name, _spikes), 1.0)

@@ -31,16 +31,17 @@ FLOWN: Mapping[str, tuple[str, dict[str, str]]] = {
     "rbpf_indoor": ("sim", {"imu.rate": "100", "particles": "100"}),
     **dict.fromkeys(("ins_ekf_pose", "ins_ukf_pose", "ins_ukf_velocity"), ("course", {})),
     "ins_particle": ("course", {"particles": "100"}),
-    "orientation_complementary": ("sim:thesis", {"sensors": "gyro,coordinate_acceleration,thrust"}),
-    "attitude_mekf": ("sim:thesis", {"sensors": "body_rate,magnetic_attitude"}),
-    "marg": ("sim:thesis", {"sensors": "imu,magnetometer"}),
-    "outdoor_eskf": ("sim:thesis", {"sensors": THESIS}),
-    "rbpf_outdoor": ("sim:thesis", {"sensors": THESIS, "particles": "100"}),
+    "orientation_complementary": ("sim:hover", {"sensors": "gyro,coordinate_acceleration,thrust"}),
+    "attitude_mekf": ("sim:roundtrip", {"sensors": "body_rate,magnetic_attitude"}),
+    "marg": ("sim:roundtrip", {"sensors": "imu,magnetometer"}),
+    "outdoor_eskf": ("sim:roundtrip", {"sensors": THESIS}),
+    "rbpf_outdoor": ("sim:roundtrip", {"sensors": THESIS, "particles": "100"}),
 }  # fmt: skip
 """The flight of each filter of a pose or an attitude, and settings of both."""
 
 BEGINS, AFTER, WINDOW = 3.0, 8.0, 0.5
-"""s after the first reading at which a fault begins, from its end to that of the flight, and of a window."""
+"""s after the first reading at which a fault begins, from its end to that of the flight (twice that where it goes
+on), and of a window."""
 
 SOON, TWICE = 4.0, 2.0
 """s within which an error is to be back, and within how many times its usual value."""
@@ -81,11 +82,11 @@ class Flown:
 
     def figures(self, first: float, last: float) -> dict[str, float]:
         """The errors of the ticks from the first second after the start on, before the last."""
-        series = self.result[self.case.estimate]
-        start = int(series.time[0])
-        there = (series.time >= start + round(first * 1e9)) & (series.time < start + round(last * 1e9))
-        part = replace(self.result, series={self.case.estimate: series[there]})
-        return self.case.score(part) if there.any() else {}
+        begun = int(self.result[self.case.estimate].time[0])
+        low, high = begun + round(first * 1e9), begun + round(last * 1e9)
+        parts = {n: s[(s.time >= low) & (s.time < high)] for n, s in self.result.series.items()}
+        there = len(parts[self.case.estimate]) > 0
+        return self.case.score(replace(self.result, series=parts)) if there else {}
 
     def error(self, first: float, last: float) -> float:
         """The error in this window; infinite where there is none."""
@@ -110,7 +111,7 @@ def _rows(name: str, wanted: tuple[str, ...], seed: int) -> Iterator[dict[str, A
                 "start_heading" in fault.settings and "start_heading" not in own
             ):
                 continue
-            lasts = BEGINS + fault.lasts + AFTER
+            lasts = _duration(fault)
             if lasts not in flights:
                 flights[lasts] = _flight(name, lasts, seed)[0]
                 usual[lasts] = _fly(name, flights[lasts], None, gate, seed)
@@ -127,6 +128,10 @@ def _rows(name: str, wanted: tuple[str, ...], seed: int) -> Iterator[dict[str, A
                 continue
             if found is not None:
                 yield {**row, **_verdict(fault, found, usual[lasts])}
+
+
+def _duration(fault: Fault) -> float:
+    return BEGINS + fault.lasts + AFTER * (1.0 if fault.lasts else 2.0)
 
 
 def _flight(name: str, duration: float, seed: int) -> tuple[Flight, dict[str, Any]]:
@@ -176,10 +181,9 @@ def _singular(case: Case) -> dict[str, Any] | None:
 def _verdict(fault: Fault, found: Flown, usual: Flown) -> dict[str, Any]:
     """What became of the error, and whether anybody is told."""
     hour = 3600.0 if fault.name.startswith("time jumps") else 0.0
-    ends, last = BEGINS + fault.lasts + hour, BEGINS + fault.lasts + AFTER + hour
-    if fault.settings:
-        ends, last = 0.0, last
-    right = usual.error(0.0 if fault.settings else BEGINS, last)
+    begins = 0.0 if fault.settings else BEGINS
+    ends, last = begins + fault.lasts + hour, _duration(fault) + hour
+    right = usual.error(begins, last - hour)
     back: float | None = None
     for first in np.arange(ends, last - WINDOW, WINDOW).tolist():
         allowed = TWICE * max(right, usual.error(first - hour, first - hour + WINDOW))
@@ -187,8 +191,8 @@ def _verdict(fault: Fault, found: Flown, usual: Flown) -> dict[str, Any]:
             back = first - ends if back is None else back
         else:
             back = None
-    worst = found.error(0.0 if fault.settings else BEGINS, last) / right
-    figures = found.figures(0.0 if fault.settings else BEGINS, last)
+    worst = found.error(begins, last) / right
+    figures = found.figures(begins, last)
     nees, dimension = figures.get("nees_mean"), _dimension(figures)
     new = [n for n in found.notes if n.startswith(_SAYS) and n not in usual.notes]
     why = ""
@@ -200,12 +204,22 @@ def _verdict(fault: Fault, found: Flown, usual: Flown) -> dict[str, Any]:
         verdict, why = "said", new[0]
     elif not found.weighs:
         verdict, why = "undetectable", "it expects no size of what it corrects by"
+    elif (largest := _surprise(figures)) is not None:
+        verdict = "undetectable"
+        why = f"its innovations are no larger than an honest filter's: a NIS of {largest:.2f} a number"
     else:
         verdict = "silent"
     return {
         "verdict": verdict, "factor": float(worst) if np.isfinite(worst) else None, "recovery_s": back,
         "nees_mean": nees if nees is None or np.isfinite(nees) else None, "dimension": dimension, "why": why,
     }  # fmt: skip
+
+
+def _surprise(figures: Mapping[str, float]) -> float | None:
+    """The largest NIS per number of a stream; None where one is beyond its 95 % band."""
+    means = {key: v for key, v in figures.items() if key.endswith("nis_mean")}
+    beyond = any(v > figures[key.removesuffix("mean") + "high"] for key, v in means.items())
+    return None if beyond or not means else max(means.values())
 
 
 def _dimension(figures: Mapping[str, float]) -> int | None:
