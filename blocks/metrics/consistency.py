@@ -68,8 +68,8 @@ IN_A_ROW = 5
 
 
 FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
-"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over all of a
-run; of how many innovations at least such a mean is; and how rarely an honest filter has as large a one."""
+"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
+whole run; of how many innovations at least such a mean is; and how rarely an honest filter has as large a one."""
 
 
 def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
@@ -125,8 +125,8 @@ def _far(name: str, innovation: Series) -> tuple[str, ...]:
         return (note("warning", said),)
     total = float(parts.sum())
     if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
-        said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too small, or a clock is off"
-        return (note("warning", said),)
+        why = "the noise is told too small, or a clock is off"
+        return (note("warning", f"{front}the NIS is far from 1: {mean:.3g} a number; {why}"),)
     if mean < 1.0 / FAR and len(values) >= FEW:
         said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
         return (note("warning", said),)

@@ -40,8 +40,8 @@ FLOWN: Mapping[str, tuple[str, dict[str, str]]] = {
 """The flight of each filter of a pose or an attitude, and settings of both."""
 
 BEGINS, AFTER, WINDOW = 3.0, 8.0, 0.5
-"""s after the first reading at which a fault begins, from its end to that of the flight (twice that where it goes
-on), and of a window."""
+"""s after the first reading at which a fault begins, from its end to that of the flight (twice that where it
+goes on), and of a window."""
 
 SOON, TWICE = 4.0, 2.0
 """s within which an error is to be back, and within how many times its usual value."""

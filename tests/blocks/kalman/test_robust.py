@@ -8,21 +8,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from flowgraph import DeclarationError, Series, Stream, arrays, delay, graph, latest, real, simulate
+from flowgraph import DeclarationError, Series, Stream, arrays, block, delay, graph, real, simulate
 from flowgraph.blocks.filtering import extended, filtered
 from flowgraph.blocks.geometry import StateSpace, euclidean
 from flowgraph.blocks.kalman import (
-    LinearModel,
     huber,
     learned_noise,
-    predict_linear,
     student_t,
     update_extended,
     update_learned,
     update_linear,
 )
 from flowgraph.blocks.signals import Gaussian
-from flowgraph.blocks.statespace import LinearMeasurement
+from flowgraph.blocks.statespace import DiscreteModel, LinearMeasurement
 from tests.support import all_engines
 
 Two = Annotated[Any, real(2)]
@@ -100,11 +98,9 @@ def test_what_is_not_positive_is_refused(make):
 # -- in a filter -----------------------------------------------------------------------------------------
 
 DT = 100_000_000
-CAR = LinearModel(
-    np.block([[np.zeros((2, 2)), np.eye(2)], [np.zeros((2, 4))]]),
-    np.zeros((4, 1)),
-    np.diag([0.0, 0.0, 0.1, 0.1]),
-)
+STEP = np.eye(4) + 0.1 * np.eye(4, k=2)
+SHAKE = np.diag([1e-5, 1e-5, 0.01, 0.01])
+CAR = DiscreteModel(STEP, SHAKE)
 START = Gaussian(mean=np.zeros(4), covariance=np.eye(4))
 
 
@@ -137,13 +133,18 @@ def tracked(fix: Stream[Two], *, method: Any, sees: LinearMeasurement) -> Stream
     return filtered(CAR, {sees: fix}, start=START, method=method)  # type: ignore[no-any-return]
 
 
+@block
+def moved(belief: Gaussian, *, xp: Any) -> Gaussian:
+    F = xp.asarray(STEP)
+    mean = (F @ belief.mean[..., None])[..., 0]
+    return Gaussian(mean=mean, covariance=F @ belief.covariance @ F.mT + xp.asarray(SHAKE))
+
+
 @graph
 def learning(fix: Stream[Two], *, first: Any, memory: float, robust: Any = None):
     belief = delay(START, name="belief")
     noise = delay(first, name="noise")
-    prior = predict_linear(
-        belief, latest(fix.map(lambda z: 0.0 * z[..., :1]), init=np.zeros(1)), model=CAR, at=fix
-    )
+    prior = moved(belief, at=fix)
     observe = lambda x, xp: (x[..., :2], xp.asarray(H))
     posterior, innovation = update_learned(prior, fix, noise, observe=observe, robust=robust)
     belief.feed(posterior)
@@ -154,18 +155,19 @@ def learning(fix: Stream[Two], *, first: Any, memory: float, robust: Any = None)
 
 @pytest.mark.parametrize("told", [0.025, 0.25, 2.5])
 def test_the_noise_is_learned_from_either_side(told):
-    _, fixes = seen(3000, spread=0.5)
-    result = simulate(learning.build(first=np.eye(2) * told, memory=150.0), {"fix": fixes})
+    _, fixes = seen(1500, spread=0.5)
+    result = simulate(learning.build(first=np.eye(2) * told, memory=100.0), {"fix": fixes})
     assert np.linalg.eigvalsh(result.noise["value"]).min() > 0.0
-    late = result.noise["value"][1500:].mean(axis=0)
-    np.testing.assert_allclose(np.diag(late), 0.25, rtol=0.2)
+    late = result.noise["value"][700:].mean(axis=0)
+    np.testing.assert_allclose(np.diag(late), 0.25, rtol=0.25)
     assert abs(late[0, 1]) < 0.05
-    assert float(np.mean(result.innovation["nis"][1500:])) == pytest.approx(2.0, rel=0.1)
+    assert float(np.mean(result.innovation["nis"][700:])) == pytest.approx(2.0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_engines_agree():
-    _, fixes = seen(60, outliers=0.2)
-    all_engines(learning.build(first=np.eye(2), memory=20.0, robust=student_t()), {"fix": fixes})
+    _, fixes = seen(30, outliers=0.2)
+    all_engines(learning.build(first=np.eye(2), memory=20.0, robust=student_t(rounds=2)), {"fix": fixes})
     observe = lambda x, xp: (x[..., :2], xp.asarray(H))
     found, _ = update_extended.step(PRIOR, np.array([3.0, 0.0]), observe=observe, R=R, robust=huber(), xp=np)
     same, _ = update_linear.step(PRIOR, np.array([3.0, 0.0]), H=H, R=R, robust=huber(), xp=np)
