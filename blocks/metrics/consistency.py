@@ -69,7 +69,7 @@ IN_A_ROW = 5
 
 FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
 """By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
-whole run; of how many innovations at least such a mean is; and how rarely an honest filter has as large a one."""
+whole run; how many innovations such a mean is of at least; how rarely an honest filter has as large a one."""
 
 
 def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:

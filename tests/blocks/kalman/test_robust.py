@@ -122,7 +122,7 @@ def test_with_outliers_it_is_much_better_and_without_hardly_worse(robust):
         place, fixes = seen(400, outliers=outliers)
         for which, method in (("plain", extended()), ("robust", extended(robust=robust))):
             built = tracked.build(method=method, sees=sees)
-            mean = simulate(built, {"fix": fixes}).belief["mean"]
+            mean = simulate(built, {"fix": fixes}).output["mean"]
             errors[outliers, which] = float(np.sqrt(np.mean((mean[50:, :2] - place[50:]) ** 2)))
     assert errors[0.1, "robust"] < 0.5 * errors[0.1, "plain"]
     assert errors[0.0, "robust"] < 1.1 * errors[0.0, "plain"]
