@@ -16,10 +16,14 @@ WORKERS = -n auto --maxprocesses 4
 SOURCES = $(wildcard flowgraph blocks graphs examples tests docs)
 TYPED   = $(wildcard flowgraph examples tests)
 
-.PHONY: help demo test test-slow lint bench docs clean
+# The scripts of the pages are made by node from FRONT, and committed: only who changes FRONT needs node.
+FRONT = flowgraph/drawing/front
+PAGES = flowgraph/drawing/pages
+
+.PHONY: help demo test test-slow lint bench docs front front-check clean
 
 help:
-	@echo "make demo | test | test-slow | lint | bench | docs | clean"
+	@echo "make demo | test | test-slow | lint | bench | docs | front | clean"
 
 demo: $(VENV)/.with-xla
 	$(BIN)/flowgraph demo --out out $(ARGS)
@@ -42,6 +46,19 @@ bench: $(VENV)/.with-bench+xla+test
 docs: $(VENV)/.with-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file $(firstword $(wildcard mkdocs.yml docs/mkdocs.yml) mkdocs.yml) \
 		--site-dir $(CURDIR)/out/site
+
+# In a copy, so that what npm installs is no part of the package.
+front: out/front/.with-node
+	cd out/front && npm run --silent check && npm run --silent build -- ../../$(PAGES)
+
+# The committed scripts are those that the source makes.
+front-check: out/front/.with-node
+	cd out/front && npm run --silent check && npm run --silent build -- made && diff -r made ../../$(PAGES)
+
+out/front/.with-node: $(wildcard $(FRONT)/*.* $(FRONT)/src/*)
+	mkdir -p out/front && rm -rf out/front/src out/front/made && cp -R $(FRONT)/. out/front
+	cd out/front && npm ci --ignore-scripts --no-audit --no-fund --silent
+	touch $@
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

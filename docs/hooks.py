@@ -1,8 +1,8 @@
 """Pictures and reference tables of the site, made when it is built and kept out of the tree.
 
 `generated/NAME.svg` is the diagram of each installed graph, started on a simulated flight, and
-`generated/rooms.svg` that of the rooms of this package. The pages named
-in `RUN` are run as programs, and the pictures that they write are taken as they are.
+`generated/rooms.svg` that of the rooms of this package; `screens` makes interactive pages and takes pictures
+of them. The pages named in `RUN` are run as programs, and the pictures that they write are taken as they are.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from mkdocs.structure.files import File
 sys.path.insert(0, str(Path(__file__).parent))
 import library
 import rooms
+import screens
 
 from flowgraph import FlowgraphError
 from flowgraph.cli.options import graph_of
@@ -42,6 +43,7 @@ def on_files(files: Any, config: Any) -> Any:
     drawn.update(diagrams)
     pictures = {f"{name}.svg": svg for name, svg in diagrams.items()}
     pictures["rooms.svg"] = rooms.house().draw(legend=False).encode()
+    pictures |= dict(screens.screens())
     for name, content in {**pictures, **dict(written_by_pages(Path(config["docs_dir"])))}.items():
         files.append(File.generated(config, f"generated/{name}", content=content))
     return files

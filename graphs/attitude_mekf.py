@@ -22,7 +22,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
-from flowgraph.blocks.kalman.lost import PATIENCE, find_back
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.commanded import (
     TURN,
@@ -33,7 +33,7 @@ from flowgraph.blocks.orientation.commanded import (
     see_attitude,
     start_turn,
 )
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, BodyRate, Gaussian
@@ -52,6 +52,7 @@ def attitude_mekf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    held: Held | None = None,
 ):
     """Multiplicative extended Kalman filter: commanded body rate, corrected by measured attitudes.
 
@@ -66,6 +67,7 @@ def attitude_mekf(
     rate = latest(body_rate, init=_STILL, at=body_rate | magnetic_attitude, name="rate")
     drive = rate if reading == "mean" else between_rates(last, rate)
     prior = predict_turn(belief, drive, noise=rate_noise, name="predict")
+    prior = bridged(belief, prior, body_rate, held=held, attitude=0)
     posterior, innovation = update_extended(
         prior,
         magnetic_attitude.map(attitude_vector, name="measured"),
@@ -77,7 +79,7 @@ def attitude_mekf(
         name="update",
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=3)
+        posterior = find_back(posterior, innovation, patience=patience, moving=3, attitude=0)
     belief.feed(posterior)
     last.feed(rate)
     collect(innovation, "innovation")
@@ -94,6 +96,7 @@ def for_flight(
     *,
     rate_noise: Positive | None = None,
     attitude_noise: Positive | None = None,
+    control: HeldControl,
     gated: Gated,
     scored: Scored,
 ) -> Case:
@@ -120,5 +123,6 @@ def for_flight(
         rate_noise=on.noise("rate_noise", rate_noise, own[0]) * math.sqrt(step),
         attitude_noise=on.noise("attitude_noise", attitude_noise, own[1]),
         reading=reading_of(on.flight, "body_rate"),
+        held=control.held(on, rate, on.inputs),
         **gated.gating(),
     )

@@ -67,7 +67,7 @@ def ekf(
         prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=10)
+        posterior = find_back(posterior, innovation, patience=patience, moving=10, attitude=6)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")

@@ -55,7 +55,7 @@ def euler_loop(
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update(prior, control)
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
+        posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=3)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")

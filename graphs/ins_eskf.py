@@ -69,14 +69,16 @@ def ins_eskf(
     )
     collect(innovation, "position_innovation")
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9, name="find_back")
+        posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6, shown=False)
     if attitude is not None:
         posterior, turn = aid_attitude(
             posterior, attitude, noise=attitude_noise, gate=gate, invariant=invariant
         )
         collect(turn, "attitude_innovation")
         if gate is not None:
-            posterior = find_back(posterior, turn, patience=patience, moving=9, name="find_back_attitude")
+            posterior = find_back(
+                posterior, turn, patience=patience, moving=(6, 9), attitude=6, name="find_back_attitude"
+            )
     belief.feed(posterior)
     return {"belief": posterior}
 

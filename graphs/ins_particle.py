@@ -114,7 +114,7 @@ def ins_particle(
     }
 
 
-@on_flight(ins_particle, "imu", told=with_imu, measured=None)
+@on_flight(ins_particle, "imu", told=with_imu)
 def for_flight(
     on: OnFlight,
     *,

@@ -72,7 +72,10 @@ def outdoor_eskf(
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return now
-        return find_back(now, innovation, patience=patience, moving=9, name=f"find_back_{name}")
+        lost: dict[str, Any] = {"moving": 9, "attitude": 6, "shown": name == "optical_flow"}
+        if name == "magnetometer":
+            lost = {"moving": (6, 9), "attitude": 6}
+        return find_back(now, innovation, patience=patience, name=f"find_back_{name}", **lost)
 
     readings: dict[str, tuple[Stream, Any, float]] = {
         "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),

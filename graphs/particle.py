@@ -73,7 +73,7 @@ def particle(
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(particle, "velocity", "position", measured=None, ranged=False)
+@on_flight(particle, "velocity", "position", ranged=False)
 def for_flight(
     on: OnFlight,
     *,

@@ -95,7 +95,7 @@ def quaternion_ukf(
         gate=gate,
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=6)
+        posterior = find_back(posterior, innovation, patience=patience, moving=6, attitude=0)
     belief.feed(posterior)
     collect(innovation, "innovation")
     return {"belief": named_orientation(posterior)}

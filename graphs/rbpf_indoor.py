@@ -177,7 +177,7 @@ def rbpf_indoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_indoor, "imu", "vicon", told=with_imu, measured=None)
+@on_flight(rbpf_indoor, "imu", "vicon", told=with_imu)
 def for_flight(
     on: OnFlight,
     *,

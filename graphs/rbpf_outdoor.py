@@ -9,33 +9,36 @@ Source: R. Fiszel's thesis on reactive pose estimation, Stanford 2017, section o
 Rao-Blackwellized particle filter. Mended: the attitude is drawn after the readings, not before them (drawn at
 every step, a thousand particles are too few for a sharp magnetometer); the altimeter reads p_z / cos(tilt)
 (the thesis prints a sine), and optical flow q_0^-1 q_1, with the displacement in the body (the thesis: q_0
-q_1, in the world). The equations stand in `blocks/outdoor/cloud.py`.
+q_1, in the world). The equations stand in `blocks/outdoor/cloud.py` and
+`blocks/outdoor/corrections.py`.
 """
 
 from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest, merge
-from flowgraph.blocks.kalman.lost import Held, stay
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.spread import spread_outdoor
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
-    correct_distance,
-    correct_field,
-    correct_flow,
-    correct_position,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
 )
+from flowgraph.blocks.outdoor.corrections import (
+    correct_distance,
+    correct_field,
+    correct_flow,
+    correct_position,
+)
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.particles.resampling import draw_ancestors
-from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Particles, Scored, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
@@ -60,6 +63,8 @@ def rbpf_outdoor(
     start: OutdoorCloud,
     sensors: OutdoorSensors,
     reading: str = "instant",
+    gate: float | None = None,
+    patience: int = PATIENCE,
     resample_below: float = 0.5,
     scheme: str = "systematic",
     draws: str = "rbpf_outdoor",
@@ -70,8 +75,11 @@ def rbpf_outdoor(
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
     resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `pose` and `belief`, with its covariance, at every tick, averaged before resampling;
-    `effective_sample_size`, `depleted` and `ancestors` at every tick with a reading.
+    With a gate, a reading that is too far from the cloud is refused; after `patience` readings of one sensor
+    in a row the particles become as unsure as the reading was far, and believe it.
+    Collected: `pose` and `belief`, with its covariance, at every tick, averaged before resampling; the
+    innovation of each sensor where there was a reading; `effective_sample_size`, `depleted` and `ancestors`
+    at every tick with a reading.
     """
     s = sensors
     cloud = delay(start, name="cloud")
@@ -82,11 +90,21 @@ def rbpf_outdoor(
     if held is not None:
         now = now if held.longest is None else stay(cloud, now, longest=held.longest)
         now = spread_outdoor(now, imu, held=held)
-    now = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, name="fuse_gps")
-    now = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, name="fuse_gps2")
-    now = correct_distance(now, altimeter, noise=s.altimeter, name="fuse_altimeter")
-    now = correct_field(now, magnetometer, earth=s.field, noise=s.magnetometer, name="fuse_field")
-    now = correct_flow(now, optical_flow, displacement=s.displacement, turn=s.turn, name="fuse_flow")
+    gated = {"gate": gate, "patience": patience}
+    now, told = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, **gated, name="fuse_gps")
+    collect(told, "gps_innovation")
+    now, told = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, **gated, name="fuse_gps2")
+    collect(told, "gps2_innovation")
+    now, told = correct_distance(now, altimeter, noise=s.altimeter, **gated, name="fuse_altimeter")
+    collect(told, "altimeter_innovation")
+    now, told = correct_field(
+        now, magnetometer, earth=s.field, noise=s.magnetometer, **gated, name="fuse_field"
+    )
+    collect(told, "magnetometer_innovation")
+    now, told = correct_flow(
+        now, optical_flow, displacement=s.displacement, turn=s.turn, **gated, name="fuse_flow"
+    )
+    collect(told, "optical_flow_innovation")
 
     plain = as_cloud(now, name="plain")
     size = effective_sample_size(plain, at=seen, name="size")
@@ -103,8 +121,8 @@ def rbpf_outdoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_outdoor, measured=None)
-def for_flight(on: OnFlight, *, cloud: Particles, control: HeldControl, scored: Scored) -> Case:
+@on_flight(rbpf_outdoor)
+def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
@@ -124,5 +142,6 @@ def for_flight(on: OnFlight, *, cloud: Particles, control: HeldControl, scored: 
         sensors=sensors,
         held=control.held(on, inputs["imu"], inputs),
         reading=reading_of(on.flight),
+        **gated.gating(),
         **cloud.resampling(),
     )

@@ -95,7 +95,7 @@ def ukf(
         gate=gate,
     )
     if gate is not None:
-        posterior = find_back(posterior, innovation, patience=patience, moving=9)
+        posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6)
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")

@@ -70,6 +70,13 @@ def close(a: Any, b: Any, name: str, exact: bool) -> None:
         assert (np.abs(np.asarray(a) - np.asarray(b)) <= bound).all(), name
 
 
+def both_quick(graph: Graph, inputs: Any, **options: Any) -> Result:
+    """The result, the same to the bit in the two engines that compile nothing."""
+    one, other = (simulate(graph, inputs, engine=e, **options) for e in ENGINES[:2])
+    same(one, other)
+    return one
+
+
 def all_engines(graph: Graph, inputs: Any, **options: Any) -> Result:
     """The result, the same in all engines."""
     results = [simulate(graph, inputs, engine=e, **options) for e in ENGINES]

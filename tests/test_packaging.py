@@ -86,9 +86,20 @@ def test_wheel_holds_real_files_under_one_name(wheel: Path) -> None:
         assert {"flowgraph/blocks/__init__.py", "flowgraph/graphs/__init__.py"} <= python
 
         # Data: the schemas, the marker of a typed package, the licence.
-        schemas = {path.relative_to(ROOT).as_posix() for path in (ROOT / "flowgraph").rglob("*.json")}
-        assert schemas, "flowgraph/ holds no schema"
+        schemas = {
+            path.relative_to(ROOT).as_posix() for path in (ROOT / "flowgraph/pipeline").rglob("*.json")
+        }
+        assert schemas, "flowgraph/pipeline/ holds no schema"
         assert schemas | {"flowgraph/py.typed"} <= set(entries)
+
+        # The scripts of the pages with their licences, and not what they are made from.
+        parts = ("diagram.js", "run.js", "style.css", "NOTICES.txt")
+        assert {n.rpartition("/")[2] for n in entries if n.startswith("flowgraph/drawing/pages/")} == set(
+            parts
+        )
+        for place in (f"flowgraph/drawing/pages/{part}" for part in parts):
+            assert archive.read(place) == (ROOT / place).read_bytes()
+        assert not [name for name in entries if "/front/" in name]
         assert any(name.endswith(".dist-info/licenses/LICENSE") for name in entries)
 
 

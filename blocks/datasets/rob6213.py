@@ -10,6 +10,9 @@ The files hold no IMU. The one given here is derived from the motion capture: lo
 positions and attitudes, differentiated. It has no bias and knows the future a little; a filter fed with it
 shows what its measurement model is worth, not what a flight would have been. The flight's notes say so.
 
+Rows that are not finite were not measured: poses and velocities are absent there, and the truth is masked.
+Where the motion capture is blind for longer than the parabolas are wide, no IMU can be had of it.
+
 The camera velocity is late, by about 0.07 s, and its stamps are shifted back. The world of the tags and that
 of the motion capture differ by a fixed shift, which no filter could find: `SHIFT` and `TURN` take one into
 the other. They were fitted to flights 1 and 4 together (each alone gives the same within 5 mm); frame=raw
@@ -35,6 +38,7 @@ from flowgraph.blocks.datasets.shape import (
     imu_noise,
     known,
     number,
+    present,
     split_argument,
     stream_settings,
 )
@@ -99,8 +103,10 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     frame = chosen(given, "frame", ("registered", "raw"), "rob6213")
     file, csv = split_argument(argument, "rob6213:FILE[:CSV]")
     content = read_structs(file, "time", "position", "angle", "linearVel", "angVel")
-    seconds = columns_of(content, "time", file)
-    table = {n: columns_of(content, n, file, 3) for n in ("position", "angle", "linearVel", "angVel")}
+    seconds = columns_of(content, "time", file, gaps=True)
+    table = {
+        n: columns_of(content, n, file, 3, gaps=True) for n in ("position", "angle", "linearVel", "angVel")
+    }
     for name, values in table.items():
         if len(values) != len(seconds):
             raise DataError(
@@ -110,21 +116,25 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
                 got=str(len(values)),
                 fix="restore the file",
             )
-    keep, notes = strictly_later(seconds, "time", file)
-    position = table["position"][keep]
-    attitude = np.asarray(quaternion_from_angles(table["angle"][keep], order="zyx", xp=np))
+    made = Recording(file.stem, kind="rob6213", given=given, place=str(file))
+    notes, absent = made.notes, made.info["absent"]
+    stamped = _stamped(seconds, file, notes)
+    seconds, table = seconds[stamped], {name: values[stamped] for name, values in table.items()}
+    keep, late = strictly_later(seconds, "time", file)
+    notes += late
+    seen = np.concatenate([table["position"], table["angle"]], axis=1)[keep]
+    moved = np.concatenate([table["linearVel"], table["angVel"]], axis=1)[keep]
+    stamps = Series.from_seconds(seconds[keep], seconds[keep]).time
+    time, seen = present("pose", str(file), stamps, _finite(seen), notes, absent)
+    position = seen[:, :3]
+    attitude = np.asarray(quaternion_from_angles(seen[:, 3:], order="zyx", xp=np))
     if frame == "registered":
         position, attitude = _registered(position, attitude)
         sentence = f"poses taken into the motion capture's frames: shift {SHIFT} m, turn {TURN:g} rad"
         notes.append(note("info", sentence))
-    pose = Series.from_seconds(seconds[keep], as_measurements(position, attitude), name="pose")
-    motion = Series(
-        pose.time, CameraMotion(velocity=table["linearVel"][keep], rate=table["angVel"][keep]), name="motion"
-    )
-    made = Recording(file.stem, kind="rob6213", given=given, place=str(file))
-    made.notes += notes
-    notes = made.notes
-    made.take(pose, str(file))
+    made.take(Series(time, as_measurements(position, attitude), name="pose"), str(file))
+    time, moved = present("motion", str(file), stamps, _finite(moved), notes, absent)
+    motion = Series(time, CameraMotion(velocity=moved[:, :3], rate=moved[:, 3:]), name="motion")
     made.info.update(mount=COURSE_MOUNT, **POSE_NOISE)
     truth = None
     csv = csv or _beside(file)
@@ -132,7 +142,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     if csv is None:
         notes.append(note("info", "no motion capture beside the file: no truth and no IMU"))
     else:
-        truth = _truth(csv)
+        truth = _truth(csv, notes, absent)
         window = number(given, "imu.window", 0.11, "rob6213", positive=True)
         derived = derived_imu(truth, window)
         notes.append(note("info", "imu: derived from the motion capture, not recorded"))
@@ -162,7 +172,23 @@ def _beside(file: Path) -> Path | None:
     return csv if csv is not None and csv.is_file() else None
 
 
-def _truth(file: Path) -> Series:
+def _finite(table: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(table), table, np.nan)
+
+
+def _stamped(seconds: np.ndarray, file: Path, notes: list[str]) -> np.ndarray:
+    """Which rows have a stamp; a note on the others."""
+    known = np.isfinite(seconds)
+    if not known.all():
+        many = int((~known).sum())
+        notes.append(
+            note("skipped", f"{file.name}: {many} of {len(seconds)} stamps are not finite: rows left out")
+        )
+    return known
+
+
+def _truth(file: Path, notes: list[str], absent: dict[str, int]) -> Series:
+    """The motion capture; rows that are not finite are masked."""
     if not file.is_file():
         raise DataError(
             "the motion capture is missing",
@@ -175,31 +201,38 @@ def _truth(file: Path) -> Series:
     try:
         if "".join(lines[:1]).replace(" ", "") != _COLUMNS:
             raise ValueError("another heading: " + "".join(lines[:1])[:60])
-        x = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
-        if x.ndim != 2 or x.shape[1] != 13 or not np.isfinite(x).all() or len(x) < 20:
-            raise ValueError(f"shape {x.shape}, or numbers that are not finite")
-        if not (np.diff(x[:, 0]) > 0.0).all():
-            row = int(np.flatnonzero(~(np.diff(x[:, 0]) > 0.0))[0])
-            raise ValueError(f"line {row + 3}: time does not increase")
+        x = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines[1:]])
+        known = np.isfinite(x)
+        if x.ndim != 2 or x.shape[1] != 13 or known.all(axis=1).sum() < 20:
+            raise ValueError(f"shape {x.shape}, or too few rows that are finite")
+        numbers = np.flatnonzero(known[:, 0])
+        if not (np.diff(x[numbers, 0]) > 0.0).all():
+            row = int(np.flatnonzero(~(np.diff(x[numbers, 0]) > 0.0))[0])
+            raise ValueError(f"line {numbers[row + 1] + 2}: time does not increase")
     except ValueError as error:
         raise DataError(
             "this is no motion capture of the family",
             path=str(file),
-            expected=f"at least 20 rows of {_COLUMNS}, times increasing",
+            expected=f"at least 20 finite rows of {_COLUMNS}, times increasing",
             got=str(error),
             fix="restore the file",
         ) from error
-    q = np.asarray(quaternion_from_angles(x[:, 4:7], order="zxy", xp=np))
-    truth = MotionTruth(position=x[:, 1:4], velocity=x[:, 7:10], attitude=q, rate=x[:, 10:13])
-    return Series.from_seconds(x[:, 0], truth, name="truth")
+    x = x[_stamped(x[:, 0], file, notes)]
+    time = Series.from_seconds(x[:, 0], x[:, 0]).time
+    time, x = present("truth", str(file), time, _finite(x[:, 1:]), notes, absent)
+    q = np.asarray(quaternion_from_angles(x[:, 3:6], order="zxy", xp=np))
+    truth = MotionTruth(position=x[:, :3], velocity=x[:, 6:9], attitude=q, rate=x[:, 9:12])
+    return Series(time, truth, name="truth", gaps=True)
 
 
 def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
     """The IMU (no bias, no noise of its own) that a motion capture implies, at `rate` Hz.
 
     specific force = R^T (d^2 p / dt^2 - g), and the rate is what turns R. Both come from parabolas fitted to
-    `window` seconds around each time (Savitzky and Golay, Analytical Chemistry 36, 1964).
+    `window` seconds around each time (Savitzky and Golay, Analytical Chemistry 36, 1964). Where the motion
+    capture has no finite row for longer than that, and half a window on either side, there is none.
     """
+    truth = truth[np.isfinite(truth["position"]).all(axis=1)]
     step = round(1e9 / rate)
     time = np.arange(truth.time[0], truth.time[-1] + 1, step)
     size = max(round(window * rate) | 1, 5)
@@ -211,4 +244,9 @@ def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
     between = savgol_filter(steps, size, 2, axis=0)
     gyro = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
     force = turns.inv().apply(acceleration - np.asarray(GRAVITY))
-    return Series(time, Imu(gyro=gyro, specific_force=force), name="imu")
+    imu = Series(time, Imu(gyro=gyro, specific_force=force), name="imu")
+    blind = np.flatnonzero(np.diff(truth.time) > round(window * 1e9))
+    half = round(0.5 * window * 1e9)
+    for k in blind.tolist():
+        imu = imu[(imu.time <= truth.time[k] - half) | (imu.time >= truth.time[k + 1] + half)]
+    return imu

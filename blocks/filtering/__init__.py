@@ -7,7 +7,9 @@ of those that believe in a Gaussian. Everything that a user's own filter needs i
 
 from __future__ import annotations
 
-from flowgraph.blocks.filtering.banks import Interacting, imm
+from flowgraph.blocks.filtering.ageing import AgedMotion, Ageing, doubt_control
+from flowgraph.blocks.filtering.banks import Interacting, imm, mmae
+from flowgraph.blocks.filtering.ensembles import Ensemble, carry_ensemble, correct_ensemble, ensemble
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
     Extended,
@@ -16,6 +18,13 @@ from flowgraph.blocks.filtering.gaussian import (
     SquareRoot,
     Unscented,
     innovation_log_likelihood,
+)
+from flowgraph.blocks.filtering.information import Information, information
+from flowgraph.blocks.filtering.marginal import (
+    Marginal,
+    carry_conditional,
+    rao_blackwellized,
+    weigh_conditional,
 )
 from flowgraph.blocks.filtering.methods import (
     Advanced,
@@ -29,17 +38,16 @@ from flowgraph.blocks.filtering.methods import (
     square_root,
     unscented,
 )
-from flowgraph.blocks.filtering.particles import (
+from flowgraph.blocks.filtering.particles import Particles, cloud_size, particles, resample_cloud
+from flowgraph.blocks.filtering.proposals import (
     PROPOSALS,
-    Particles,
     auxiliary_cloud,
     carry_cloud,
-    cloud_size,
     guide_cloud,
-    particles,
-    resample_cloud,
-    weigh_cloud,
+    propose_cloud,
 )
+from flowgraph.blocks.filtering.towards import find_cloud_back
+from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import Gaussian
@@ -69,24 +77,40 @@ __all__ = [
     "Gaussian",
     "filtered",
     "first",
+    "Ageing",
+    "AgedMotion",
+    "doubt_control",
     "FirstMeasurement",
     "linear",
     "extended",
+    "information",
+    "Information",
+    "ensemble",
+    "Ensemble",
+    "carry_ensemble",
+    "correct_ensemble",
+    "rao_blackwellized",
+    "Marginal",
+    "carry_conditional",
+    "weigh_conditional",
     "square_root",
     "unscented",
     "cubature",
     "SigmaPoints",
     "imm",
+    "mmae",
     "Interacting",
     "particles",
     "PROPOSALS",
     "Particles",
     "carry_cloud",
     "guide_cloud",
+    "propose_cloud",
     "auxiliary_cloud",
     "weigh_cloud",
     "resample_cloud",
     "cloud_size",
+    "find_cloud_back",
     "Method",
     "Advanced",
     "Seen",

@@ -7,12 +7,14 @@ motion i becomes j over a step. Before each prediction the filters are mixed,
     x_j = sum_i mu_i|j x_i     P_j = sum_i mu_i|j (P_i + (x_i minus x_j)(x_i minus x_j)^T)
 
 each predicts with its own motion and corrects, and a measurement weighs them, mu_j = c_j p(z | x_j) / sum.
-With no transitions this is a bank of independent filters, of which one wins (multiple model adaptive
-estimation). The belief is the mixture's mean and covariance. Over no time nothing goes over.
+In a bank of independent filters nothing goes over: c_j = mu_j, and none is mixed. One of the motions is then
+the true one from first to last, and wins (multiple model adaptive estimation). The belief is the mixture's
+mean and covariance. Over no time nothing goes over.
 
-Source: H. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for systems with Markovian
-switching coefficients", IEEE TAC 33(8), 1988; Y. Bar-Shalom et al., "Estimation with Applications to Tracking
-and Navigation", 2001, sec. 11.6.6.
+Source: D. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10(4), 1965
+(independent filters); H. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for systems with
+Markovian switching coefficients", IEEE TAC 33(8), 1988; Y. Bar-Shalom et al., "Estimation with Applications
+to Tracking and Navigation", 2001, sec. 11.6.6.
 """
 
 from __future__ import annotations
@@ -35,15 +37,15 @@ from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import When
 
-__all__ = ["Interacting", "imm"]
+__all__ = ["Interacting", "imm", "mmae"]
 
 
 @dataclass(frozen=True)
 class Interacting(GaussianMethod):
-    """The interacting multiple model filter; see `imm`."""
+    """The interacting multiple model filter, and without transitions a bank of filters; see `imm`, `mmae`."""
 
     motions: tuple[Motion, ...]
-    transition: npt.NDArray[np.float64]
+    transition: npt.NDArray[np.float64] | None
     weights: npt.NDArray[np.float64]
     maths: GaussianMethod
 
@@ -73,19 +75,29 @@ class Interacting(GaussianMethod):
 
     def predicted(self, kept: Bank, control: Any, motion: Motion, dt: Any, xp: Any) -> Bank:
         kind, n = kept.weight.dtype, len(self.motions)
+        if self.transition is None:
+            each = [Gaussian(mean=kept.mean[j, :], covariance=kept.covariance[j, ...]) for j in range(n)]
+            return self._moved(each, kept.weight, control, dt, xp)
         passed = xp.asarray(dt, dtype=kind) > 0.0
         p = xp.where(passed, xp.asarray(self.transition, dtype=kind), xp.eye(n, dtype=kind))
         joint = p * kept.weight[:, None]
         weight = xp.sum(joint, axis=0)
         share = joint / xp.where(weight > 0.0, weight, 1.0)
-        means, covariances = [], []
+        mixed = []
         for j, own in enumerate(self.motions):
             mean, P = _mixed(kept.mean, kept.covariance, share[:, j], own.space, xp)
             mean, P = xp.where(passed, mean, kept.mean[j, :]), xp.where(passed, P, kept.covariance[j, ...])
-            found = self.maths.predicted(Gaussian(mean=mean, covariance=P), control, own, dt, xp)
-            means.append(found.mean)
-            covariances.append(found.covariance)
-        return Bank(weight=weight, mean=xp.stack(means), covariance=xp.stack(covariances))
+            mixed.append(Gaussian(mean=mean, covariance=P))
+        return self._moved(mixed, weight, control, dt, xp)
+
+    def _moved(self, each: Sequence[Gaussian], weight: Array, control: Any, dt: Any, xp: Any) -> Bank:
+        """Each belief after its own motion."""
+        found = [
+            self.maths.predicted(belief, control, own, dt, xp)
+            for belief, own in zip(each, self.motions, strict=True)
+        ]
+        mean, P = xp.stack([one.mean for one in found]), xp.stack([one.covariance for one in found])
+        return Bank(weight=weight, mean=mean, covariance=P)
 
     def corrected(
         self, kept: Bank, message: Any, measurement: Measurement, gate: float | None, xp: Any
@@ -150,7 +162,7 @@ def imm(
     Args:
         motions: two or more, over one state, with one kind of control.
         transition: (k, k), the chance that motion i (row) becomes j (column) over a step; 0.95 to stay, and
-            the rest shared by the others, if left out. The identity makes a bank of independent filters.
+            the rest shared by the others, if left out.
         weights: (k), of each motion at first; equal if left out.
         method: of each filter: linear, extended, unscented or cubature; extended if left out.
 
@@ -161,26 +173,59 @@ def imm(
     stay = np.full((k, k), 0.05 / max(k - 1, 1))
     np.fill_diagonal(stay, 0.95)
     p = stay if transition is None else np.array(transition, dtype=float)
+    if k < 2 or p.shape != (k, k) or (p < 0.0).any() or not np.allclose(p.sum(axis=1), 1.0):
+        raise _no_bank("imm", k, f"transition {p.tolist()}")
+    p.flags.writeable = False
+    return _bank("imm", motions, p, weights, method)
+
+
+def mmae(*motions: Motion, weights: npt.ArrayLike | None = None, method: Method | None = None) -> Method:
+    """A bank of independent filters, one a motion, of which one is the true one: multiple model adaptive
+    estimation, of parameters such as a density of noise.
+
+        filtered(walk, {gps: fix}, method=mmae(walk, run))
+
+    A motion that has lost does not come back; where the truth may go over from one to another, take `imm`.
+
+    Args:
+        motions, weights, method: as in `imm`.
+
+    Raises:
+        DeclarationError: where these do not fit together.
+    """
+    return _bank("mmae", motions, None, weights, method)
+
+
+def _no_bank(path: str, k: int, got: str) -> DeclarationError:
+    return DeclarationError(
+        "this is no bank of motions",
+        path=path,
+        expected="k > 1 motions; transition (k, k), whose rows add up to 1, and weights (k) that do",
+        got=f"{k} motions, {got}",
+        fix="write imm(walk, drive, transition=[[0.97, 0.03], [0.03, 0.97]]), or mmae(walk, drive)",
+    )
+
+
+def _bank(
+    path: str,
+    motions: tuple[Motion, ...],
+    transition: npt.NDArray[np.float64] | None,
+    weights: npt.ArrayLike | None,
+    method: Method | None,
+) -> Method:
+    k = len(motions)
     w = np.full(k, 1.0 / max(k, 1)) if weights is None else np.array(weights, dtype=float)
-    shares = p.shape == (k, k) and w.shape == (k,) and (p >= 0.0).all() and (w >= 0.0).all()
-    if k < 2 or not shares or not np.allclose(p.sum(axis=1), 1.0) or not np.isclose(w.sum(), 1.0):
-        raise DeclarationError(
-            "this is no bank of motions",
-            path="imm",
-            expected="k > 1 motions; transition (k, k), whose rows add up to 1, and weights (k) that do",
-            got=f"{k} motions, transition {p.tolist()}, weights {w.tolist()}",
-            fix="write imm(walk, drive, transition=[[0.97, 0.03], [0.03, 0.97]])",
-        )
+    if k < 2 or w.shape != (k,) or (w < 0.0).any() or not np.isclose(w.sum(), 1.0):
+        raise _no_bank(path, k, f"weights {w.tolist()}")
     inner = extended() if method is None else method
     kept_plainly = isinstance(inner, GaussianFilter) and type(inner.maths).begin is GaussianMethod.begin
     if not isinstance(inner, GaussianFilter) or not kept_plainly:
         raise DeclarationError(
             "the filters of a bank keep a mean and a covariance",
-            path="imm.method",
+            path=f"{path}.method",
             expected="linear(), extended(), unscented() or cubature()",
             got=repr(method),
-            fix="write imm(..., method=extended())",
+            fix=f"write {path}(..., method=extended())",
         )
-    for array in (p, w):
-        array.flags.writeable = False
-    return GaussianFilter(Interacting(motions, p, w, inner.maths))
+    w.flags.writeable = False
+    return GaussianFilter(Interacting(motions, transition, w, inner.maths))

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph import Array, Stream, block, collect, delay, latest, when
+from flowgraph.blocks.filtering.ageing import Ageing, aged_motion, doubt_control
 from flowgraph.blocks.filtering.methods import Advanced, Method, Seen, believed, extended
 from flowgraph.blocks.kalman.lost import PATIENCE
 from flowgraph.blocks.signals import Gaussian
@@ -62,6 +63,7 @@ def filtered(
     start: Gaussian | FirstMeasurement,
     control: Stream[Any] | None = None,
     control_at_first: Any = None,
+    held: Ageing | None = None,
     method: Method | None = None,
     gate: float | None = None,
     patience: int = PATIENCE,
@@ -80,6 +82,8 @@ def filtered(
             from the first message.
         control: the stream of controls, each held until the next; None for a motion that has none.
         control_at_first: before the first control came; zeros if left out.
+        held: from which age on a control that is held is doubted, and how fast: `Ageing(after, spread)`; one
+            that is held counts as fresh if left out.
         method: `extended()`, `unscented()`, `particles(1000)`, ...; extended if left out.
         gate: as in `update_linear`: below 1 the probability with which an honest measurement passes, from 1
             on the largest NIS. Refused measurements change nothing.
@@ -98,13 +102,16 @@ def filtered(
     ticks = functools.reduce(operator.or_, (clock_of(s) for s in streams))
     rest = motion.space.resting() if isinstance(start, FirstMeasurement) else _fitting(start, motion)
     with builder("filtered").scope(name, given=name != "filter"):
-        held = None
+        last = None
         if control is not None:
             at_first = zeros(control.type) if control_at_first is None else control_at_first
-            held = latest(control, init=at_first, at=ticks, name="control")
+            last = latest(control, init=at_first, at=ticks, name="control")
+            if held is not None:
+                last = doubt_control(last, control, ageing=held, at=ticks, name="doubt")
+                motion = aged_motion(motion, control.type, held)
         initial = method.begin(rest, motion, NumpyDraw("start", seed_words(method.seed), 0), np)
         kept = delay(initial, name="belief")
-        found = method.advance(kept, held, motion, seen, at=ticks, gate=gate, patience=patience)
+        found = method.advance(kept, last, motion, seen, at=ticks, gate=gate, patience=patience)
         if isinstance(start, FirstMeasurement):
             found = _from_first(found, start, seen, initial, motion, method)
         kept.feed(found.kept)

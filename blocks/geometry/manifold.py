@@ -283,16 +283,24 @@ class StateSpace:
         """
         if self._reset_table is None:
             return None
-        table = xp.asarray(self._reset_table, dtype=d.dtype)
-        turned = xp.reshape(d @ table, (*d.shape[:-1], self.tangent, self.tangent))
+        table, turning = self._reset_table
+        parts = [d[..., on] for on in turning]  # the others leave the error as it is
+        d = parts[0] if len(parts) == 1 else xp.concat(parts, axis=-1)
+        turned = d @ xp.asarray(table, dtype=d.dtype)
+        turned = xp.reshape(turned, (*d.shape[:-1], self.tangent, self.tangent))
         return turned + xp.eye(self.tangent, dtype=d.dtype)
 
     @functools.cached_property
-    def _reset_table(self) -> np.ndarray | None:
-        """(tangent, tangent^2): maps d to the sum of what the parts say."""
+    def _reset_table(self) -> tuple[np.ndarray, list[slice]] | None:
+        """(k, tangent^2): maps the k numbers of d that turn an error to the sum of what their parts say, and
+        where those stand in d."""
         table = np.zeros((self.tangent, self.tangent, self.tangent))
         known = [(part.reset_table(), on) for part, _, on in self.places()]
         for own, on in known:
             if own is not None:
                 table[on, on, on] = own
-        return None if all(own is None for own, _ in known) else table.reshape(self.tangent, -1)
+        turning = [on for own, on in known if own is not None]
+        if not turning:
+            return None
+        flat = table.reshape(self.tangent, -1)
+        return np.concatenate([flat[on] for on in turning]), turning

@@ -17,11 +17,10 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from flowgraph import Array, block
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
     from_rotation_vector,
@@ -30,7 +29,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import accepts, masked
+from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
 __all__ = ["aid_attitude", "aid_position"]
@@ -42,18 +41,8 @@ ORIGIN = (0.0, 0.0, 0.0)
 ALIGNED = (1.0, 0.0, 0.0, 0.0)
 
 
-def _reset_table() -> np.ndarray:
-    """(3, 225): maps an attitude correction d to -skew(d)/2 in the attitude block of a 15 x 15 matrix."""
-    table = np.zeros((3, 15, 15))
-    table[0, 7, 8], table[0, 8, 7] = 0.5, -0.5
-    table[1, 8, 6], table[1, 6, 8] = 0.5, -0.5
-    table[2, 6, 7], table[2, 7, 6] = 0.5, -0.5
-    flat = table.reshape(3, 225)
-    flat.flags.writeable = False
-    return flat
-
-
-_RESET = _reset_table()
+STATE = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6))
+"""Of a belief with biases, and of its errors."""
 
 
 @block
@@ -160,48 +149,38 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
     return to_rotation_vector(multiply(conjugate(q, xp=xp), measured, xp=xp), xp=xp)
 
 
+class _Group(NamedTuple):
+    """The error as one of the group SE_2(3), at an attitude: that of position and velocity turns with it."""
+
+    attitude: Array
+
+    def reset(self, d: Array, xp: Any) -> Array:
+        """The Jacobian (15, 15) of the error when the state moves by d, as `StateSpace.reset` gives it."""
+        _, swing = _carried(self.attitude, d[..., 6:9], xp)
+        none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=d.dtype)
+        diagonal = (swing, swing, stay, stay, stay)
+        rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
+        return xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+
+
 def _correct(
     prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
 ) -> tuple[Belief, KalmanInnovation]:
-    """The update every measurement shares: the posterior and the innovation, of the known entries."""
-    P = prior.covariance
-    present = ~xp.isnan(apart)
-    residual = xp.where(present, apart, 0.0)
-    H, R = masked(H, R, present, xp)
-    HP = H @ P
-    S = HP @ H.mT + R
-    column = residual[..., None]
-    solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
-    nis = (column.mT @ solved[..., 15:])[..., 0, 0]
-    accepted = accepts(nis, gate, present, xp)
-    K = solved[..., :15].mT
-    if gate is not None:
-        K = K * xp.astype(accepted, K.dtype)[..., None, None]
-    d = (K @ column)[..., 0]
-    turn = d[..., 6:9]
+    """The correction that every Kalman filter shares, folded into the nominal state."""
+    space = _Group(prior.attitude) if invariant else STATE
+    found = correct(prior.covariance, apart, H, R, gate=gate, space=space, xp=xp)
+    d, turn = found.shift, found.shift[..., 6:9]
+    to_place, to_speed = d[..., 0:3], d[..., 3:6]
     if invariant:
-        push, swing = _carried(prior.attitude, turn, xp)
-        moved = push @ xp.concat([d[..., 0:3, None], d[..., 3:6, None]], axis=-1)
+        push, _ = _carried(prior.attitude, turn, xp)
+        moved = push @ xp.concat([to_place[..., None], to_speed[..., None]], axis=-1)
         to_place, to_speed = moved[..., 0], moved[..., 1]
-        none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=P.dtype)
-        diagonal = (swing, swing, stay, stay, stay)
-        rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
-        reset = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
-    else:
-        to_place, to_speed = d[..., 0:3], d[..., 3:6]
-        one = xp.eye(15, dtype=P.dtype)
-        reset = xp.reshape(turn @ xp.asarray(_RESET, dtype=P.dtype), (*d.shape[:-1], 15, 15)) + one
-    gain = reset @ K
-    A = reset - gain @ H
-    P = A @ P @ A.mT + gain @ R @ gain.mT
     posterior = Belief(
         position=prior.position + to_place,
         velocity=prior.velocity + to_speed,
         attitude=multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
         gyro_bias=prior.gyro_bias + d[..., 9:12],
         accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],
-        covariance=0.5 * (P + P.mT),
+        covariance=found.covariance,
     )
-    parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
-    innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
-    return posterior, innovation
+    return posterior, found.innovation

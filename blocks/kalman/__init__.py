@@ -20,7 +20,19 @@ from flowgraph.blocks.kalman.filters import (
 )
 from flowgraph.blocks.kalman.learned import learned_noise, update_learned
 from flowgraph.blocks.kalman.linear import LinearModel
-from flowgraph.blocks.kalman.lost import PATIENCE, Held, aged, bridge, bridged, find_back, stay
+from flowgraph.blocks.kalman.lost import (
+    FARTHEST,
+    PATIENCE,
+    UNKNOWN_TURN,
+    Held,
+    aged,
+    bridge,
+    bridged,
+    find_back,
+    in_doubt,
+    lost_variances,
+    stay,
+)
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.robust import Robust, huber, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
@@ -36,13 +48,17 @@ __all__ = [
     "update_learned",
     "noise_matrix",
     "observation_matrix",
+    "FARTHEST",
     "PATIENCE",
+    "UNKNOWN_TURN",
     "Held",
     "aged",
     "bridge",
     "bridged",
     "stay",
     "find_back",
+    "in_doubt",
+    "lost_variances",
     "covariance_root",
     "LinearModel",
     "Correction",

@@ -15,7 +15,7 @@ Source: Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to T
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,13 @@ __all__ = [
 
 Vector = Annotated[Any, real("m")]
 """A control or a measurement: m real numbers."""
+
+
+class Resets(Protocol):
+    """What says how an error turns when its state is moved: a `StateSpace`, for one."""
+
+    def reset(self, d: Array, xp: Any) -> Array | None:
+        """The Jacobian (..., t, t) of the error when the state moves by d (..., t); None where it is I."""
 
 
 class Correction(NamedTuple):
@@ -158,7 +165,7 @@ def correct(
     *,
     present: Array | None = None,
     gate: float | None = None,
-    space: StateSpace | None = None,
+    space: Resets | None = None,
     robust: Robust | None = None,
     xp: Any,
 ) -> Correction:
@@ -170,7 +177,8 @@ def correct(
         H: Jacobian (..., m, t).
         R: covariance of the noise (..., m, m).
         present: (..., m) which entries there are; None: all.
-        gate, space, robust: as in `update_linear`. The innovation is that of the noise as it was told.
+        gate, robust: as in `update_linear`. The innovation is that of the noise as it was told.
+        space: of the state, or what else says how the error turns when the state is corrected.
     """
     if present is None:
         present = ~xp.isnan(residual)
@@ -186,12 +194,16 @@ def correct(
     if robust is not None:
         R = reweighted(robust, HP @ H.mT, residual, R, parts, xp)
         solved = xp.linalg.solve(HP @ H.mT + R, xp.concat([HP, column], axis=-1))
-    K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
+    K = solved[..., :-1].mT
+    if gate is not None:
+        K = K * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
-    rest = xp.eye(P.shape[-1], dtype=P.dtype) - K @ H
-    if turn is not None:
-        rest, K = turn @ rest, turn @ K
+    if turn is None:
+        turn = xp.eye(P.shape[-1], dtype=P.dtype)
+    else:
+        K = turn @ K
+    rest = turn - K @ H
     innovation = KalmanInnovation(
         residual=residual,
         covariance=S,

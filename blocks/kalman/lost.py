@@ -1,24 +1,52 @@
 """A filter that has lost track: what it is told when its control is old, and how its gate opens again.
 
 `bridge` makes a prior less sure when the control that drove it is old. `find_back` makes a belief less sure
-when a gate has refused a run of measurements, until one passes: then the belief is all but that measurement.
-Both change the covariance alone, of any belief that has one. `stay` leaves a belief of any kind where it was
-over a step that is no step but a jump of the stamps. All do nothing while all is well.
+when a gate has refused a run of measurements, so that the next one passes. Both change the covariance alone,
+of any belief that has one. `stay` leaves a belief of any kind where it was over a step that is no step but a
+jump of the stamps. All do nothing while all is well. Whether track is lost is told by `in_doubt`, of Gaussian
+beliefs and of clouds alike.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowgraph import Array, block
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.metrics.consistency import IN_A_ROW
 
-__all__ = ["PATIENCE", "Held", "aged", "bridge", "bridged", "find_back", "stay"]
+__all__ = [
+    "FARTHEST",
+    "GROWN",
+    "PATIENCE",
+    "UNKNOWN_TURN",
+    "Held",
+    "aged",
+    "bridge",
+    "bridged",
+    "find_back",
+    "in_doubt",
+    "lost_variances",
+    "stay",
+]
 
 PATIENCE = IN_A_ROW
 """How many refusals in a row are taken for outliers."""
+
+GROWN = 4.0
+"""How many times as large, at least, the deviations of a lost belief become."""
+
+FARTHEST = 1e14
+"""The nis of a measurement of which nothing can be made: it would leave no digit of the covariance."""
+
+REACH = 1e6
+"""m, m/s: the deviation from which on a number of the motion does not grow."""
+
+UNKNOWN_TURN = math.pi / math.sqrt(3.0)
+"""rad: the deviation of an angle of which nothing is known: that of a uniform one."""
 
 PAUSE = 1.0
 """s: a pause of all streams, or a jump of their stamps, makes as unsure as a gap of the control so long."""
@@ -76,7 +104,7 @@ def bridge(  # type: ignore[no-untyped-def]
     *,
     held: Held,
     position: int | None = None,
-    velocity: int,
+    velocity: int | None = None,
     attitude: int | None = None,
     dt: float,
     xp: Any,
@@ -97,8 +125,8 @@ def bridge(  # type: ignore[no-untyped-def]
         control: where there is a fresh one; the age of the one before counts in the step that ends with it.
         held: from which age on, and how fast, it becomes worthless.
         position, velocity, attitude: where these stand in the covariance. An attitude of three numbers is an
-            error in the body or angles; of a belief with ten, it is the quaternion. A position or attitude
-            may be left out.
+            error in the body or angles; of a belief with ten, it is the quaternion. What a belief has not is
+            left out.
 
     State: the age of the control, s.
     """
@@ -107,11 +135,12 @@ def bridge(  # type: ignore[no-untyped-def]
     n = P.shape[-1]
     table = np.zeros((3, n, n))
     one = np.eye(3)
-    v = slice(velocity, velocity + 3)
-    table[0, v, v] = one * held.force**2
-    if position is not None:
-        p = slice(position, position + 3)
-        table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
+    if velocity is not None:
+        v = slice(velocity, velocity + 3)
+        table[0, v, v] = one * held.force**2
+        if position is not None:
+            p = slice(position, position + 3)
+            table[1, p, v] = table[1, v, p] = table[2, p, p] = one * held.force**2
     push = [xp.asarray(part_, dtype=P.dtype) for part_ in table]
     more = push[0] * w + push[1] * (0.5 * part * w) + push[2] * (part * part * w / 3.0)
     if attitude is not None:
@@ -155,36 +184,120 @@ def _fresh(*_: Any, **__: Any) -> Any:
     return np.float64(0.0)
 
 
-@block
-def find_back(state, posterior: Any, innovation: Any | None, *, patience: int, moving: int, xp: Any):  # type: ignore[no-untyped-def]
-    """Doubt a belief whose gate refuses one measurement after the other.
+def in_doubt(
+    state: Array, near: Array, nis: Array, parts: Array, *, patience: float, xp: Any
+) -> tuple[Array, Array, Array]:
+    """Whether a belief has lost track, of how it foretold a measurement and those before.
 
-    The first `patience` refusals in a row change nothing: they may be outliers. From then on each makes the
-    deviations of the first `moving` numbers, those of the motion, four times as large and keeps their
-    correlations, while biases keep what they know. The covariance so grows until a measurement passes, and
-    the motion is then that which was measured. A measurement that passes ends the run.
+    The first `patience` measurements in a row that are too far off are taken for outliers. The next shows
+    that track is lost, and so on until one is near; and as one correction may not mend an error so large, the
+    next one after it that is far shows it again: only two in a row are trusted.
 
     Args:
-        posterior: any belief with a `covariance`, or its `root`, after the correction.
+        state: how many were too far off in a row; `patience` after one that was near in doubt.
+        near: whether this one is as near as expected.
+        nis, parts: of its innovation.
+        patience: how many in a row are taken for outliers.
+
+    Returns:
+        The next state; whether track is lost, which a nis beyond `FARTHEST` does not tell; and by what the
+        variances must then grow, nis over parts and at least `GROWN` squared, else 1.
+    """
+    wait = 0.0 * state + patience
+    count = xp.where(near, xp.where(state > wait, wait, 0.0 * state), state + 1.0)
+    usable = nis < FARTHEST
+    lost = (count > wait) & usable
+    ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
+    return count, lost, xp.where(lost, xp.maximum(ratio, 0.0 * ratio + GROWN**2), 1.0)
+
+
+@block
+def find_back(  # type: ignore[no-untyped-def]
+    state,
+    posterior: Any,
+    innovation: Any | None,
+    *,
+    patience: int,
+    moving: int | tuple[int, int],
+    attitude: int | None = None,
+    shown: bool = True,
+    xp: Any,
+):
+    """Doubt a belief whose gate refuses one measurement after the other.
+
+    After `patience` refusals in a row the motion is lost (`in_doubt`). The deviations of its numbers then
+    become as many times as large as the residual was than expected, so that a like measurement passes,
+
+        s' = s max(4, sqrt(nis / m))        for a measurement of m numbers
+
+    and they are correlated with nothing any more: what they told of each other was of another error. Numbers
+    that do not move, such as biases, keep what they know. An attitude becomes at most as unsure as one of
+    which nothing is known, everything else as `REACH`.
+
+    Args:
+        posterior: any belief with a `covariance`, its `root` or `information`, after the correction.
         innovation: of that correction, where there was one.
         patience: how many refusals in a row are taken for outliers.
-        moving: how many numbers of the covariance, from the first on, may have lost track.
+        moving: how many numbers of the covariance, from the first on, may have lost track; or from which on
+            to before which.
+        attitude: where an attitude stands in the covariance, as in `bridge`.
+        shown: whether the measurement shows that attitude. Where it does not, the others are blamed first,
+            and the attitude's deviations become only four times as large.
 
-    State: how many measurements were refused in a row.
+    State: that of `in_doubt`.
     """
     if innovation is None:
         return state, posterior
-    on_root = "root" in posterior._fields
-    P = posterior.root if on_root else posterior.covariance
-    refused = 1.0 - xp.astype(innovation.accepted, P.dtype)
-    count = (state + refused) * refused
-    lost = xp.astype(count > float(patience), P.dtype)
-    moved = np.zeros(P.shape[-1])
-    moved[:moving] = 1.0
-    scale = 1.0 + 3.0 * xp.asarray(moved, dtype=P.dtype) * lost
+    on_root, inverse = "root" in posterior._fields, "information" in posterior._fields
+    kept = posterior.root if on_root else posterior.information if inverse else posterior.covariance
+    kind, n = kept.dtype, kept.shape[-1]
+    count, lost, grow = in_doubt(
+        state, innovation.accepted, innovation.nis, innovation.parts, patience=float(patience), xp=xp
+    )
+    one = xp.eye(n, dtype=kind)
+    P = kept @ kept.mT if on_root else xp.linalg.solve(kept, one) if inverse else kept
+    variance = xp.sum(P * one, axis=-1)
+    wide = lost_variances(variance, grow, moving=moving, attitude=attitude, shown=shown, xp=xp)
+    inside = _inside(n, moving)
+    apart = xp.asarray(np.where(inside[:, None] | inside, np.eye(n), 1.0), dtype=kind)
+    doubted = P * apart + one * (wide - variance)[..., :, None]
+    lost = lost[..., None, None]
     if on_root:
-        return count, posterior.replace(root=P * scale[..., :, None])
-    return count, _with(posterior, P * scale[..., :, None] * scale[..., None, :])
+        return count, posterior.replace(root=xp.where(lost, covariance_root(doubted, xp=xp), kept))
+    if inverse:
+        return count, posterior.replace(information=xp.where(lost, xp.linalg.solve(doubted, one), kept))
+    return count, _with(posterior, xp.where(lost, doubted, P))
+
+
+def lost_variances(
+    variance: Array,
+    grow: Array,
+    *,
+    moving: int | tuple[int, int],
+    attitude: int | None = None,
+    shown: bool = True,
+    xp: Any,
+) -> Array:
+    """The variances (n) of a belief by what they are, and what `in_doubt` says they must grow by.
+
+    Args:
+        moving, attitude, shown: as in `find_back`.
+    """
+    n = variance.shape[-1]
+    inside = _inside(n, moving)
+    most, blamed = np.where(inside, REACH**2, 0.0), np.ones(n)
+    if attitude is not None:
+        turn = slice(attitude, attitude + (4 if n == 10 else 3))  # a quaternion is of half angles
+        most[turn] = UNKNOWN_TURN**2 * (0.25 if n == 10 else 1.0) * inside[turn]
+        blamed[turn] = float(shown)
+    grow, least = grow[..., None], xp.minimum(grow, 0.0 * grow + GROWN**2)[..., None]
+    grow = xp.asarray(blamed, dtype=variance.dtype) * (grow - least) + least
+    return xp.minimum(grow * variance, xp.maximum(xp.asarray(most, dtype=variance.dtype), variance))
+
+
+def _inside(n: int, moving: int | tuple[int, int]) -> np.ndarray:
+    first, last = moving if isinstance(moving, tuple) else (0, moving)
+    return (np.arange(n) >= first) & (np.arange(n) < last)
 
 
 @find_back.init

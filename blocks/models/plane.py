@@ -55,10 +55,11 @@ def weigh_plane(cloud: PlaneCloud, measured: PlanePosition, *, noise: float, xp:
     """Multiply the weights by the likelihood of z = x + N(0, noise^2 I), and normalise.
 
     Args:
-        measured: z, m.
+        measured: z, m; an entry that is NaN was not measured.
         noise: standard deviation on each axis, m.
     """
     error = measured.position[:, None] - cloud.position
+    error = xp.where(xp.isnan(error), 0.0, error)
     log_weight = cloud.log_weight - xp.sum(error * error, axis=0) * (0.5 / noise**2)
     return cloud.replace(log_weight=log_weight - log_sum_exp(log_weight, xp=xp))
 

@@ -2,7 +2,8 @@
 
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
-on the same sensors, with the same knowledge, so that the two can be compared.
+on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
+sensor does to it.
 """
 
 from __future__ import annotations
@@ -22,15 +23,17 @@ from flowgraph.blocks.outdoor.belief import (
 )
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
-    correct_distance,
-    correct_field,
-    correct_flow,
-    correct_position,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
+)
+from flowgraph.blocks.outdoor.corrections import (
+    correct_distance,
+    correct_field,
+    correct_flow,
+    correct_position,
 )
 from flowgraph.blocks.outdoor.flight import (
     STREAMS,

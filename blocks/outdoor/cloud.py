@@ -9,9 +9,6 @@ in it. Each reading is then a Kalman update of each particle, and weighs it by h
 When a picture is taken, e is drawn from what all readings since the last one have left of it, and the motion
 is conditioned on the draw: the proposal that looks at the readings first, and the least uneven weights.
 
-Each block takes one sensor, passes the cloud through where there is no reading, and leaves the weights
-normalised; so sensors may come in any order, at any time.
-
 Optical flow measures from one picture to the next. Each particle keeps its attitude at the last picture and,
 in its Kalman state, how far it has moved since, which is zero and certain when a picture is taken.
 
@@ -24,7 +21,6 @@ by local linearisation); for the sensors: R. Fiszel's thesis on reactive pose es
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,38 +30,33 @@ from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor.flight import OutdoorStart
-from flowgraph.blocks.particles.cloud import cloud_belief, log_sum_exp, start_cloud
+from flowgraph.blocks.particles.cloud import cloud_belief, start_cloud
 from flowgraph.blocks.signals import (
     Ancestors,
     Cloud,
     Imu,
-    MagneticField,
     OpticalFlow,
     OutdoorCloud,
     PoseBelief,
     PoseEstimate,
-    Position,
-    Range,
     Weights,
 )
 
 __all__ = [
+    "MOVED",
+    "POSITION",
+    "TURN",
+    "VELOCITY",
     "as_cloud",
-    "correct_distance",
-    "correct_field",
-    "correct_flow",
-    "correct_position",
     "outdoor_belief",
     "predict_outdoor",
     "start_outdoor_cloud",
     "take_outdoor_ancestors",
     "take_picture",
+    "turned",
 ]
 
-ORIGIN = (0.0, 0.0, 0.0)
-_VELOCITY, _POSITION, _MOVED, _TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-_LEAST_UPRIGHT = 0.05
-"""cos(tilt) below which a beam along body z does not meet the ground for any practical purpose."""
+VELOCITY, POSITION, MOVED, TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 
 
 def _blocks(entries: dict[tuple[int, int], float]) -> np.ndarray:
@@ -132,7 +123,7 @@ def predict_outdoor(
     attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
     force = lanes.rotate(middle, imu.specific_force, xp=xp)
     step = (force + xp.asarray(gravity, dtype=kind)[:, None]) * dt
-    path = (cloud.motion[_VELOCITY, :] + 0.5 * step) * dt
+    path = (cloud.motion[VELOCITY, :] + 0.5 * step) * dt
     W, W2, W3 = (xp.asarray(table * noise.accelerometer**2, dtype=kind) for table in _WHITE)
     Q = (W + (W2 + W3 * dt) * dt) * dt
     N = xp.asarray(_WHITE_TURN * (0.5 * noise.gyro**2), dtype=kind) * dt
@@ -148,116 +139,10 @@ def predict_outdoor(
 
 def _advanced(A: Array, push: Array, dt: Array, xp: Any) -> Array:
     """F A for each particle: A (12, 12, n), and push (3, n) the force times dt."""
-    v, p, s, e = (A[part, :, :] for part in (_VELOCITY, _POSITION, _MOVED, _TURN))
+    v, p, s, e = (A[part, :, :] for part in (VELOCITY, POSITION, MOVED, TURN))
     step = -lanes.cross(push, e, xp=xp)
     path = (v + 0.5 * step) * dt
     return xp.concat([v + step, p + path, s + path, e], axis=0)
-
-
-@block
-def correct_position(
-    cloud: OutdoorCloud,
-    position: Position | None,
-    *,
-    noise: float,
-    lever: tuple[float, float, float] = ORIGIN,
-    xp: Any,
-) -> OutdoorCloud:
-    """Correct each particle with a measured position: z = p + R lever + N(0, noise^2 I).
-
-    Args:
-        position: z, m, world, of a point fixed to the body; without one the cloud passes through.
-        noise: standard deviation, m.
-        lever: the point in body coordinates, m.
-    """
-    if position is None:
-        return cloud
-    residual = position.position[:, None] - cloud.motion[_POSITION, :]
-    if lever == ORIGIN:
-        return _corrected(cloud, residual, lambda A: A[_POSITION, :, :], noise**2, xp)
-    arm = lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=residual.dtype), xp=xp)
-    seen = lambda A: A[_POSITION, :, :] - lanes.cross(arm, A[_TURN, :, :], xp=xp)
-    return _corrected(cloud, residual - arm, seen, noise**2, xp)
-
-
-@block
-def correct_distance(cloud: OutdoorCloud, distance: Range | None, *, noise: float, xp: Any) -> OutdoorCloud:
-    """Correct each particle with a distance to the ground (world z = 0) along body -z.
-
-        z = p_z / u_z + N(0, noise^2),  u = R (0, 0, 1)
-
-    of which the derivative by e is -p_z / u_z^2 (u_y, -u_x, 0).
-
-    Args:
-        distance: z, m; without one the cloud passes through.
-        noise: standard deviation, m, along the beam.
-    """
-    if distance is None:
-        return cloud
-    up = lanes.rotate(cloud.attitude, xp.asarray([0.0, 0.0, 1.0], dtype=cloud.motion.dtype), xp=xp)
-    h = 1.0 / xp.maximum(up[2, :], _LEAST_UPRIGHT)
-    seen = cloud.motion[5, :] * h
-    lean_x, lean_y = -seen * h * up[1, :], seen * h * up[0, :]
-    P = cloud.covariance
-    across = P[5, :, :] * h + P[9, :, :] * lean_x + P[10, :, :] * lean_y  # (12, n)
-    S = across[5, :] * h + across[9, :] * lean_x + across[10, :] * lean_y + noise**2
-    residual = distance.distance - seen
-    gain = across / S
-    log_likelihood = -0.5 * (residual * residual / S + xp.log(S) + math.log(2.0 * math.pi))
-    return _moved(cloud, gain * residual, P - gain[:, None, :] * across[None, :, :], log_likelihood, xp)
-
-
-@block
-def correct_field(
-    cloud: OutdoorCloud,
-    field: MagneticField | None,
-    *,
-    earth: tuple[float, float, float],
-    noise: float,
-    xp: Any,
-) -> OutdoorCloud:
-    """Correct each particle with a measured magnetic field: z = R^T earth + N(0, noise^2 I).
-
-    Turned into the world by the mean attitude, R z = earth + earth x e + N(0, noise^2 I).
-
-    Args:
-        field: z, T, body; without one the cloud passes through.
-        earth: the field in the world, T.
-        noise: standard deviation of each component, T.
-    """
-    if field is None:
-        return cloud
-    # in units of the noise: squares of tesla are too small for single precision
-    expected = xp.asarray([[m / noise] for m in earth], dtype=cloud.motion.dtype)
-    residual = lanes.rotate(cloud.attitude, field.field / noise, xp=xp) - expected
-    return _corrected(cloud, residual, lambda A: lanes.cross(expected, A[_TURN, :, :], xp=xp), 1.0, xp)
-
-
-@block
-def correct_flow(
-    cloud: OutdoorCloud, flow: OpticalFlow | None, *, displacement: float, turn: float, xp: Any
-) -> OutdoorCloud:
-    """Correct each particle with how the body moved and turned since the last picture.
-
-        displacement = R(q_0)^T s + N(0, displacement^2 I)
-        turn = q_0^-1 Exp(e) q * Exp(N(0, turn^2 I)),  so that  Log(q_0 turn q^-1) = e + N(0, turn^2 I)
-
-    q_0 is the particle's attitude at the last picture and s its displacement since.
-
-    Args:
-        flow: over the time since the reading before it, or since the start; without one the cloud passes
-            through.
-        displacement, turn: standard deviations, m and rad.
-    """
-    if flow is None:
-        return cloud
-    moved = lanes.rotate(cloud.picture, flow.displacement, xp=xp) - cloud.motion[_MOVED, :]
-    cloud = _corrected(cloud, moved, lambda A: A[_MOVED, :, :], displacement**2, xp)
-    back = cloud.picture * xp.asarray([[1.0], [-1.0], [-1.0], [-1.0]], dtype=moved.dtype)
-    own = lanes.multiply(back, cloud.attitude, xp=xp)
-    error = lanes.rotation_vectors_to(own, flow.turn, xp=xp)  # in the body
-    error = xp.sum(lanes.rotation_matrices(cloud.attitude, xp=xp) * error[None, :, :], axis=1)
-    return _corrected(cloud, error, lambda A: A[_TURN, :, :], turn**2, xp)
 
 
 @block
@@ -284,7 +169,7 @@ def take_picture(cloud: OutdoorCloud, flow: OpticalFlow | None, *, draw: Any, xp
         state = state + c * deviations[k, :]
         P = P - c[:, None, :] * c[None, :, :]
     kept = xp.asarray(_KEPT, dtype=P.dtype)
-    attitude = _turned(cloud.attitude, state[_TURN, :], xp)
+    attitude = turned(cloud.attitude, state[TURN, :], xp)
     return cloud.replace(
         attitude=attitude,
         picture=attitude,
@@ -293,41 +178,7 @@ def take_picture(cloud: OutdoorCloud, flow: OpticalFlow | None, *, draw: Any, xp
     )
 
 
-def _corrected(
-    cloud: OutdoorCloud, residual: Array, seen: Callable[[Array], Array], variance: float, xp: Any
-) -> OutdoorCloud:
-    """The Kalman update and the weights for residual (3, n) = H x + N(0, variance I), where `seen` applies H.
-
-    seen: H A (3, m, n) of A (12, m, n).
-    """
-    across = seen(cloud.covariance)  # (3, 12, n)
-    own = seen(lanes.transpose(across, xp=xp))
-    own = own + xp.asarray((np.eye(3) * variance)[:, :, None], dtype=residual.dtype)
-    inverse, determinant = lanes.inverse_and_determinant(own, xp=xp)
-    u = xp.sum(inverse * residual[None, :, :], axis=1)
-    solved = sum(inverse[:, k, None, :] * across[None, k, :, :] for k in range(3))  # (3, 12, n)
-    less = sum(across[k, :, None, :] * solved[k, None, :, :] for k in range(3))
-    log_likelihood = -0.5 * (
-        xp.sum(residual * u, axis=0) + xp.log(determinant) + 3.0 * math.log(2.0 * math.pi)
-    )
-    state = xp.sum(across * u[:, None, :], axis=0)
-    return _moved(cloud, state, cloud.covariance - less, log_likelihood, xp)
-
-
-def _moved(
-    cloud: OutdoorCloud, state: Array, covariance: Array, log_likelihood: Array, xp: Any
-) -> OutdoorCloud:
-    """The cloud with its means moved by `state` (12, n), of which the turn goes into the attitude."""
-    both = cloud.log_weight + log_likelihood
-    return cloud.replace(
-        log_weight=both - log_sum_exp(both, xp=xp),
-        attitude=_turned(cloud.attitude, state[_TURN, :], xp),
-        motion=cloud.motion + state[:9, :],
-        covariance=0.5 * (covariance + lanes.transpose(covariance, xp=xp)),
-    )
-
-
-def _turned(q: Array, e: Array, xp: Any) -> Array:
+def turned(q: Array, e: Array, xp: Any) -> Array:
     """Exp(e) q: attitudes (4, n) turned by rotation vectors (3, n) in the world."""
     return lanes.normalize(lanes.multiply(lanes.exponential(e, xp=xp), q, xp=xp), xp=xp)
 
@@ -339,11 +190,11 @@ def as_cloud(cloud: OutdoorCloud) -> Cloud:
     return Cloud(
         log_weight=cloud.log_weight,
         attitude=cloud.attitude,
-        velocity=cloud.motion[_VELOCITY, :],
-        position=cloud.motion[_POSITION, :],
-        velocity_covariance=P[_VELOCITY, _VELOCITY, :],
-        cross_covariance=P[_POSITION, _VELOCITY, :],
-        position_covariance=P[_POSITION, _POSITION, :],
+        velocity=cloud.motion[VELOCITY, :],
+        position=cloud.motion[POSITION, :],
+        velocity_covariance=P[VELOCITY, VELOCITY, :],
+        cross_covariance=P[POSITION, VELOCITY, :],
+        position_covariance=P[POSITION, POSITION, :],
     )
 
 

@@ -25,11 +25,11 @@ from flowgraph.blocks.particles.cloud import (
 from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, silverman, spread_of
 from flowgraph.blocks.particles.lost import (
     BELIEVED,
-    FARTHEST,
     believe_pose,
     depletion,
     depletion_remarks,
     judge_pose,
+    judged,
     mixture,
     pose_within_reach,
     verdict,
@@ -49,7 +49,6 @@ from flowgraph.blocks.particles.resampling import (
 __all__ = [
     "within_reach",
     "pose_within_reach",
-    "FARTHEST",
     "BELIEVED",
     "Spread",
     "Kernels",
@@ -78,6 +77,7 @@ __all__ = [
     "depletion",
     "depletion_remarks",
     "judge_pose",
+    "judged",
     "mixture",
     "verdict",
     "take_ancestors",

@@ -76,10 +76,13 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
 
         log p(z | q) = -|Log(q^-1 * z)|^2 / (2 noise^2) - 3 log(noise) - 3/2 log(2 pi)
 
+    An attitude with a NaN in it was not measured: all particles explain it alike.
+
     Args:
         noise: standard deviation about each body axis, rad; small, so that the circle does not matter.
     """
     error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
+    error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
     return LogLikelihood(value=xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant)
 

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.lost import FARTHEST
 from flowgraph.blocks.particles.cloud import log_sum_exp
-from flowgraph.blocks.particles.lost import FARTHEST
 
 __all__ = ["Kernels", "Spread", "corrected", "drawn", "silverman", "spread_of"]
 

@@ -16,16 +16,17 @@ import numpy as np
 from flowgraph import Array, Scalar, Series, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.kalman.filters import accepts
+from flowgraph.blocks.kalman.lost import FARTHEST, in_doubt
 from flowgraph.blocks.signals import Cloud, Depletion, KalmanInnovation, Pose
 from flowgraph.data.notes import note
 
 __all__ = [
     "BELIEVED",
-    "FARTHEST",
     "believe_pose",
     "depletion",
     "depletion_remarks",
     "judge_pose",
+    "judged",
     "mixture",
     "pose_within_reach",
     "verdict",
@@ -34,12 +35,6 @@ __all__ = [
 
 BELIEVED = 1.0 - 1e-6
 """The probability with which a measurement is as near as an honest cloud expects; beyond, a cloud is lost."""
-
-FARTHEST = 1e14
-"""The nis of a measurement of which nothing can be made: it would leave no digit of the covariance."""
-
-GROWN = 16.0
-"""By how much, at least, the variances of a lost cloud grow at a measurement."""
 
 _REACH = 1e12
 
@@ -60,7 +55,7 @@ def within_reach(x: Array, *, xp: Any) -> Array:
 
 @block
 def pose_within_reach(pose: Pose, *, xp: Any) -> Pose:
-    """A pose whose position is `within_reach`."""
+    """A pose whose position is `within_reach`; NaN stays."""
     return Pose(position=within_reach(pose.position, xp=xp), attitude=pose.attitude)
 
 
@@ -77,10 +72,8 @@ def verdict(
 ) -> tuple[Array, KalmanInnovation, Array]:
     """Whether a cloud, taken for the Gaussian of its mean and covariance, believes a measurement.
 
-    The first `patience` measurements in a row that are too far off are taken for outliers: with a gate they
-    are refused, without one they are believed all the same. The next one shows that the cloud has lost track,
-    and so on until one is near.
-    Such a cloud must grow, or start anew, before it is corrected.
+    Whether it has lost track is as in `kalman.lost.in_doubt`; such a cloud must grow, or start anew, before
+    it is corrected. What is too far off before is refused with a gate, and believed all the same without one.
 
     Args:
         state: how many measurements were too far off in a row.
@@ -104,14 +97,22 @@ def verdict(
     parts = xp.sum(xp.astype(present, S.dtype))
     usable = nis < FARTHEST
     near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable
-    far = xp.where(near, 0.0, state + 1.0)
     wait = 0.0 if gate is None and at_once else float(patience)
-    lost = usable & (far > wait)
+    far, lost, grow = in_doubt(state, near, nis, parts, patience=wait, xp=xp)
+    far = xp.where(parts > 0.0, far, state)  # of what was not measured nothing is learned
     accepted = usable if gate is None else near | lost
-    ratio = xp.where(lost, nis, 0.0) / xp.maximum(parts, 0.0 * parts + 1.0)
-    grow = xp.where(lost, xp.maximum(ratio, 0.0 * ratio + GROWN), 1.0)
     innovation = KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)
     return far, innovation, grow
+
+
+def judged(
+    state: Array, residual: Array, S: Array, *, gate: float | None, patience: int, xp: Any
+) -> tuple[Array, KalmanInnovation, Array]:
+    """`verdict` on the entries of a residual (m) that are not NaN."""
+    present = ~xp.isnan(residual)
+    S = xp.where(present[:, None] & present[None, :], S, xp.eye(S.shape[-1], dtype=S.dtype))
+    residual = xp.where(present, residual, 0.0)
+    return verdict(state, residual, S, present, gate=gate, patience=patience, xp=xp)
 
 
 @block
@@ -128,6 +129,9 @@ def judge_pose(
     xp: Any,
 ) -> tuple[Any, tuple[KalmanInnovation, Scalar]]:
     """The innovation (m, world; rad, body) of a whole cloud at a measured pose, and whether to believe it.
+
+    Of a pose of which some entries are NaN, the others are judged; a NaN in the quaternion takes all of the
+    attitude with it.
 
     Its covariance is that of the particles' innovations, the mean of their own and the noise. Whether it
     is believed is as in `verdict`.
@@ -150,14 +154,12 @@ def judge_pose(
         point = point + lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=point.dtype), xp=xp)
     turn = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     mean, S = mixture(weight, xp.concat([-point, turn], axis=0), xp=xp)
-    mean = mean + xp.concat([pose.position, 0.0 * pose.position])
+    mean = mean + xp.concat([pose.position, 0.0 * cloud.position[:, 0]])
     own = xp.sum(cloud.position_covariance * weight, axis=-1)
     wide = xp.asarray(np.eye(3, 6), dtype=S.dtype)
     noise = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
     S = S + wide.mT @ own @ wide + xp.asarray(noise, dtype=S.dtype)
-    count, innovation, grow = verdict(
-        state, mean, 0.5 * (S + S.mT), mean == mean, gate=gate, patience=patience, xp=xp
-    )
+    count, innovation, grow = judged(state, mean, 0.5 * (S + S.mT), gate=gate, patience=patience, xp=xp)
     return count, (innovation, grow)
 
 
@@ -184,7 +186,8 @@ def believe_pose(
     was lost.
 
     A new cloud is equally weighted and lies about the measured pose, with its noise; the velocities stay,
-    with variances `grow` times as large. Draws `anew` (3, n).
+    with variances `grow` times as large, and so does what was not measured of the pose (NaN), attitudes as
+    they are. Draws `anew` (3, n).
 
     Args:
         prior, posterior: before and after the correction.
@@ -207,16 +210,21 @@ def _anew(
     errors = xp.asarray(draw.normal("anew", (3, n)), dtype=kind) * attitude_noise
     measured = pose.attitude[:, None] + 0.0 * prior.attitude
     q = lanes.normalize(lanes.multiply(measured, lanes.exponential(errors, xp=xp), xp=xp), xp=xp)
+    q = xp.where(xp.any(xp.isnan(pose.attitude)), prior.attitude, q)
     p = pose.position[:, None] - lanes.rotate(q, xp.asarray(lever, dtype=kind), xp=xp)
+    seen = ~xp.isnan(pose.position)
     one = xp.asarray(np.eye(3)[:, :, None], dtype=kind)
+    fixed = one * position_noise**2 + 0.0 * prior.position_covariance
+    vague = grow * prior.position_covariance
+    both = (seen[:, None] | seen[None, :])[:, :, None]
     fresh = Cloud(
         log_weight=0.0 * prior.log_weight - float(np.log(n)),
         attitude=q,
         velocity=prior.velocity,
-        position=p,
+        position=xp.where(seen[:, None], p, prior.position),
         velocity_covariance=grow * prior.velocity_covariance,
         cross_covariance=0.0 * prior.cross_covariance,
-        position_covariance=one * position_noise**2 + 0.0 * prior.position_covariance,
+        position_covariance=xp.where(both, fixed, vague),
     )
     gone = grow > 1.0
     return Cloud(

@@ -97,6 +97,9 @@ def correct_motion(
         p' = p + P u        C' = r S^-1 C
                             P' = r S^-1 P
 
+    An entry of z that is NaN was not measured: e is 0 there, with a noise whose variance is 1e8 times what is
+    known, so that nothing is learned of it; r I is then a diagonal matrix.
+
     Args:
         pose: the measured position, m, world, of a point fixed to the body; its attitude is not used here.
         noise: standard deviation, m.
@@ -107,11 +110,15 @@ def correct_motion(
     """
     kind = cloud.position.dtype
     V, C, P = cloud.velocity_covariance, cloud.cross_covariance, cloud.position_covariance
-    r = noise**2
+    one = xp.asarray(_EYE, dtype=kind)
     residual = pose.position[:, None] - cloud.position
     if lever != ORIGIN:
         residual = residual - lanes.rotate(cloud.attitude, xp.asarray(lever, dtype=kind), xp=xp)
-    inverse, determinant = lanes.inverse_and_determinant(P + xp.asarray(_EYE * r, dtype=kind), xp=xp)
+    missing = xp.any(xp.isnan(residual), axis=1)
+    residual = xp.where(missing[:, None], 0.0, residual)
+    vague = 1e8 * (xp.max(xp.sum(P * one, axis=1), axis=-1) + noise**2)
+    r = xp.where(missing, vague, noise**2)[:, None, None]
+    inverse, determinant = lanes.inverse_and_determinant(P + one * r, xp=xp)
     u = xp.sum(inverse * residual[None, :, :], axis=1)
     inverse_C = lanes.matrix_product(inverse, C)
     distance = xp.sum(residual * u, axis=0)

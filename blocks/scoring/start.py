@@ -22,6 +22,7 @@ from flowgraph.blocks.inertial.alignment import (
     static_alignment,
     usable,
 )
+from flowgraph.blocks.kalman.lost import UNKNOWN_TURN
 from flowgraph.blocks.metrics.truth import interpolate, known
 from flowgraph.blocks.scoring.settings import Settings, left_out_or, one_of
 from flowgraph.errors import DataError
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MAGNETIC_HEADING", "UNKNOWN_HEADING", "Started", "StartPose", "from_first", "turned"]
 
-UNKNOWN_HEADING = math.pi / math.sqrt(3.0)
-"""The deviation of an angle of which nothing is known, rad: that of a uniform one."""
+UNKNOWN_HEADING = UNKNOWN_TURN
+"""The deviation of a heading of which nothing is known, rad."""
 
 MAGNETIC_HEADING = 0.3
 """The deviation of a heading that one look at a magnetometer shows, rad: iron is near."""

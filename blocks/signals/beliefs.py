@@ -41,6 +41,13 @@ class GaussianRoot(Signal):
     root: Array = real("t", "t")
 
 
+class GaussianInformation(Signal):
+    """A Gaussian belief by the inverse of its covariance."""
+
+    mean: Array = real("n")
+    information: Array = real("t", "t")
+
+
 class Bank(Signal):
     """Gaussian beliefs under several models: how likely each is (weights add up to 1), and what it says."""
 

@@ -73,6 +73,20 @@ class StateCloud(Signal):
     state: Array = real("particles", "size")
 
 
+class StateEnsemble(Signal):
+    """States of equal weight, one a member."""
+
+    state: Array = real("members", "size")
+
+
+class ConditionalCloud(Signal):
+    """Weighted states, part of each of which is known as a Gaussian: its mean stands in the state."""
+
+    log_weight: Array = real("particles")
+    state: Array = real("particles", "size")
+    covariance: Array = real("particles", "l", "l")
+
+
 class StateKernels(Signal):
     """Weighted Gaussians over the states of a `StateCloud`: their means, and the covariance that all have."""
 

@@ -13,6 +13,7 @@ Source: R. Murray, Z. Li and S. Sastry, "A Mathematical Introduction to Robotic 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,8 @@ def velocity_error(motion: Series, truth: Series, mount: Mount, delay: float = 0
 
     Args:
         motion: `CameraMotion`, whose stamps are `delay` seconds late.
-        truth: with `attitude`, `velocity` and `rate` (body).
+        truth: with `attitude`, `velocity` and `rate` (body). Beside rows that are NaN nothing is compared;
+            infinity, where these are all.
 
     Raises:
         DataError: when no stamp lies within the truth.
@@ -79,7 +81,8 @@ def velocity_error(motion: Series, truth: Series, mount: Mount, delay: float = 0
         )
     expected, _ = camera_motion_of(truth, time[inside], mount)
     error = motion["velocity"][inside] - expected
-    return float(np.sqrt(np.mean(np.sum(error * error, axis=1))))
+    error = error[np.isfinite(error).all(axis=1)]
+    return float(np.sqrt(np.mean(np.sum(error * error, axis=1)))) if len(error) else math.inf
 
 
 def find_delay(

@@ -27,6 +27,7 @@ from flowgraph.cli.options import (
     graph_of,
     one_flight,
 )
+from flowgraph.cli.pages import runs_before, watcher_of, write_page
 from flowgraph.cli.resume import kept_in, resumed
 from flowgraph.cli.terminal import (
     err_console,
@@ -52,6 +53,7 @@ from flowgraph.data.series import Flight, Series
 from flowgraph.engines.options import Checkpoint
 from flowgraph.engines.registry import engine_names
 from flowgraph.engines.simulate import simulate
+from flowgraph.engines.watched import Watcher, simulate_watched
 from flowgraph.errors import DataError, FlowgraphError, plain, writes
 
 
@@ -73,7 +75,7 @@ def list_(as_json: AsJson = False) -> None:
 def show(
     graph: Name,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="An .svg, .png, .pdf or .dot file.")
+        Path | None, typer.Option("-o", "--output", help="An .html, .svg, .png, .pdf or .dot file.")
     ] = None,
     fold: Annotated[
         int | None, typer.Option(min=0, help="Draw graphs nested deeper than this as one box.")
@@ -83,14 +85,20 @@ def show(
     settings: Settings = None,
     seed: Seed = 0,
 ) -> None:
-    """Draw a graph: in the terminal, or to a file."""
+    """Draw a graph: in the terminal, or to a file; an .html is a page in which it unfolds."""
+    from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
+    from flowgraph.pipeline.costs.places import costs_by_path
+
     built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
         return
     with writing(output), without_font_warnings():
-        built.draw(str(output), fold=fold)
+        if output.suffix.lower() == ".html":
+            diagram_page(built, output, fold=fold, costs=costs_by_path(built))
+        else:
+            built.draw(str(output), fold=fold)
 
 
 @app.command()
@@ -104,6 +112,12 @@ def run(
     seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A page of the run, with diagram, plots and a slider.")
+    ] = None,
+    beside: Annotated[
+        bool, typer.Option("--beside", help="Keep the runs that are in the page, to compare with them.")
+    ] = False,
     diverged: Annotated[
         str, typer.Option(help="Numbers that are no longer finite: raise or count.")
     ] = "raise",
@@ -127,6 +141,7 @@ def run(
     kept = kept_in(checkpoint, every, resume, command)
     if out is not None:
         make_ready(out)
+    others = runs_before(html, beside)
     notes: dict[str, None] = {}
 
     def say(found: tuple[str, ...]) -> None:
@@ -137,13 +152,22 @@ def run(
 
     spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
-    result, row = _measure(case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, kept=kept)
+    watcher = watcher_of(case, engine) if html is not None and kept is None else None
+    result, row = _measure(
+        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept
+    )
     say(case.remarks(result))
+    if html is not None and watcher is None:
+        say((note("info", f"the page has no values on the wires: engine={engine} does not show them"),))
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
     if out is not None:
         report["notes"] += _write_report(out, case, flight, result, report)
+    if html is not None:
+        title = ", ".join([graph, spec, *(settings or ()), f"seed {seed}", engine])
+        with writing(html):
+            write_page(html, others, title, case, flight.truth, _recorded(case), result, watcher, report)
     if as_json:
         return print_json(report)
     out_console.print(runs_table([row]))
@@ -187,6 +211,7 @@ def _measure(
     *,
     quiet: bool,
     diverged: str = "raise",
+    watcher: Watcher | None = None,
     kept: Checkpoint | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
@@ -196,16 +221,11 @@ def _measure(
         if hidden
         else ProgressBar(f"{name} ({engine})", total=case.inputs, console=err_console) as meter
     ):
-        result = simulate(
-            case.graph,
-            case.inputs,
-            engine=engine,
-            dtype=dtype,
-            seed=seed,
-            progress=meter,
-            diverged=diverged,
-            checkpoint=kept,
-        )
+        options: dict[str, Any] = {"dtype": dtype, "seed": seed, "progress": meter, "diverged": diverged}
+        if watcher is None:
+            result = simulate(case.graph, case.inputs, engine=engine, checkpoint=kept, **options)
+        else:
+            result = simulate_watched(case.graph, case.inputs, watcher, **options)
     total = perf_counter() - start
     row = {"graph": name, "engine": engine, "ticks": result.ticks, "wall_s": result.wall_s}
     row.update({"setup_s": total - result.wall_s, **case.score(result), **result.stats})
@@ -221,10 +241,10 @@ def _measure(
     return result, row
 
 
-def _recorded(case: Case) -> list[Series]:
-    """What the graph was fed, where it is recorded."""
+def _recorded(case: Case) -> dict[str, Series]:
+    """What the graph was fed, by source, where it is recorded."""
     inputs = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
-    return [s for s in inputs.values() if isinstance(s, Series)]
+    return {name: s for name, s in inputs.items() if isinstance(s, Series) and name in case.graph.sources}
 
 
 def _write_report(
@@ -274,7 +294,7 @@ def _pictures(
     if estimate is None:
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
-        seen = next((s for s in _recorded(case) if "position" in s.leaves and len(s)), None)
+        seen = next((s for s in _recorded(case).values() if "position" in s.leaves and len(s)), None)
         found["navigation.png"] = lambda file: plot_navigation(
             estimate, flight.truth, file, observed=seen, order=case.order
         )

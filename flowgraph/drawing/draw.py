@@ -15,6 +15,7 @@ import struct
 from pathlib import Path
 
 from flowgraph.data.files import put
+from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.text import (
     Link,
     block_words,
@@ -29,15 +30,15 @@ from flowgraph.drawing.text import (
     scope_depth,
     shorten,
     to_networkx,
+    triggers,
     type_words,
 )
 from flowgraph.errors import DeclarationError, MissingDependencyError, UnknownNameError, writes
 from flowgraph.language.block import Port
-from flowgraph.language.clock import atoms
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 
 _LONGEST = 32_767
-ENDINGS = (".svg", ".png", ".pdf", ".dot", ".gv")
+ENDINGS = (".svg", ".png", ".pdf", ".html", ".dot", ".gv")
 # for each direction, the sides of a box at which values enter and leave
 COMPASS = {"LR": ("w", "e"), "TB": ("n", "s"), "RL": ("e", "w"), "BT": ("s", "n")}
 FONT = "Helvetica,Arial,sans-serif"
@@ -66,7 +67,8 @@ def draw(
     """Draw the block diagram.
 
     Args:
-        file: where to write it; its ending (.svg, .png, .pdf, .dot or .gv) says what. None: return SVG text.
+        file: where to write it; its ending (.svg, .png, .pdf, .html, .dot or .gv) says what. None: return SVG
+            text. An .html is a page in which graphs unfold; see `flowgraph.drawing.page`.
         rankdir: which way values flow: "LR" left to right, "TB" top to bottom, "RL" or "BT".
         fold: graphs nested deeper than this are drawn as one box: 0 folds all of them, None none.
         legend: whether to say below the title what the kinds of arrow mean.
@@ -82,6 +84,8 @@ def draw(
     if ending not in ENDINGS:
         raise UnknownNameError("file ending", ending, ENDINGS, path=str(file))
     source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend)
+    if ending == ".html":
+        return diagram_page(graph, file, fold=fold, rankdir=rankdir)
     if path is None:
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
@@ -208,7 +212,7 @@ class _Diagram:
             rows.append(_font(shorten(doc, 110), size=10))
         notes = ["dashed: read one tick later"] if any(link.feedback for link in self.links) else []
         notes += ["hollow arrow: may be absent"] if any(link.optional for link in self.links) else []
-        notes += ["dotted: only fires"] if self.triggers() else []
+        notes += ["dotted: only fires"] if triggers(self.graph) else []
         if legend and notes:
             rows.append(_font(" · ".join(notes), tag="i"))
         return _table([f'<tr><td align="left">{row}</td></tr>' for row in rows])
@@ -299,18 +303,6 @@ class _Diagram:
         rows = [f"<tr>{cell}</tr>" for cell in cells] if self.along else ["<tr>", *cells, "</tr>"]
         return f'<td cellpadding="0">{_table(rows, padding=3)}</td>'
 
-    def triggers(self) -> list[tuple[int, int]]:
-        """(source or block, block) where the first is wired to nothing and only makes the second fire."""
-        wired = {link.tail for link in self.links} | {c.wire.node for c in self.graph.collected}
-        found = []
-        for index, node in enumerate(self.graph.nodes):
-            if index not in wired and not isinstance(node, RegisterNode):
-                own = {node.clock} if isinstance(node, SourceNode) else {p.clock for p in node.outputs}
-                for fired, call in self.graph.calls:
-                    if own & set(atoms(call.firing)) and firing_words(self.graph, call):
-                        found.append((index, fired))
-        return found
-
     def edges(self) -> list[str]:
         """One arrow for each link that shows; links into one folded box that carry the same are one."""
         groups: dict[tuple[object, ...], list[Link]] = {}
@@ -326,7 +318,7 @@ class _Diagram:
             lines.append(self.edge(group[0]._replace(optional=optional, feedback=feedback), str(name)))
         for collected in self.graph.collected:
             lines.append(self.edge(Link(*collected.wire, -1, "", False, False), f"output: {collected.name}"))
-        for index, fired in self.triggers():
+        for index, fired in triggers(self.graph):
             tail, head = self.tail(Link(index, 0, fired, "", False, False)), self.visible(fired)
             look = _attributes(style="dotted", arrowhead="odot", tooltip="fires")
             lines.append(f"{tail} -> {_quoted(head)} {look};")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from flowgraph.errors import DeclarationError
-from flowgraph.language.clock import Condition, Counted, either
+from flowgraph.language.clock import Condition, Counted, atoms, either
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.types import StructType, Type, flatten
 
@@ -125,6 +125,19 @@ def links(graph: Graph) -> Iterator[Link]:
                     yield Link(argument.register, None, index, port.name, argument.optional, False)
         elif isinstance(node, RegisterNode) and node.feed is not None:
             yield Link(*node.feed, index, "", False, node.role == "delay")
+
+
+def triggers(graph: Graph) -> list[tuple[int, int]]:
+    """(source or block, block) where the first is wired to nothing and only makes the second fire."""
+    wired = {link.tail for link in links(graph)} | {c.wire.node for c in graph.collected}
+    found = []
+    for index, node in enumerate(graph.nodes):
+        if index not in wired and not isinstance(node, RegisterNode):
+            own = {node.clock} if isinstance(node, SourceNode) else {p.clock for p in node.outputs}
+            for fired, call in graph.calls:
+                if own & set(atoms(call.firing)) and firing_words(graph, call):
+                    found.append((index, fired))
+    return found
 
 
 def to_networkx(graph: Graph) -> networkx.MultiDiGraph:

@@ -21,6 +21,7 @@ from tests.bench import (
     imports,
     inertial,
     many,
+    pages,
     particles,
     random,
     studies,
@@ -53,6 +54,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
         {"runs": 8, "sample": 2, "duration": 2.0, "chunk": 4, "repeats": 1},
     ),
     "study-memory": (study_memory.rows, {"sizes": (4, 8), "duration": 1.2}),
+    "pages": (pages.rows, {"duration": 2.0, "repeats": 1}),
     "import": (imports.import_time, {"repeats": 1}),
 }
 """The benches by name, each with the sizes of `--quick`."""

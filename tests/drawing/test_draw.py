@@ -263,7 +263,7 @@ def test_without_any_layout_engine_the_error_says_what_to_install(monkeypatch):
     assert "pip install pygraphviz" in str(caught.value)
 
 
-BROKEN = "#!/bin/sh\necho 'Format: \"svg\" not recognized.' >&2\nexit 1\n"
+BROKEN = "#!/bin/sh\ncat >/dev/null\necho 'Format: \"svg\" not recognized.' >&2\nexit 1\n"
 
 
 @pytest.mark.parametrize("script", [BROKEN, "#!/bin/sh\nkill -9 $$\n", "no program at all"])
@@ -300,7 +300,7 @@ def test_an_unknown_ending_lists_the_valid_ones(tmp_path):
     with pytest.raises(FlowgraphError) as caught:
         draw(built(), tmp_path / "diagram.jpeg")
     assert isinstance(caught.value, UnknownNameError)
-    assert "one of .dot, .gv, .pdf, .png, .svg" in str(caught.value)
+    assert "one of .dot, .gv, .html, .pdf, .png, .svg" in str(caught.value)
     assert "'.jpeg'" in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -135,3 +136,38 @@ def test_what_is_missing_is_said():
     with pytest.raises(DataError, match="rate_noise"):
         attitude_mekf.case(unsaid)
     assert attitude_mekf.case(unsaid, rate_noise=0.3, attitude_noise=0.3).graph
+
+
+def without_rates(base: Flight, first: float, last: float) -> Flight:
+    """The flight of which nothing comes between these times, s."""
+
+    def cut(series: Series) -> Series:
+        return series[(series.seconds <= first) | (series.seconds >= last)]
+
+    return replace(base, streams={name: cut(series) for name, series in base.streams.items()})
+
+
+def test_a_rate_that_does_not_come_is_less_and_less_believed():
+    made = without_rates(flight(duration="4"), 2.0, 2.6)
+    found, scores = {}, {}
+    for how in ("grow", "keep"):
+        case = attitude_mekf.case(made, held_noise=how, settle=2.7)
+        result = simulate(case.graph, case.inputs)
+        found[how], scores[how] = result["belief"], case.score(result)
+        assert any(n.startswith("bridged: body_rate: a gap of 0.6") for n in case.notes)
+    before = found["grow"].seconds < 2.0
+    np.testing.assert_array_equal(found["grow"]["covariance"][before], found["keep"]["covariance"][before])
+    assert scores["grow"]["total_rmse_deg"] < 0.7 * scores["keep"]["total_rmse_deg"]
+
+
+@pytest.mark.parametrize("gap", [0.3, 1.0])
+def test_the_first_attitude_after_a_gap_is_worth_what_the_gap_left(gap):
+    """After T s the turn is as uncertain as rate T is: T^2 rad / 2 in the deviation's growth w."""
+    made = without_rates(flight(duration="4"), 2.0, 2.0 + gap)
+    case = attitude_mekf.case(made)
+    innovation = simulate(case.graph, case.inputs)["innovation"]
+    k = int(np.searchsorted(innovation.seconds, 2.0 + gap))
+    step = np.median(np.diff(made.streams["body_rate"].seconds))
+    part = innovation.seconds[k] - innovation.seconds[k - 1] - 4.0 * step
+    grown = innovation["covariance"][k, 0, 0] - innovation["covariance"][k - 1, 0, 0]
+    assert grown == pytest.approx(2.0 * (part + 4.0 * step - 0.5 * part) * part, rel=0.2)

@@ -129,20 +129,22 @@ SAID = {
 }
 """How a note on a fault begins, and what else is in it."""
 
-LASTING = {
+UNSEEN = {
     *((name, fault) for name in ("gyro_integration", "complementary") for fault in ("spike", "gap")),
-    *((name, "spike") for name in (
-        "ins_eskf", "ins_ekf_pose", "ins_ukf_pose", "ins_ukf_velocity", "ins_particle", "rbpf_indoor",
-        "rbpf_outdoor", "outdoor_eskf", "marg", "quaternion_ukf", "kalman", "async_kalman", "ekf",
-        "augmented_complementary",
-    )),
-    ("ins_ukf_velocity", "gap"), ("ins_ukf_velocity", "aid"), ("ins_ukf_velocity", "jump"),
-    ("ins_particle", "gap"), ("rbpf_indoor", "gap"), ("ins_particle", "aid"),
+    *(("ins_ukf_velocity", fault) for fault in ("spike", "gap", "aid", "jump")),
+}
+"""Faults that last, since no sensor tells what turned while nobody looked (`gyro_integration`, the heading of
+`complementary`), or where the body went (`ins_ukf_velocity`)."""
+
+UNGATED = {
+    "ins_eskf", "ins_ekf_pose", "ins_ukf_pose", "ins_particle", "rbpf_outdoor", "outdoor_eskf", "marg",
+    "quaternion_ukf", "kalman", "async_kalman", "augmented_complementary",
 }  # fmt: skip
-"""Faults that last longer, and are said. What turned while nobody looked is not told by any other sensor
-(`gyro_integration`, the heading of `complementary`), nor where `ins_ukf_velocity` is; a spike that no range
-refuses throws a filter off by 10 m/s and 1 rad, and its velocity and biases take longer; particles that lost
-the body are found by other means."""
+"""Filters in which a spike that neither a range nor a gate refuses lasts: it throws them off by 30 m/s and
+3 rad, and a filter that believes each measurement takes it for a bias, or one of the aids for a liar."""
+
+SLOWER = {"outdoor_eskf": 3.0}
+"""How many times the usual error is right after a spike: the mean of 11 readings of a satellite receiver."""
 
 
 def key_of(score: dict[str, float]) -> str:
@@ -188,11 +190,12 @@ def test_a_fault_is_over_soon_or_said(name, fault):
         if kind in SAID and (name, kind) != ("roll_pitch", "jump"):  # it remembers nothing
             begins, holds = SAID[kind]
             assert any(note.startswith(begins) and holds in note for note in notes), notes
-        if (name, kind) in LASTING:
+        if (name, kind) in UNSEEN or (kind == "spike" and not settings and name in UNGATED):
             assert any(note.startswith(("bridged: ", "warning: ")) for note in notes)
         else:
             key = key_of(score)
-            assert score[key] < 2.0 * usual(name)[key]
+            more = SLOWER.get(name, 2.0) if kind == "spike" else 2.0
+            assert score[key] < more * usual(name)[key]
 
 
 @pytest.mark.parametrize("name", GRAPHS)
@@ -269,10 +272,13 @@ def in_part(base: Flight, field: str, columns: list[int], first: int) -> Flight:
 @pytest.mark.parametrize(("field", "columns", "parts"), [
     ("position", [0], 5.0), ("position", [0, 1, 2], 3.0), ("attitude", [2], 3.0),
 ])  # fmt: skip
-@pytest.mark.parametrize("name", ["ekf", pytest.param("ukf", marks=pytest.mark.slow), "ins_ekf_pose"])
+@pytest.mark.parametrize("name", [
+    "ekf", pytest.param("ukf", marks=pytest.mark.slow), "ins_ekf_pose", "ins_particle", "rbpf_indoor",
+])  # fmt: skip
 def test_a_measurement_corrects_by_its_finite_entries(name, field, columns, parts):
     made = in_part(flown("ekf")[0], field, columns, 12)
-    case = find_graph(name).case(made)
+    few = {"ins_particle": {"particles": 100}, "rbpf_indoor": {"particles": 100, "unknown_yaw": False}}
+    case = find_graph(name).case(made, **few.get(name, {}))
     result = simulate(case.graph, case.inputs)
     found = result["innovation"]["parts"]
     assert (found[:12] == 6.0).all()
@@ -285,12 +291,10 @@ def test_a_measurement_corrects_by_its_finite_entries(name, field, columns, part
     assert np.abs(off[:, seen]).max(initial=0.0) < 0.2
 
 
-@pytest.mark.parametrize("name", ["rbpf_indoor", "augmented_complementary"])
-def test_a_filter_that_takes_whole_measurements_takes_no_parts(name):
+def test_a_filter_that_takes_whole_measurements_takes_no_parts():
     base = flown("ekf")[0]
     made = in_part(base, "position", [0], 30)
-    few = {"particles": 50} if name == "rbpf_indoor" else {}
-    case = find_graph(name).case(made, **few)
+    case = find_graph("augmented_complementary").case(made)
     assert isinstance(case.inputs, dict)
     assert len(case.inputs["vicon"]) == 30
     assert any(note.startswith("skipped: vicon: ") for note in case.notes)
@@ -409,3 +413,49 @@ def test_before_the_first_reading_nothing_accelerates(name, gravity):
     found = simulate(graph, inputs)["pose" if name == "augmented_complementary" else "belief"]
     np.testing.assert_allclose(found["velocity"], 0.0, atol=0.03)
     np.testing.assert_allclose(found["position"], 0.0, atol=0.03)
+
+
+def parts_of(graph: str, flight: Flight, changes: dict[str, tuple[str, list[int]]], **settings: Any) -> Any:
+    """The case of a flight whose streams lack entries of a field in all readings but the first ten."""
+    streams = dict(flight.streams)
+    for name, (field, columns) in changes.items():
+        values = np.array(streams[name][field])
+        values[10:, columns] = np.nan
+        streams[name] = with_leaves(streams[name], {**streams[name].leaves, field: values}, gaps=True)
+    return find_graph(graph).case(replace(flight, streams=streams), **settings)
+
+
+def test_points_of_the_plane_are_weighed_by_the_entries_there_are():
+    base = load_flight("sim:plane", seed=0, settings={"duration": "6"})
+    case = parts_of("particle", base, {"position": ("position", [0])}, particles=300)
+    belief = simulate(case.graph, case.inputs)["belief"]
+    whole = find_graph("particle").case(base, particles=300)
+    usual = simulate(whole.graph, whole.inputs)["belief"]
+    late, best = (np.sqrt(b["covariance"][-1].diagonal()) for b in (belief, usual))
+    assert late[1] < 1.3 * best[1]
+    assert late[0] > 1.5 * best[0]
+    assert base.truth is not None
+    off = np.abs(belief["position"][-1] - base.truth["position"][-1])
+    assert (off < 4.0 * late).all()
+
+
+@pytest.mark.parametrize("changes", [
+    {"gps": ("position", [2]), "gps2": ("position", [0, 2]), "magnetometer": ("field", [1])},
+    pytest.param({"optical_flow": ("displacement", [0])}, marks=pytest.mark.slow),
+    pytest.param({"optical_flow": ("turn", [1]), "gps": ("position", [0, 1, 2])}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_outdoor_particles_take_the_entries_there_are(changes):
+    """Fields, and each half of optical flow, which are of the body, as a whole."""
+    data, settings = OWN["rbpf_outdoor"]
+    _, base = case_of("rbpf_outdoor", data, ["duration=2", "gps.rate=10", "gps2.rate=10", *settings], 0)
+    case = parts_of("rbpf_outdoor", base, changes, particles=60, gate=0.999)
+    result = simulate(case.graph, case.inputs)
+    for name, (field, columns) in changes.items():
+        if field == "position" and len(columns) == 3:
+            assert len(result[f"{name}_innovation"]) == 10
+            continue
+        parts = result[f"{name}_innovation"]["parts"]
+        whole = 6 if name == "optical_flow" else 3
+        assert (parts[:10] == whole).all()
+        assert (parts[10:] == whole - (len(columns) if field == "position" else 3)).all()
+    assert case.score(result)["position_rmse_m"] < 0.3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any
 
@@ -24,6 +25,8 @@ from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     geodesic_angle,
     multiply,
+    skew,
+    to_matrix,
     to_rotation_vector,
 )
 from flowgraph.blocks.inertial.alignment import rest_seconds
@@ -31,6 +34,7 @@ from flowgraph.blocks.inertial.calibration import silence_frozen_gyro
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import STATE, roll_pitch_attitude, see_rate_and_gravity
 from flowgraph.blocks.signals import Attitude, Imu
+from flowgraph.blocks.world import RoundTrip
 from flowgraph.graphs import gyro_integration, quaternion_ukf, roll_pitch
 from flowgraph.graphs.benches.ese650 import PUBLISHED
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
@@ -84,6 +88,34 @@ def test_with_the_brownian_drift_of_the_project_roll_and_pitch_keep_below_what_w
     assert made.truth is not None
     steps = np.diff(made.truth["gyro_bias"], axis=0)
     assert np.std(steps) == pytest.approx(0.002, rel=0.1)
+
+
+def yaw_bound(seconds: float, rate: float = 100.0, step: float = 0.002) -> float:
+    """The least root mean square of the yaw error (rad) of any causal filter on that round trip: a Kalman
+    filter of attitude and gyroscope bias, linearised along the truth, which knows yaw and bias at first."""
+    time = np.arange(round(seconds * rate) + 1) / rate
+    motion, dt = RoundTrip(duration=seconds).at(time), 1.0 / rate
+    attitude = to_matrix(motion.attitude, xp=np)
+    noise, force = np.diag([9e-8 * dt] * 3 + [step**2] * 3), np.eye(3) * 1e-6 * rate
+    P, total = np.diag([1e-4, 1e-4, 0.0, 0.0, 0.0, 0.0]), 0.0
+    for k, R in enumerate(attitude):
+        F = np.eye(6)
+        F[:3, :3], F[:3, 3:] = R.T @ attitude[max(k - 1, 0)], -np.eye(3) * dt
+        P = F @ P @ F.T + noise if k else P
+        H = np.hstack([skew(R.T @ [0.0, 0.0, 9.81], xp=np), np.zeros((3, 3))])
+        P = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + force, H @ P)
+        x, y, _ = R[:, 0]  # of zyx, yaw is the direction of body x: how it turns with an error in the world
+        J = np.array([-x * R[2, 0], -y * R[2, 0], x * x + y * y]) / (x * x + y * y) @ R
+        total += float(J @ P[:3, :3] @ J)
+    return math.sqrt(total / len(time))
+
+
+def test_the_published_yaw_is_below_what_the_brownian_drift_of_twenty_seconds_leaves_any_filter():
+    """The accelerometer shows the drift of two axes at a time; 0.105 rad takes luck, or less than 11 s."""
+    assert yaw_bound(20.0) == pytest.approx(0.189, abs=0.002)
+    assert yaw_bound(10.0) == pytest.approx(0.086, abs=0.002)
+    # without a look at the accelerometer, the integral of the drift: step sqrt(rate T^3 / 12)
+    assert 0.002 * math.sqrt(100 * 20.0**3 / 12) == pytest.approx(0.516, abs=0.001)
 
 
 def below_the_published_errors(n: int) -> None:

@@ -51,16 +51,26 @@ class PythonEngine(BlockEngine):
 
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
         if options.checkpoint is not None:
-            result, given, error = _in_stretches(graph, inputs, options, options.checkpoint)
-            kept: Callable[[], Inputs] = lambda: given
-        else:
-            given, kept = _kept(inputs)
-            run, error = _started(graph, given, options), None
-            try:
-                run.to_end(options.progress)
-            except FifoOverflowError as full:
-                error = full
-            result = run.result()
+            return self._kept(graph, inputs, options, options.checkpoint)
+        return self.driven(graph, inputs, options, lambda run: run.to_end(options.progress))
+
+    def _kept(self, graph: Graph, inputs: Inputs, options: RunOptions, asked: Checkpoint) -> Result:
+        result, given, error = _in_stretches(graph, inputs, options, asked)
+        if error is None and all_finite(result):
+            return result
+        return settled(result, _playback(graph, lambda: given, options), options.diverged, error)
+
+    def driven(
+        self, graph: Graph, inputs: Inputs, options: RunOptions, drive: Callable[[Run], object]
+    ) -> Result:
+        """A run that `drive` takes to its end in its own way, and what is to be said of it."""
+        given, kept = _kept(inputs)
+        run, error = _started(graph, given, options), None
+        try:
+            drive(run)
+        except FifoOverflowError as full:
+            error = full
+        result = run.result()
         if error is None and all_finite(result):
             return result
         return settled(result, _playback(graph, kept, options), options.diverged, error)

@@ -352,6 +352,69 @@ def test_an_imu_is_derived_and_said_to_be(tmp_path):
     assert any("no motion capture" in n for n in alone.notes)
 
 
+def broken_rob6213(folder: Path, rows: range, columns: slice, word: str = "NaN") -> str:
+    """The small flight with cells of some rows of its motion capture replaced by a word."""
+    file = small_rob6213(folder)
+    csv = folder / "vicon_dataset7.csv"
+    lines = [line.split(",") for line in csv.read_text().splitlines()]
+    for k in rows:
+        lines[1 + k][columns] = [word] * len(lines[1 + k][columns])
+    csv.write_text("\n".join(",".join(line) for line in lines) + "\n")
+    return file
+
+
+@pytest.mark.parametrize(("rows", "columns", "word"), [
+    (range(20, 22), slice(1, 4), "NaN"),
+    (range(20, 21), slice(1, 13), ""),
+    (range(30, 33), slice(6, 7), "inf"),
+])  # fmt: skip
+def test_rows_of_the_motion_capture_that_are_not_finite_are_masked(tmp_path, rows, columns, word):
+    given = {"frame": "raw", "delay": "0.05"}
+    flight = load_flight("rob6213:" + broken_rob6213(tmp_path, rows, columns, word), settings=given)
+    assert flight.truth is not None
+    assert np.isnan(flight.truth["position"]).all(axis=1).nonzero()[0].tolist() == list(rows)
+    assert f"skipped: truth: {len(rows)} of 60 rows hold NaN, masked" in flight.notes
+    whole = load_flight("rob6213:" + small_rob6213(tmp_path), settings=given)
+    np.testing.assert_array_equal(flight.streams["imu"].time, whole.streams["imu"].time)
+    np.testing.assert_allclose(
+        flight.streams["imu"]["specific_force"][10:75],
+        whole.streams["imu"]["specific_force"][10:75],
+        atol=0.4,
+    )
+
+
+def test_where_the_motion_capture_is_blind_no_imu_is_derived(tmp_path):
+    given = {"frame": "raw", "delay": "0.05"}
+    flight = load_flight("rob6213:" + broken_rob6213(tmp_path, range(20, 40), slice(1, 13)), settings=given)
+    t = flight.streams["imu"].seconds
+    steps = np.diff(t)
+    assert steps.max() == pytest.approx(
+        21 * 0.015 + 0.11, abs=0.02
+    )  # from a row to a row, half a window more
+    assert t[int(steps.argmax())] == pytest.approx(19 * 0.015 - 0.055, abs=0.011)
+
+
+def test_poses_and_velocities_that_are_not_finite_are_absent(tmp_path):
+    file = small_rob6213(tmp_path)
+    t = np.arange(40) * 0.02 + 0.01
+    x = np.stack([np.sin(t), np.cos(t), 1.0 + t], axis=1)
+    velocity = np.zeros((40, 3))
+    x[[3, 4], 1], velocity[7], t[39] = np.nan, np.inf, np.nan
+    content = {"time": t, "position": x, "angle": np.zeros((40, 3)), "linearVel": velocity}
+    savemat(tmp_path / "proj2_dataset7.mat", {**content, "angVel": np.zeros((40, 3))})
+    flight = load_flight("rob6213:" + file, settings={"frame": "raw", "delay": "0"})
+    assert [len(flight.streams[name]) for name in ("pose", "motion")] == [37, 38]
+    for said in ("pose: 2 of 39 rows", "motion: 1 of 39 rows", "1 of 40 stamps are not finite"):
+        assert any(n.startswith("skipped: ") and said in n for n in flight.notes)
+
+
+def test_a_motion_capture_of_few_finite_rows_is_refused(tmp_path):
+    with pytest.raises(
+        DataError, match=r"no motion capture of the family[\s\S]*too few rows that are finite"
+    ):
+        rob6213.load(broken_rob6213(tmp_path, range(45), slice(2, 3)))
+
+
 def test_a_malformed_motion_capture_is_refused(tmp_path):
     file = small_rob6213(tmp_path)
     csv = tmp_path / "vicon_dataset7.csv"

@@ -17,6 +17,7 @@ from flowgraph.blocks.filtering import (
     filtered,
     imm,
     linear,
+    mmae,
     particles,
     unscented,
 )
@@ -97,6 +98,7 @@ def test_it_is_equal_in_all_engines_and_lowered(method):
     built = both.build(method=imm(MOVES, STAYS, transition=STAY, method=method), gate=0.999)
     result = all_engines(built, inputs)
     assert len(result["log_likelihood"]) == len(z)
+    all_engines(both.build(method=mmae(MOVES, STAYS, method=method)), inputs)
     assert {"filter/predict", "filter/correct", "filter/posterior"} <= {s.path for s in lower(built).stages}
 
 
@@ -116,11 +118,49 @@ def test_a_bank_without_transitions_is_its_filters_weighed_by_their_likelihood()
         weight.append(result["log_likelihood"]["value"].sum())
     share = np.exp(np.array(weight) - max(weight))
     share /= share.sum()
-    result = simulate(both.build(method=imm(MOVES, STAYS, transition=np.eye(2), method=linear())), inputs)
-    expected = share @ np.array(alone)
-    np.testing.assert_allclose(result["output"]["mean"][-1], expected, rtol=1e-12, atol=1e-9)
-    whole = result["log_likelihood"]["value"].sum()
-    assert whole == pytest.approx(np.logaddexp(*weight) - np.log(2.0), abs=1e-9)
+    for bank in (
+        imm(MOVES, STAYS, transition=np.eye(2), method=linear()),
+        mmae(MOVES, STAYS, method=linear()),
+    ):
+        result = simulate(both.build(method=bank), inputs)
+        expected = share @ np.array(alone)
+        np.testing.assert_allclose(result["output"]["mean"][-1], expected, rtol=1e-12, atol=1e-9)
+        whole = result["log_likelihood"]["value"].sum()
+        assert whole == pytest.approx(np.logaddexp(*weight) - np.log(2.0), abs=1e-9)
+
+
+def test_a_bank_without_transitions_is_that_of_filterpy():
+    from filterpy.kalman import KalmanFilter, MMAEFilterBank
+
+    _, z = crassidis(60)
+    filters = []
+    for noise in (Q, 0.0 * Q):
+        one = KalmanFilter(6, 2)
+        one.F, one.Q, one.H, one.R = F, noise, H, 1e4 * np.eye(2)
+        one.x, one.P = START.mean[:, None].copy(), START.covariance.copy()
+        filters.append(one)
+    bank, means = MMAEFilterBank(filters, [0.3, 0.7], 6, H), []
+    for k, seen in enumerate(z):
+        if k:
+            bank.predict()
+        bank.update(seen[:, None])
+        means.append(bank.x[:, 0].copy())
+    inputs = {"spot": Series(np.arange(len(z)) * SECOND, Spot(position=z))}
+    method = mmae(MOVES, STAYS, weights=[0.3, 0.7], method=linear())
+    found = simulate(both.build(method=method), inputs)["output"]["mean"]
+    assert (np.abs(found - means) / np.maximum(1.0, np.abs(means))).max() < 1e-12
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero encountered in log")
+def test_a_motion_that_lost_does_no_harm():
+    """Its weight is zero after a while, and the bank is the filter of the other."""
+    wild = DiscreteModel(F, 1e12 * Q + 1e-6 * np.eye(6))
+    _, z = crassidis(400)
+    inputs = {"spot": Series(np.arange(len(z)) * SECOND, Spot(position=z))}
+    found = simulate(both.build(method=mmae(STAYS, wild, method=linear())), inputs)
+    alone = simulate(both.build(method=mmae(STAYS, STAYS, method=linear())), inputs)
+    assert np.isfinite(found["output"]["mean"]).all()
+    np.testing.assert_allclose(found["output"]["mean"][-1], alone["output"]["mean"][-1], rtol=1e-12)
 
 
 def test_what_is_no_bank_is_refused():
@@ -128,6 +168,10 @@ def test_what_is_no_bank_is_refused():
         imm(MOVES)
     with pytest.raises(DeclarationError, match=r"this is no bank of motions"):
         imm(MOVES, STAYS, transition=[[0.9, 0.2], [0.0, 1.0]])
+    with pytest.raises(DeclarationError, match=r"mmae: this is no bank of motions[\s\S]*weights"):
+        mmae(MOVES, STAYS, weights=[0.5, 0.6])
+    with pytest.raises(DeclarationError, match=r"mmae.method: the filters of a bank keep a mean"):
+        mmae(MOVES, STAYS, method=particles(10))
     with pytest.raises(DeclarationError, match=r"keep a mean and a covariance"):
         imm(MOVES, STAYS, method=particles(10))
     with pytest.raises(DeclarationError, match=r"the motions of a bank are not of one state"):

@@ -35,6 +35,7 @@ from flowgraph.blocks.filtering import (
     extended,
     filtered,
     first,
+    information,
     linear,
     square_root,
     unscented,
@@ -109,6 +110,7 @@ METHODS = {
     "extended": extended(),
     "iterated": extended(iterations=3),
     "root": square_root(),
+    "information": information(),
     "unscented": unscented(),
     "cubature": cubature(),
 }
@@ -116,7 +118,11 @@ METHODS = {
 
 @pytest.mark.parametrize(
     "name",
-    ["extended", "unscented", *(pytest.param(n, marks=SLOW) for n in ("iterated", "root", "cubature"))],
+    [
+        "extended",
+        "unscented",
+        *(pytest.param(n, marks=SLOW) for n in ("iterated", "root", "information", "cubature")),
+    ],
 )
 def test_a_method_is_equal_in_all_engines_lowered_and_drawn(name):
     _, inputs = driven(3.0)
@@ -305,7 +311,7 @@ def test_on_a_root_a_sharp_measurement_leaves_a_covariance_in_single_precision()
 # -- what goes wrong in the field ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", [extended(), square_root(), unscented()])
+@pytest.mark.parametrize("method", [extended(), square_root(), information(), unscented()])
 def test_a_gate_refuses_and_finds_its_way_back(method):
     jump = {k: (50.0, 50.0) for k in range(20, 40)}
     built = point.build(method=method, gate=0.999)
@@ -332,7 +338,7 @@ def test_entries_that_are_missing_say_nothing(method):
     assert before == pytest.approx(after, rel=1e-14)
 
 
-@pytest.mark.parametrize("method", [extended(), square_root(), unscented()])
+@pytest.mark.parametrize("method", [extended(), square_root(), information(), unscented()])
 def test_a_filter_starts_from_its_first_measurement(method):
     def believe(fix, xp):
         mean = xp.concat([fix.position, xp.asarray([0.3, 5.0])])

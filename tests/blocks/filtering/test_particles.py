@@ -32,7 +32,7 @@ from flowgraph.blocks.filtering import (
     particles,
 )
 from flowgraph.blocks.signals import Gaussian
-from tests.blocks.filtering.test_filtered import PLACE, driven, point, spots, tracker
+from tests.blocks.filtering.test_filtered import PLACE, POINT, driven, point, spots, tracker
 from tests.support import all_engines
 
 MS = 1_000_000
@@ -69,6 +69,58 @@ def test_the_likelihood_is_the_exact_one_within_its_spread(proposal):
     assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio)) + 0.05
     apart = np.mean([r["output"]["mean"] for r in runs], axis=0) - exact["output"]["mean"]
     assert np.abs(apart).max() < 0.35
+
+
+def _broad(x, z, dt, xp):
+    """The motion's own noise, half as wide again, and moved towards what was measured."""
+    Q = POINT.discrete(dt, xp, np.float64)[2]
+    away = 0.2 * (z - x.position) * dt
+    return xp.concat([0.5 * away * dt, away], axis=-1), 2.25 * Q
+
+
+@pytest.mark.parametrize("proposal", ["bootstrap", "auxiliary"])
+def test_with_a_proposal_of_the_users_the_likelihood_is_the_exact_one(proposal):
+    inputs = spots(12)
+    exact = simulate(point.build(method=linear()), inputs)["log_likelihood"]["value"].sum()
+    method = lambda seed: particles(400, proposal=proposal, propose=_broad, seed=seed)
+    runs = [simulate(point.build(method=method(k)), inputs, seed=k, engine="reference") for k in range(12)]
+    ratio = np.exp([run["log_likelihood"]["value"].sum() - exact for run in runs])
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio)) + 0.02
+    assert ratio.std() < 2.0
+
+
+@pytest.mark.parametrize("proposal", ["bootstrap", "auxiliary"])
+def test_a_proposal_that_is_the_noise_itself_changes_nothing(proposal):
+    def own(x, dt, xp):
+        return xp.zeros((4,)), POINT.discrete(dt, xp, np.float64)[2]
+
+    inputs = spots(12)
+    built = [point.build(method=particles(50, proposal=proposal, propose=f)) for f in (None, own)]
+    one, other = (simulate(b, inputs, engine="reference")["output"]["mean"] for b in built)
+    np.testing.assert_allclose(other, one, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("proposal", ["bootstrap", "auxiliary"])
+def test_a_proposal_of_the_users_is_equal_in_all_engines(proposal):
+    all_engines(point.build(method=particles(50, proposal=proposal, propose=_broad), gate=0.999), spots(8))
+
+
+@pytest.mark.parametrize("proposal", PROPOSALS)
+def test_a_gate_refuses_and_finds_its_way_back(proposal):
+    jump = {k: (50.0, 50.0) for k in range(20, 40)}
+    built = point.build(method=particles(300, proposal=proposal), gate=0.999)
+    result = simulate(built, spots(at=jump), engine="reference")
+    accepted = result["innovation"]["accepted"]
+    assert accepted[:20].all()
+    assert not accepted[20:25].any()
+    assert accepted[-5:].all()
+    assert np.abs(result["output"]["mean"][-1][:2] - 50.0).max() < 2.0
+    single = point.build(method=particles(300, proposal=proposal), gate=0.999)
+    found = simulate(single, spots(at={20: (50.0, 50.0)}), engine="reference")
+    plain = simulate(single, spots(at={20: (np.nan, np.nan)}), engine="reference")
+    np.testing.assert_array_equal(found["output"]["mean"][20], found["prior"]["mean"][20])
+    assert np.abs(found["output"]["mean"] - plain["output"]["mean"])[:, :2].max() < 0.6
 
 
 NARROW = DiscreteModel([[1.0]], [[1.0]])
@@ -151,8 +203,10 @@ def test_what_is_out_of_range_is_refused():
         particles(10, proposal="guide")
     with pytest.raises(UnknownNameError, match="scheme"):
         particles(10, scheme="fair")
-    with pytest.raises(DeclarationError, match="particles have no gate"):
-        point.build(method=particles(10), gate=0.99)
+    with pytest.raises(DeclarationError, match="particles that the model guides have their proposal"):
+        particles(10, proposal="guided", propose=lambda x, xp: (0.0, 1.0))
+    with pytest.raises(DeclarationError, match=r"particles.propose[\s\S]*z, dt, xp"):
+        particles(10, propose=lambda x, a, b, xp: (0.0, 1.0))
     still = MotionModel(LEVEL, lambda x, dt, xp: x)
     seen = MeasurementModel(LEVEL, lambda x, xp: x.level, noise=1.0)
 

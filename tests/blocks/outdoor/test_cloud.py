@@ -127,11 +127,22 @@ SENSORS = {
 
 
 def sensed(name: str, cloud: OutdoorCloud, z: np.ndarray, noise: float) -> OutdoorCloud:
-    if name == "position":
-        return correct_position.step(cloud, Position(position=z), noise=noise, lever=LEVER, xp=np)
-    if name == "distance":
-        return correct_distance.step(cloud, Range(distance=z[0]), noise=noise, xp=np)
-    return correct_field.step(cloud, MagneticField(field=z * 5e-7), earth=tuple(EARTH), noise=5e-7, xp=np)
+    earth = tuple(EARTH)
+    _, (after, _) = {
+        "position": lambda: correct_position.step(
+            0.0, cloud, Position(position=z), noise=noise, lever=LEVER, xp=np
+        ),
+        "distance": lambda: correct_distance.step(0.0, cloud, Range(distance=z[0]), noise=noise, xp=np),
+        "field": lambda: correct_field.step(
+            0.0, cloud, MagneticField(field=z * 5e-7), earth=earth, noise=5e-7, xp=np
+        ),
+    }[name]()
+    return after
+
+
+def flowed(cloud: OutdoorCloud, flow: OpticalFlow, turn: float) -> OutdoorCloud:
+    _, (after, _) = correct_flow.step(0.0, cloud, flow, displacement=0.05, turn=turn, xp=np)
+    return after
 
 
 def check_update(
@@ -173,7 +184,7 @@ def test_optical_flow_corrects_as_one_kalman_filter_a_particle():
         turn=g.from_rotation_vector(np.array([0.01, -0.02, 0.015]), xp=np),
         interval=np.array(0.05),
     )
-    after = correct_flow.step(cloud, flow, displacement=0.05, turn=0.01, xp=np)
+    after = flowed(cloud, flow, 0.01)
 
     def minus(state: State) -> np.ndarray:
         motion, q, picture = state
@@ -181,7 +192,7 @@ def test_optical_flow_corrects_as_one_kalman_filter_a_particle():
         turn = turn_between(q, g.multiply(picture, flow.turn, xp=np))
         return np.concatenate([moved, turn])
 
-    first = correct_flow.step(cloud, flow, displacement=0.05, turn=1e6, xp=np)  # no turn to speak of
+    first = flowed(cloud, flow, 1e6)  # no turn to speak of
     check_update(cloud, first, lambda state: minus(state)[:3], np.eye(3) * 0.05**2)
     exact = one(first, 0)
     r = minus(exact)[3:]
@@ -234,6 +245,9 @@ def test_a_turn_that_is_certain_is_drawn_where_it_is():
 
 def test_without_a_reading_the_cloud_passes_through():
     cloud = a_cloud()
-    assert correct_flow.step(cloud, None, displacement=0.1, turn=0.1, xp=np) is cloud
-    assert correct_field.step(cloud, None, earth=tuple(EARTH), noise=1e-6, xp=np) is cloud
+    state, found = correct_flow.step(2.0, cloud, None, displacement=0.1, turn=0.1, xp=np)
+    assert state == 2.0
+    assert found == (cloud, None)
+    _, found = correct_field.step(2.0, cloud, None, earth=tuple(EARTH), noise=1e-6, xp=np)
+    assert found == (cloud, None)
     assert take_picture.step(cloud, None, draw=NumpyDraw("test", seed_words(1), 0), xp=np) is cloud
