@@ -43,7 +43,8 @@ def body(seconds: float) -> tuple[list[float], list[float]]:
 def send(port: int, seconds: float) -> None:
     """Send the packets of a flight, each at its time and a while later, and some not at all."""
     rng, sock = random.Random(1), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    begun, waiting, numbers = time.perf_counter(), [], dict.fromkeys(KINDS, 0)
+    begun, numbers = time.perf_counter(), dict.fromkeys(KINDS, 0)
+    waiting: list[tuple[float, bytes]] = []
     for stamp in range(0, round(seconds * 1e9), KINDS["imu"][0]):
         read, position = body(stamp * 1e-9)
         made = {"imu": [x + rng.gauss(0.0, 0.03 if k < 3 else 0.3) for k, x in enumerate(read)]}
@@ -84,7 +85,8 @@ def receive(sock: socket.socket, live: Live, seconds: float) -> tuple[dict[str, 
 
 def digests(graph: Any, arrived: dict[str, Series]) -> dict[str, str]:
     """Of each leaf of the belief, where the recorded events are run: 10 s by 10 s, so that memory is flat."""
-    state, found, step = None, {}, 10_000_000_000
+    state, step = None, 10_000_000_000
+    found: dict[str, Any] = {}
     for first in range(0, int(arrived["imu"].time[-1]) + 1, step):
         part = {n: s[(s.time >= first) & (s.time < first + step)] for n, s in arrived.items()}
         result = simulate(graph, part, engine="c", state=state)

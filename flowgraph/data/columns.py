@@ -18,7 +18,9 @@ class Columns:
         self._type, self._name, self._gaps = type_, name, gaps
         self._count = 0
         self._time = np.empty(64, np.int64)
-        self._leaves = [np.empty((64, *leaf.shape), DTYPES[leaf.dtype]) for _, leaf in leaves_of(type_)]
+        self._leaves: list[np.ndarray] = [
+            np.empty((64, *map(int, leaf.shape)), DTYPES[leaf.dtype]) for _, leaf in leaves_of(type_)
+        ]
 
     def add(self, time: int, leaves: Sequence[Any]) -> None:
         """One more row."""

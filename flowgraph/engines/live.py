@@ -311,7 +311,7 @@ class Live:
             {f"p{p:g}": d.percentile(p) for p in (50.0, 90.0, 99.0, 99.9)} | {"max": d.longest * 1e-9}
             for d in self._times
         ]
-        return Latencies(*shown, self._missed)
+        return Latencies(shown[0], shown[1], shown[2], self._missed)
 
     def _count_notes(self) -> list[str]:
         found = []

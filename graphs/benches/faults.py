@@ -114,7 +114,9 @@ def _rows(name: str, wanted: tuple[str, ...], seed: int) -> Iterator[dict[str, A
             lasts = _duration(fault)
             if lasts not in flights:
                 flights[lasts] = _flight(name, lasts, seed)[0]
-                usual[lasts] = _fly(name, flights[lasts], None, gate, seed)
+                flown = _fly(name, flights[lasts], None, gate, seed)
+                assert flown is not None
+                usual[lasts] = flown
             row: dict[str, Any] = {
                 "graph": name,
                 "fault": fault.name,

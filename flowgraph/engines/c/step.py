@@ -7,7 +7,6 @@ writes into it, calls, and copies out.
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,7 +32,7 @@ class SingleTicks(CellStepper):
         self._rows = library.single_rows()
         self._into = [
             [
-                rows[name][0, ...] if leaf.shape and math.prod(leaf.shape) else rows[name]
+                rows[name][0, ...] if leaf.shape and 0 not in leaf.shape else rows[name]
                 for name, leaf in zip(rows.dtype.names or (), port.leaves, strict=False)
             ]
             for rows, port in zip(self._rows, pipeline.inputs, strict=True)
