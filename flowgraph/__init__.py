@@ -24,8 +24,10 @@ from flowgraph.language.clock import aperiodic, periodic
 from flowgraph.language.declare import delay, graph
 from flowgraph.language.graph import Graph
 from flowgraph.language.joins import collect, every, latest, merge, sink
+from flowgraph.language.late import absent_for, label_data, resample_at, zip_last
 from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
+from flowgraph.language.stamps import stamp_of
 from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
@@ -34,8 +36,9 @@ from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
+    from flowgraph.data.arrival import batched, delayed, reorder, replayed, timeouts
     from flowgraph.data.batch import Batch
-    from flowgraph.data.export import write_tum
+    from flowgraph.data.export import write_table, write_tum
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
@@ -53,7 +56,13 @@ if _TYPE_CHECKING:
 
 # What is done with a graph is imported when it is first asked for: who declares pays for no engine.
 _LATER = {
+    "batched": "flowgraph.data.arrival",
+    "delayed": "flowgraph.data.arrival",
+    "reorder": "flowgraph.data.arrival",
+    "replayed": "flowgraph.data.arrival",
+    "timeouts": "flowgraph.data.arrival",
     "Batch": "flowgraph.data.batch",
+    "write_table": "flowgraph.data.export",
     "write_tum": "flowgraph.data.export",
     "arrays": "flowgraph.data.inputs",
     "clocks_of": "flowgraph.data.inputs",
@@ -145,15 +154,18 @@ __all__ = [
     "Tick",
     "TypeMismatchError",
     "UnknownNameError",
+    "absent_for",
     "aperiodic",
     "apply",
     "arrays",
     "batch",
+    "batched",
     "block",
     "boolean",
     "clocks_of",
     "collect",
     "delay",
+    "delayed",
     "delta_time",
     "drop",
     "every",
@@ -165,6 +177,7 @@ __all__ = [
     "integer",
     "integrate",
     "jacobian",
+    "label_data",
     "latest",
     "load_flight",
     "load_state",
@@ -176,22 +189,29 @@ __all__ = [
     "periodic",
     "real",
     "reduce",
+    "reorder",
+    "replayed",
+    "resample_at",
     "save_state",
     "scan",
     "simulate",
     "simulate_many",
     "sink",
     "stacked",
+    "stamp_of",
     "take_while",
     "tap",
     "ticks",
+    "timeouts",
     "timing_of",
     "until",
     "unzip",
     "when",
     "window",
+    "write_table",
     "write_tum",
     "zip",
+    "zip_last",
     "zip_latest",
     "zip_latest_right",
 ]

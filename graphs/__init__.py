@@ -5,6 +5,7 @@ from flowgraph.graphs.attitude_mekf import attitude_mekf
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.complementary import complementary
 from flowgraph.graphs.ekf import ekf
+from flowgraph.graphs.gnss_ins import gnss_ins
 from flowgraph.graphs.gyro_integration import gyro_integration
 from flowgraph.graphs.imu_calibration import imu_calibration
 from flowgraph.graphs.ins_ekf_pose import ins_ekf_pose
@@ -34,6 +35,7 @@ __all__ = [
     "kalman",
     "imu_calibration",
     "ins_eskf",
+    "gnss_ins",
     "marg",
     "attitude_mekf",
     "rbpf_indoor",

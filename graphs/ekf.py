@@ -22,13 +22,15 @@ from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.pose import (
     driving,
+    in_tangent_space,
     pose_belief,
     pose_steps,
     predict_pose,
     start_pose,
     update_pose,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.capture import on_capture
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Imu, Pose, QuaternionBelief
 
@@ -84,4 +86,4 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
     """
-    return on_capture(on, filter, start=start_pose, steps=pose_steps)
+    return on_capture(on, filter, start=start_pose, believed=in_tangent_space, steps=pose_steps)

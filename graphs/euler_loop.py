@@ -13,6 +13,7 @@ from typing import Any
 
 from flowgraph import collect, delay, latest
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.backward import Crossing, collect_steps
 from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
@@ -34,6 +35,7 @@ def euler_loop(
     patience: int,
     held: Held | None,
     gravity: tuple[float, float, float] = GRAVITY,
+    crossing: Crossing | None = None,
 ) -> dict[str, Any]:
     """Wire the loop, and name what a graph collects: `belief`, `angles` and the `innovation`.
 
@@ -47,11 +49,14 @@ def euler_loop(
         gate, patience: whether `update` refuses measurements, and how many in a row are taken for outliers.
         held: from which age on a reading is old.
         gravity: in the world, m/s^2, for what a unit at rest reads.
+        crossing: of the prediction, where a smoother is to go back over the run; then what it needs is
+            collected too.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(gravity), name="last_control")
     control = latest(imu, init=Imu.at_rest(gravity), at=imu | measured, name="control")
-    prior = predict(belief, driving(last, control, reading))
+    drive = driving(last, control, reading)
+    prior = predict(belief, drive)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     posterior, innovation = update(prior, control)
     if gate is not None:
@@ -59,6 +64,9 @@ def euler_loop(
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
+    if crossing is not None:
+        collect_steps(belief, prior, drive, crossing=crossing, held=held)
+        collect(posterior, "posterior")
     return {
         "belief": navigation_belief(posterior, order=order),
         "angles": euler_angles(posterior, order=order),

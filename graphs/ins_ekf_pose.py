@@ -15,7 +15,7 @@ from typing import Any
 from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
-from flowgraph.blocks.models.euler_ins import predict_extended, update_pose_angles
+from flowgraph.blocks.models.euler_ins import extended_crossing, predict_extended, update_pose_angles
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
 from flowgraph.blocks.scoring.tuning import with_imu
@@ -40,15 +40,17 @@ def ins_ekf_pose(
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """15-state extended Kalman filter with Euler angles: IMU control, camera pose.
 
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
+    Collected: `belief` and `angles` at every tick, and the `innovation` at every pose; with `smoothing` what
+    a smoother needs too.
     """
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
-        gravity=gravity,
+        gravity=gravity, crossing=extended_crossing(order) if smoothing else None,
         predict=lambda belief, drive: predict_extended(
             belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
@@ -70,4 +72,6 @@ def for_flight(on: OnFlight, *, filter: EulerFilter) -> Case:
         DataError: where the flight lacks a stream.
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
-    return on_measured_pose(on, filter, poses_of(on.name, on.flight, tags=filter.tags))
+    return on_measured_pose(
+        on, filter, poses_of(on.name, on.flight, tags=filter.tags), smoothing=filter.smoothed
+    )

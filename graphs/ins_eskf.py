@@ -15,12 +15,15 @@ from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, 
 from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
+from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_flight
+from flowgraph.blocks.models.inertial_pose import inertial_crossing, inertial_steps, stacked
+from flowgraph.blocks.models.recordings import inertial_recording
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.start import StartPose
-from flowgraph.blocks.scoring.tuning import with_imu
+from flowgraph.blocks.scoring.tuning import reading_of, with_imu
 from flowgraph.blocks.signals import Attitude, Belief, Imu, Position
 
 SEARCHED, LONGEST, HEADINGS = 15.0, 60.0, 12
@@ -53,17 +56,22 @@ def ins_eskf(
     held: Held | None = None,
     invariant: bool = False,
     patience: int = PATIENCE,
+    smoothing: bool = False,
 ):
     """15-state error-state Kalman filter: every tick predicts to now; a tick with a measurement also updates.
 
     State: position, velocity, attitude, gyroscope and accelerometer bias. The error is local: a right (body)
-    rotation vector. Collected: `belief` at every tick, and the innovation of each aid where there was one.
+    rotation vector. Collected: `belief` at every tick, and the innovation of each aid where there was one;
+    with `smoothing` what a smoother needs too.
     """
     ticks = imu | position if attitude is None else imu | position | attitude
     belief = delay(start, name="belief")
     control = latest(imu, init=Imu.at_rest(gravity), name="control")
     prior = predict(belief, control, noise=noise, gravity=gravity, at=ticks)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
+    if smoothing:
+        drive = latest(imu, init=Imu.at_rest(gravity), at=ticks, name="drive")
+        collect_steps(belief, prior, drive, crossing=inertial_crossing, held=held)
     posterior, innovation = aid_position(
         prior, position, noise=position_noise, lever=lever, gate=gate, invariant=invariant
     )
@@ -84,7 +92,7 @@ def ins_eskf(
 
 
 @on_flight(ins_eskf, told=with_imu)
-def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
+def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
     """Start and tune the filter for a flight with an IMU and a position: EuRoC, or the simulated one.
 
     The start is the truth's position, the attitude that takes the measured specific force to +z and is
@@ -117,11 +125,15 @@ def for_flight(on: OnFlight, *, filter: PoseFilter) -> Case:
     guess = Guess(begin.attitude) if begin.heading is None else Guess(begin.attitude, begin.heading, True)
     if attitude is None and (guess.invariant or filter.start_heading is not None):
         guess = _searched(on, inputs, begin, guess, force, settings)
+    start = guess.belief(begin.position, force)
+    known = {name: value for name, value in settings.items() if name not in filter.gating()}
+    recording = inertial_recording(inputs, start=stacked(start), reading=reading_of(on.flight), **known)
     return on.case(
-        filter.score(on, pose_errors),
+        filter.score(on, pose_errors, steps=inertial_steps, recording=recording),
         inputs=inputs,
-        start=guess.belief(begin.position, force),
+        start=start,
         invariant=guess.invariant,
+        smoothing=filter.smoothed,
         **settings,
     )
 
@@ -182,7 +194,8 @@ def _searched(
             break
         seconds *= 2.0
     if begin.unknown:
-        on.note("warning", "the measurements do not tell the heading at the start: it stays unknown")
+        sentence = "it stays unknown, however sure the filter grows of it"
+        on.note("warning", f"the measurements do not tell the heading at the start: {sentence}")
     return guess
 
 
@@ -213,5 +226,5 @@ def _inputs(on: OnFlight) -> tuple[dict[str, Series], str]:
         return {"imu": streams["imu"], "position": streams["leica"]}, "leica_lever"
     streams = on.need("imu", "vicon", fix="choose a flight with an imu, and leica or vicon")
     vicon = streams["vicon"]
-    turns = Series(vicon.time, Attitude(attitude=vicon["attitude"]), name="attitude", gaps=vicon.gaps)
+    turns = vicon.holding(Attitude(attitude=vicon["attitude"]), "attitude")
     return {"imu": streams["imu"], "position": positions(vicon), "attitude": turns}, "vicon_lever"

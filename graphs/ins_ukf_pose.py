@@ -24,7 +24,7 @@ from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, FarPoints, on_measured_pose
 from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, PoseMeasurement
-from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented.filters import predict_unscented, unscented_crossing
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.graphs.euler_loop import euler_loop
 from flowgraph.graphs.tag_pose import poses_of
@@ -50,20 +50,20 @@ def ins_ukf_pose(
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera pose.
 
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `belief` and `angles` at every tick, and the `innovation` at every pose.
+    Collected: `belief` and `angles` at every tick, and the `innovation` at every pose; with `smoothing` what
+    a smoother needs too.
     """
-    predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
-        points=points, name="predict",
-    )  # fmt: skip
+    moving: dict[str, Any] = {"move": carried(order, gravity), "noise": np.diag(increment_variances(noise))}
+    moving |= {"space": STATE, "points": points}
     return euler_loop(
         imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
-        gravity=gravity,
-        predict=predict,
+        gravity=gravity, crossing=unscented_crossing(**moving) if smoothing else None,
+        predict=lambda belief, drive: predict_unscented(belief, drive, name="predict", **moving),
         update=lambda prior, _: update_pose_angles(
             prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
         ),
@@ -83,4 +83,4 @@ def for_flight(on: OnFlight, *, filter: EulerFilter, sigma: FarPoints) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     poses = poses_of(on.name, on.flight, tags=filter.tags)
-    return on_measured_pose(on, filter, poses, points=sigma.points(12))
+    return on_measured_pose(on, filter, poses, points=sigma.points(12), smoothing=filter.smoothed)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.metrics.errors import pose_errors
@@ -25,16 +26,19 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -54,19 +58,25 @@ def outdoor_eskf(
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `belief` at every tick, and the innovation of each sensor where there was a reading.
+    Collected: `belief` at every tick, and the innovation of each sensor where there was a reading;
+    with `smoothing` what a smoother needs too.
     """
     s = sensors
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
     control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
-    now = predict_clone(belief, driving(last, control, reading), noise=s.imu, name="predict")
+    drive = driving(last, control, reading)
+    now = predict_clone(belief, drive, noise=s.imu, name="predict")
     now = bridged(belief, now, imu, held=held, position=0, velocity=3, attitude=6)
+    if smoothing:
+        taken = delay(start, name="taken")
+        collect_steps(taken, now, drive, crossing=clone_crossing, held=held)
 
     def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
         collect(innovation, f"{name}_innovation")
@@ -100,6 +110,9 @@ def outdoor_eskf(
         R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
     )  # fmt: skip
     now = told(now, innovation, "optical_flow")
+    if smoothing:  # what is smoothed has the clone that its readings were measured from
+        collect(now, "posterior")
+        taken.feed(picture_cross(now, optical_flow, name="picture_cross"))
     now = new_picture(now, optical_flow, name="picture")
     last.feed(control)
     belief.feed(now)
@@ -107,20 +120,21 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Scored) -> Case:
+def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Smoothed) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
     """
     inputs, sensors, first = outdoor_flight(on.flight, on.name)
-    score = scored.score(on, pose_errors)
+    score = scored.score(on, pose_errors, steps=outdoor_steps)
     return on.case(
         score,
         inputs=inputs,
         start=start_outdoor(first),
         sensors=sensors,
         reading=reading_of(on.flight),
+        smoothing=scored.smoothed,
         held=control.held(on, inputs["imu"], inputs),
         **gated.gating(),
     )

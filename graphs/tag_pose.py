@@ -125,14 +125,16 @@ def poses_of(graph_name: str, flight: Flight, *, tags: str = "all") -> Series:
                 got=f"{len(flight.streams['tags'])} images",
                 fix="check the map's ids, or the setting tags",
             )
-        return Series(found.time, found.values, name="pose")
+        seen = flight.streams["tags"]
+        stamp = seen.stamp[np.searchsorted(seen.time, found.time)] if seen.is_late else None
+        return Series(found.time, found.values, name="pose", stamp=stamp)
     measured = flight.need(graph_name, source)[source]
     if source == "pose":
         return measured
     pose: Any = measured.values
     assert isinstance(pose, Pose)
     values = as_measurements(pose.position, pose.attitude)
-    return Series(measured.time, values, name="pose", gaps=measured.gaps)
+    return measured.holding(values, "pose")
 
 
 __all__ = ["PoseMeasurement", "poses_of", "tag_pose"]

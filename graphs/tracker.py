@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Stream, block, graph
+from flowgraph import Case, DataError, Result, Series, Stream, block, graph
 from flowgraph.blocks.filtering import (
     LinearMeasurement,
     cubature,
@@ -27,11 +27,14 @@ from flowgraph.blocks.filtering import (
     particles,
     unscented,
 )
+from flowgraph.blocks.filtering.batch import Recording
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.tracking import constant_velocity
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive, one_of
 from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
+from flowgraph.errors import DeclarationError
 
 METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
 
@@ -40,6 +43,21 @@ METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
 def seen_in_plane(belief: Gaussian) -> PlaneBelief:
     """The position of a belief about position and velocity."""
     return PlaneBelief(position=belief.mean[..., :2], covariance=belief.covariance[..., :2, :2])
+
+
+def seen_position(noise: float) -> LinearMeasurement:
+    """The measured position; noise: standard deviation on each axis, m."""
+    return LinearMeasurement(constant_velocity(1.0).space, np.eye(2, 4), noise=noise**2)
+
+
+def plane_steps(result: Result) -> Steps:
+    """Those of a run that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, seen_in_plane.step(belief), name=smoothed.name)
+
+    return steps_of(result)._replace(named=named)
 
 
 @graph
@@ -52,17 +70,21 @@ def tracker(
     method: Any = None,
     gate: float | None = None,
     patience: int = 5,
+    smoothing: bool = False,
 ):
     """A point whose velocity wanders, followed by its positions.
 
-    Collected at every position: `belief`, `prior`, `posterior`, `innovation` and `log_likelihood`.
+    Collected at every position: `belief`, `prior`, `posterior`, `innovation` and `log_likelihood`; with
+    `smoothing` what a smoother needs too.
     """
     motion = constant_velocity(wander)
-    seen = LinearMeasurement(motion.space, np.eye(2, 4), noise=position_noise**2)
+    seen = seen_position(position_noise)
     belief = filtered(
-        motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience
-    )
-    return {"belief": seen_in_plane(belief), "posterior": belief}
+        motion, {seen: position}, start=start, method=method or linear(), gate=gate, patience=patience,
+        smoothing=smoothing,
+    )  # fmt: skip
+    posterior = {} if smoothing else {"posterior": belief}  # then the filter collects it
+    return {"belief": seen_in_plane(belief), **posterior}
 
 
 @on_flight(tracker, "position", ranged=False)
@@ -75,7 +97,7 @@ def for_flight(
     position_noise: Positive | None = None,
     cloud: Particles,
     gated: Gated,
-    scored: Scored,
+    scored: Smoothed,
 ) -> Case:
     """Start the filter at the first position of a flight in the plane, such as `sim:plane`.
 
@@ -88,7 +110,8 @@ def for_flight(
         position_noise: standard deviation in m; the flight's own if left out.
 
     Raises:
-        DataError: where the flight lacks the stream; DeclarationError: for a setting that is out of range.
+        DataError: where the flight lacks the stream, or is not in a plane.
+        DeclarationError: for a setting that is out of range.
     """
     motion = constant_velocity(wander)
     chosen = {
@@ -101,11 +124,28 @@ def for_flight(
     }[method]()
     noise = on.noise("position_noise", position_noise)
     first = on.inputs["position"]["position"][0]
+    if first.shape != (2,):
+        raise DataError(
+            "the tracker follows a point in a plane", path=f"{on.flight.name}: position",
+            expected="positions of two numbers", got=f"of {len(first)}",
+            fix="choose a flight such as sim:plane",
+        )  # fmt: skip
+    start = motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0))
+    if method == "particles" and scored.smoothed:
+        raise DeclarationError(
+            "particles have no smoother that goes back over their run",
+            path="tracker.method",
+            expected="linear, extended, unscented or cubature, with smooth or lag",
+            got="particles",
+            fix='smooth the clouds of a run of your own: smoothed_cloud(result["cloud"], motion)',
+        )
+    recording = Recording(motion, {seen_position(noise): on.inputs["position"]}, start)
     return on.case(
-        scored.score(on, plane_errors),
-        start=motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0)),
+        scored.score(on, plane_errors, steps=plane_steps, recording=recording),
+        start=start,
         wander=wander,
         position_noise=noise,
         method=chosen,
+        smoothing=scored.smoothed,
         **gated.gating(),
     )

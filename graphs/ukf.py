@@ -25,6 +25,7 @@ import numpy as np
 
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.pose import POSE, driving
 from flowgraph.blocks.models.unscented_pose import (
@@ -34,12 +35,14 @@ from flowgraph.blocks.models.unscented_pose import (
     named_pose,
     see_pose,
     start_state,
+    unscented_steps,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter, on_capture, on_flight
+from flowgraph.blocks.scoring.capture import on_capture
+from flowgraph.blocks.scoring.cases import OnFlight, SmoothedPoseFilter, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import with_imu
 from flowgraph.blocks.signals import Gaussian, Imu, Pose
-from flowgraph.blocks.unscented.filters import predict_unscented, update_unscented
+from flowgraph.blocks.unscented.filters import predict_unscented, unscented_crossing, update_unscented
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 
 _NONE = (0.0, 0.0, 0.0)
@@ -66,23 +69,19 @@ def ukf(
     gate: float | None = None,
     patience: int = PATIENCE,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """Unscented Kalman filter of position, velocity and quaternion: IMU control, motion capture pose.
 
-    Collected: `belief` at every tick, and the `innovation` at every pose.
+    Collected: `belief` at every tick, and the `innovation` at every pose; with `smoothing` what a smoother
+    needs too.
     """
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(gravity), name="last_control")
     control = latest(imu, init=Imu.at_rest(gravity), at=imu | vicon, name="control")
     drive = driving(last, control, reading)
-    prior = predict_unscented(
-        belief,
-        drive,
-        move=carry_pose(gravity),
-        noise=imu_density(noise),
-        space=STATE,
-        points=points,
-    )
+    moving = {"move": carry_pose(gravity), "noise": imu_density(noise), "space": STATE, "points": points}
+    prior = predict_unscented(belief, drive, **moving)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
     posterior, innovation = update_unscented(
         prior,
@@ -99,6 +98,9 @@ def ukf(
     belief.feed(posterior)
     last.feed(control)
     collect(innovation, "innovation")
+    if smoothing:
+        collect_steps(belief, prior, drive, crossing=unscented_crossing(**moving), held=held)
+        collect(posterior, "posterior")
     return {"belief": named_pose(posterior)}
 
 
@@ -106,7 +108,7 @@ def ukf(
 def for_flight(
     on: OnFlight,
     *,
-    filter: PoseFilter,
+    filter: SmoothedPoseFilter,
     alpha: Positive = 1.0,
     beta: float = 2.0,
     kappa: float = 0.0,
@@ -122,4 +124,7 @@ def for_flight(
         alpha, beta, kappa: of the sigma points; in float32 or fixed point alpha must be at least 0.1.
         mean: of quaternions, "markley" or "kraft".
     """
-    return on_capture(on, filter, start=start_state, points=SigmaPoints(alpha, beta, kappa, mean))
+    return on_capture(
+        on, filter, start=start_state, believed=lambda start: start, steps=unscented_steps,
+        smoothing=filter.smoothed, points=SigmaPoints(alpha, beta, kappa, mean),
+    )  # fmt: skip

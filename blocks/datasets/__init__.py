@@ -24,11 +24,32 @@ from flowgraph.blocks.datasets import (
     csv_file,
     ese650,
     euroc,
+    kitti,
+    nmea,
+    outdoor_quadrotor,
+    px4,
     rob6213,
     rosbag,
+    rtklib,
     studentdata,
     tum,
     umd,
 )
 
-__all__ = ["broad", "course", "csv_file", "ese650", "euroc", "rob6213", "rosbag", "studentdata", "tum", "umd"]
+__all__ = [
+    "broad",
+    "course",
+    "csv_file",
+    "ese650",
+    "euroc",
+    "kitti",
+    "nmea",
+    "outdoor_quadrotor",
+    "px4",
+    "rob6213",
+    "rosbag",
+    "rtklib",
+    "studentdata",
+    "tum",
+    "umd",
+]

@@ -120,8 +120,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     notes, absent = made.notes, made.info["absent"]
     stamped = _stamped(seconds, file, notes)
     seconds, table = seconds[stamped], {name: values[stamped] for name, values in table.items()}
-    keep, late = strictly_later(seconds, "time", file)
-    notes += late
+    keep, unordered = strictly_later(seconds, "time", file)
+    notes += unordered
     seen = np.concatenate([table["position"], table["angle"]], axis=1)[keep]
     moved = np.concatenate([table["linearVel"], table["angVel"]], axis=1)[keep]
     stamps = Series.from_seconds(seconds[keep], seconds[keep]).time

@@ -46,7 +46,8 @@ _OF_A_STREAM: Mapping[str, str] = {
 
 SETTINGS: Mapping[str, str] = {
     "topics": "NAME:TOPIC, comma-separated: which topics to read, and their streams' names; truth is one",
-    "stamp": "header (when it was measured) or bag (when it was recorded)",
+    "stamp": "header (when it was measured), bag (when it was recorded), or both: true by the header, and "
+    "arrived as the bag says",
     **{f"STREAM.{name}": meaning for name, meaning in _OF_A_STREAM.items()},
     **NOISE_SETTINGS,
     **MEASURED_NOISE,
@@ -55,7 +56,7 @@ SETTINGS: Mapping[str, str] = {
 }
 """The settings of `load` and what they mean. STREAM stands for the name of any."""
 
-STAMPS = ("header", "bag")
+STAMPS = ("header", "bag", "both")
 _DOWN = re.compile(r"(^|_)(ned|frd|esd)($|_)", re.IGNORECASE)
 _STRANGE = 3_600 * 10**9
 """ns: stamps that are farther from a stamp of 0 were not counted from there."""
@@ -90,7 +91,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         policy(given, "rosbag"),
         kind="rosbag",
         given=given,
-        clock="stamp=bag takes the clock of the recorder" if stamp == "header" else "check the bag",
+        clock="stamp=bag takes the clock of the recorder" if stamp != "bag" else "check the bag",
         units="mend the driver: ROS has SI units",
         place=argument,
     )
@@ -207,10 +208,11 @@ def _read(
     made.add(
         name,
         place,
-        _stamps(place, name, found, stamp),
+        _stamps(place, name, found, "bag" if stamp == "bag" else "header"),
         {field: table[:, part] for field, part in how.fields.items()},
         how.signal,
         row=lambda k: f"{place}, message {k + 1}",
+        arrival=_stamps(place, name, found, "bag") if stamp == "both" and name != "truth" else None,
     )
     frame, body = found.who[0]
     made.info["topics"][name], made.info["frames"][name] = topic, frame

@@ -32,6 +32,7 @@ from flowgraph.blocks.datasets.settings import (
 )
 from flowgraph.blocks.datasets.stamps import POLICIES, check_clock, in_order
 from flowgraph.blocks.geometry.rotations import rotate
+from flowgraph.data.arrival import delayed
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
@@ -57,6 +58,7 @@ __all__ = [
 ]
 
 stream_settings = adjust.stream_settings
+_ARRIVAL = "arrival"  # how late each row came, ns: it goes with the rows, whatever becomes of them
 
 
 def present(
@@ -168,6 +170,7 @@ class Recording:
         raw: bool = False,
         exact: bool = False,
         scalar_last: bool = False,
+        arrival: np.ndarray | None = None,
     ) -> Series:
         """A stream, or the truth where `name` is "truth".
 
@@ -187,6 +190,8 @@ class Recording:
             raw: whether the numbers are counts, of which nothing is known.
             exact: whether attitudes are of unit norm as they were made, and not read.
             scalar_last: whether attitudes are x, y, z, w; they are put scalar first.
+            arrival: (n,) int64 ns, when each row arrived, of the clock of `time`; when it was true, if left
+                out.
 
         Raises:
             DataError: for stamps that are no clock's or out of order, infinite values, attitudes that are
@@ -220,8 +225,12 @@ class Recording:
         time = adjust.shifted(name, place, np.asarray(time), how.shift)
         if how.shift:
             self.notes.append(note("info", f"{name}: stamps shifted by {how.shift} ns"))
+        if arrival is not None:
+            names.append(_ARRIVAL)
+            flat[_ARRIVAL] = (arrival - time).astype(float)[:, None]
         rows = np.flatnonzero(~gone) if name != "truth" else np.arange(len(time))
-        time, rows, said = in_order(name, lambda k: where(int(rows[k])), time[rows], rows, self.bad_time)
+        overtaken = "sort" if arrival is not None else self.bad_time
+        time, rows, said = in_order(name, lambda k: where(int(rows[k])), time[rows], rows, overtaken)
         self.notes += said
         time, rows = self._clocked(name, where, time, rows, inertial="specific_force" in flat)
         table = np.concatenate([flat[n] for n in names], axis=1)[rows]
@@ -233,9 +242,10 @@ class Recording:
         time, table = time[keep], table[keep]
         widths = np.cumsum([flat[n].shape[1] for n in names])[:-1]
         parts = {
-            n: part.reshape(len(time), *np.shape(columns[n])[1:])
+            n: part.reshape(len(time), *np.shape(columns.get(n, time))[1:])
             for n, part in zip(names, np.split(table, widths, axis=1), strict=True)
         }
+        late = parts.pop(_ARRIVAL, None)
         if checked and not raw:
             for field, part in parts.items():
                 plausible(field, part, f"{place}: {name}.{field}", self._convert(name, field))
@@ -243,11 +253,30 @@ class Recording:
             self.notes += doubtful(name, time, parts)
         parts = self._placed(name, parts, how, mount)
         series = Series(time, signal(**parts), name=name, gaps=name == "truth")
+        if late is not None:
+            series = self._arrived(series, place, late)
         if name == "truth":
             self.truth = series
         else:
             self.streams[name] = series
         return series
+
+    def _arrived(self, series: Series, place: str, late: np.ndarray) -> Series:
+        """The stream as it arrived, `late` ns (n,) after it was true."""
+        if (late < 0).any():
+            k = int(np.argmin(late))
+            raise DataError(
+                "a value arrived before it was true",
+                path=f"{place}: {series.name}",
+                expected="arrivals after the stamps, by one clock",
+                got=f"{-late[k] * 1e-9:.6g} s before it, at t = {series.time[k]} ns",
+                fix=f"{series.name}.time_offset={late[k] * 1e-9:.6g} moves the stamps",
+            )
+        mean, most = late.mean() * 1e-9, late.max() * 1e-9
+        self.notes.append(
+            note("info", f"{series.name}: arrived {mean:.3g} s after it was true, {most:.3g} s at most")
+        )
+        return delayed(series, late.astype(np.int64))
 
     def take(self, series: Series, place: str) -> Series:
         """A stream that was made elsewhere, or the truth, by the name of the series; its clock and its units

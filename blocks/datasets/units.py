@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["ANGLE", "FIELD", "FORCE", "LENGTH", "RATE", "SPEED", "TIME", "split_unit", "unit_of"]
+__all__ = ["ANGLE", "FIELD", "FORCE", "KINDS", "LENGTH", "RATE", "SPEED", "TIME", "split_unit", "unit_of"]
 
 _DEGREE = np.pi / 180.0
 LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
@@ -31,9 +31,10 @@ TIME = {
 }
 """Of a unit of time, in ns; the first of each kind is what is taken where nothing is said."""
 
+KINDS = (LENGTH, RATE, FORCE, FIELD, ANGLE, SPEED)
 _NONE = "none"
 _SPELLINGS: Mapping[str, str] = {
-    **{u: u for kind in (LENGTH, RATE, FORCE, FIELD, ANGLE, SPEED, TIME) for u in kind},
+    **{u: u for kind in (*KINDS, TIME) for u in kind},
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),

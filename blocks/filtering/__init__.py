@@ -2,13 +2,25 @@
 
 A model is declared once (`statespace`), over a `StateSpace` with named parts; `filtered` makes a filter of it
 by any method, as a sub-graph of delay, predict and correct. `methods` has them by name, `gaussian` the maths
-of those that believe in a Gaussian. Everything that a user's own filter needs is importable from here.
+of those that believe in a Gaussian. `rewind` runs any filter over events that come late. Everything that a
+user's own filter needs is importable from here.
 """
 
 from __future__ import annotations
 
 from flowgraph.blocks.filtering.ageing import AgedMotion, Ageing, doubt_control
 from flowgraph.blocks.filtering.banks import Interacting, imm, mmae
+from flowgraph.blocks.filtering.batch import (
+    LOSSES,
+    Aged,
+    Derived,
+    Loss,
+    Recording,
+    cauchy,
+    estimate_batch,
+    huber,
+    loss_of,
+)
 from flowgraph.blocks.filtering.ensembles import Ensemble, carry_ensemble, correct_ensemble, ensemble
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
@@ -31,6 +43,7 @@ from flowgraph.blocks.filtering.methods import (
     Method,
     Seen,
     correct,
+    crossed,
     cubature,
     extended,
     linear,
@@ -46,10 +59,12 @@ from flowgraph.blocks.filtering.proposals import (
     guide_cloud,
     propose_cloud,
 )
+from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
+from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
 from flowgraph.blocks.filtering.towards import find_cloud_back
 from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
-from flowgraph.blocks.kalman import LinearModel
+from flowgraph.blocks.kalman import LinearModel, smooth
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.statespace import (
     DiscreteModel,
@@ -61,6 +76,12 @@ from flowgraph.blocks.statespace import (
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
+    "crossed",
+    "loss_of",
+    "Recording",
+    "Derived",
+    "Aged",
+    "LOSSES",
     "StateSpace",
     "euclidean",
     "angle",
@@ -81,6 +102,13 @@ __all__ = [
     "AgedMotion",
     "doubt_control",
     "FirstMeasurement",
+    "smooth",
+    "backward_simulation",
+    "smoothed_cloud",
+    "estimate_batch",
+    "Loss",
+    "huber",
+    "cauchy",
     "linear",
     "extended",
     "information",
@@ -116,6 +144,9 @@ __all__ = [
     "Seen",
     "predict",
     "correct",
+    "rewind",
+    "Rewound",
+    "OLDER",
     "GaussianMethod",
     "Linear",
     "Extended",

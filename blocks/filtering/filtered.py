@@ -67,6 +67,7 @@ def filtered(
     method: Method | None = None,
     gate: float | None = None,
     patience: int = PATIENCE,
+    smoothing: bool = False,
     name: str = "filter",
 ) -> Stream[Gaussian]:
     """The belief about the state of a model, by any method: a sub-graph.
@@ -88,6 +89,8 @@ def filtered(
         gate: as in `update_linear`: below 1 the probability with which an honest measurement passes, from 1
             on the largest NIS. Refused measurements change nothing.
         patience: how many refusals in a row are taken for outliers; then the gate opens again (`find_back`).
+        smoothing: collect what a smoother needs too: the `posterior`, and the `cross` covariance of each
+            belief with the next prior; of particles the `cloud`; and the `control` of each step.
         name: of the sub-graph; two in one graph need two.
 
     Returns:
@@ -112,8 +115,12 @@ def filtered(
         initial = method.begin(rest, motion, NumpyDraw("start", seed_words(method.seed), 0), np)
         kept = delay(initial, name="belief")
         found = method.advance(kept, last, motion, seen, at=ticks, gate=gate, patience=patience)
+        more = dict(method.smoothable(kept, last, motion, found, at=ticks)) if smoothing else {}
         if isinstance(start, FirstMeasurement):
-            found = _from_first(found, start, seen, initial, motion, method)
+            found, more = _from_first(found, more, start, seen, initial, motion, method)
+        if smoothing:
+            more["posterior"] = found.belief
+            more |= {} if last is None else {"control": last}
         kept.feed(found.kept)
     own = "" if name == "filter" else f"{name}_"
     collect(found.prior, f"{own}prior")
@@ -121,7 +128,7 @@ def filtered(
         front = own + (f"{label}_" if len(seen) > 1 else "")
         collect(stream, f"{front}innovation")
         collect(found.log_likelihoods[label], f"{front}log_likelihood")
-    for label, stream in found.more.items():
+    for label, stream in [*found.more.items(), *more.items()]:
         collect(stream, own + label)
     return found.belief
 
@@ -207,9 +214,10 @@ def _chosen(first: Array, a: Any, b: Any, xp: Any) -> Any:
 
 
 def _from_first(
-    found: Advanced, start: FirstMeasurement, seen: list[Seen], rest: Any, motion: Motion, method: Method
-) -> Advanced:
-    """What a tick makes, where the filter waits for its first message."""
+    found: Advanced, more: Mapping[str, Any], start: FirstMeasurement, seen: list[Seen], rest: Any,
+    motion: Motion, method: Method,
+) -> tuple[Advanced, dict[str, Any]]:  # fmt: skip
+    """What a tick makes, and `more` of it, where the filter waits for its first message."""
     message = next((one.stream for one in seen if one.model is start.measurement), None)
     if message is None:
         raise DeclarationError(
@@ -226,7 +234,7 @@ def _from_first(
     )  # fmt: skip
     started.feed(now)
     belief = believed(kept, method=method, motion=motion, name="started_belief")
-    return Advanced(
+    advanced = Advanced(
         kept,
         once(prior, now, name="started_prior"),
         once(belief, now, name="once"),
@@ -234,3 +242,4 @@ def _from_first(
         {name: once(s, started, name=f"{name}_likelihood") for name, s in found.log_likelihoods.items()},
         found.more,
     )
+    return advanced, {name: once(s, now, name=f"started_{name}") for name, s in more.items()}

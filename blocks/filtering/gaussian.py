@@ -35,7 +35,7 @@ from flowgraph.blocks.kalman.roots import correct_root
 from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, GaussianRoot, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
-from flowgraph.blocks.unscented.filters import through_motion, through_observation
+from flowgraph.blocks.unscented.filters import motion_cross, through_motion, through_observation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import Limit, When
@@ -57,6 +57,20 @@ class GaussianMethod(abc.ABC):
     @abc.abstractmethod
     def predicted(self, kept: Any, control: Any, motion: Motion, dt: Any, xp: Any) -> Any:
         """What is kept, after dt seconds with a control that is held over the step."""
+
+    def crossed(self, kept: Any, control: Any, motion: Motion, dt: Any, xp: Any) -> Array:
+        """The covariance (t, t) of what is kept and of what `predicted` makes of it, for a smoother.
+
+        Raises:
+            DeclarationError: of a method that has none.
+        """
+        raise DeclarationError(
+            "this method has no smoother that goes back over its run",
+            path=f"filtered.{type(self).__name__}",
+            expected="linear(), extended(), square_root(), information(), unscented() or cubature()",
+            got=repr(self),
+            fix="leave smoothing out, or use another method",
+        )
 
     @abc.abstractmethod
     def corrected(
@@ -85,6 +99,9 @@ class Extended(GaussianMethod):
         P = F @ kept.covariance @ F.mT
         P = P if Q is None else P + Q
         return Gaussian(mean=mean, covariance=0.5 * (P + P.mT))
+
+    def crossed(self, kept: Gaussian, control: Any, motion: Motion, dt: Any, xp: Any) -> Array:
+        return kept.covariance @ motion.linearised(kept.mean, control, dt, xp)[1].mT
 
     def corrected(
         self, kept: Gaussian, message: Any, measurement: Measurement, gate: float | None, xp: Any
@@ -147,6 +164,10 @@ class SquareRoot(GaussianMethod):
         wide = wide if Q is None else xp.concat([wide, semidefinite_root(Q, xp=xp)], axis=-1)
         return GaussianRoot(mean=mean, root=lower_root(wide, xp=xp))
 
+    def crossed(self, kept: GaussianRoot, control: Any, motion: Motion, dt: Any, xp: Any) -> Array:
+        F = motion.linearised(kept.mean, control, dt, xp)[1]
+        return kept.root @ (F @ kept.root).mT
+
     def corrected(
         self, kept: GaussianRoot, message: Any, measurement: Measurement, gate: float | None, xp: Any
     ) -> tuple[GaussianRoot, When, Array]:
@@ -177,6 +198,13 @@ class Unscented(GaussianMethod):
             kept.mean, kept.covariance, carry, shaken, space=motion.space, points=self.points, xp=xp
         )
         return Gaussian(mean=mean, covariance=0.5 * (P + P.mT))
+
+    def crossed(self, kept: Gaussian, control: Any, motion: Motion, dt: Any, xp: Any) -> Array:
+        shaken = motion.noise_root(control, dt, kept.mean.dtype, xp)
+        carry = lambda x, w: motion.carry(x, control, w, dt, xp)
+        return motion_cross(
+            kept.mean, kept.covariance, carry, shaken, space=motion.space, points=self.points, xp=xp
+        )
 
     def corrected(
         self, kept: Gaussian, message: Any, measurement: Measurement, gate: float | None, xp: Any

@@ -50,6 +50,10 @@ class Information(GaussianMethod):
             M = xp.linalg.solve(xp.eye(M.shape[-1], dtype=M.dtype) + M @ Q, M)
         return GaussianInformation(mean=mean, information=0.5 * (M + M.mT))
 
+    def crossed(self, kept: GaussianInformation, control: Any, motion: Motion, dt: Any, xp: Any) -> Array:
+        F = motion.linearised(kept.mean, control, dt, xp)[1]
+        return xp.linalg.solve(kept.information, F.mT)
+
     def corrected(
         self, kept: GaussianInformation, message: Any, measurement: Measurement, gate: float | None, xp: Any
     ) -> tuple[GaussianInformation, When, Array]:

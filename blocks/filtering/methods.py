@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flowgraph import Scalar, Stream, block, when
 from flowgraph.blocks.filtering.gaussian import (
     Extended,
@@ -22,7 +24,7 @@ from flowgraph.blocks.filtering.gaussian import (
 )
 from flowgraph.blocks.kalman.lost import find_back
 from flowgraph.blocks.kalman.robust import Robust
-from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph.blocks.signals import CrossCovariance, Gaussian, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
 from flowgraph.errors import DeclarationError
@@ -33,6 +35,7 @@ __all__ = [
     "Method",
     "Seen",
     "correct",
+    "crossed",
     "cubature",
     "extended",
     "linear",
@@ -93,6 +96,26 @@ class Method(abc.ABC):
     ) -> Advanced:
         """Wire one tick, at the clock `at`, of what was kept at the tick before."""
 
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> Mapping[str, Stream[Any]]:
+        """What a smoother needs of a tick beside prior and belief, by name.
+
+        Args:
+            kept, control, motion, at: as for `advance`.
+            found: what that wired.
+
+        Raises:
+            DeclarationError: of a method that cannot be smoothed.
+        """
+        raise DeclarationError(
+            "this method has no smoother",
+            path=f"filtered.{type(self).__name__}",
+            expected="a method with a Gaussian belief, or particles",
+            got=repr(self),
+            fix="leave smoothing out, or use another method",
+        )
+
 
 @block
 def predict(belief: Any, control: Any | None, *, motion: Motion, method: GaussianMethod, dt: float, xp: Any):
@@ -134,8 +157,21 @@ def correct(
     return posterior, when(*found), when(found.present, likely)
 
 
+@block
+def crossed(
+    kept: Any, control: Any | None, *, motion: Motion, method: GaussianMethod, dt: float, xp: Any
+) -> CrossCovariance:
+    """The covariance of a belief and of what `predict` makes of it, which a smoother goes back by.
+
+    Args:
+        kept, control, motion, method: as for `predict`.
+    """
+    return CrossCovariance(covariance=method.crossed(kept, control, motion, dt, xp))
+
+
 @predict.limited
 @correct.limited
+@crossed.limited
 def _limits(*, method: GaussianMethod, **_: Any) -> Sequence[Limit]:
     return method.limits()
 
@@ -178,6 +214,14 @@ class GaussianFilter(Method):
                     name=f"find_back{suffix}",
                 )  # fmt: skip
         return Advanced(kept, prior, self._belief(kept, motion, "posterior"), innovations, likelihoods, {})
+
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> Mapping[str, Stream[Any]]:
+        still = motion.space.resting()
+        if type(self.maths).crossed is GaussianMethod.crossed:  # refuses, before anything is wired
+            self.maths.crossed(still, None, motion, 0.0, np)
+        return {"cross": crossed(kept, control, motion=motion, method=self.maths, at=at, name="cross")}
 
     def _belief(self, kept: Any, motion: Motion, name: str) -> Stream[Gaussian]:
         if type(self.maths).believed is GaussianMethod.believed:

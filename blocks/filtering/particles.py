@@ -138,6 +138,11 @@ class Particles(Method):
             {"effective_sample_size": size},
         )
 
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> dict[str, Any]:
+        return {"cloud": found.kept}
+
     def _drawn_with(self) -> tuple[Callable[..., Any], dict[str, Any]]:
         """The block that draws knowing the first measurement, and its own settings."""
         if self.proposal == "auxiliary":

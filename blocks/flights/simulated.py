@@ -1,7 +1,8 @@
 """Simulated flights. `sim`: 1 s at rest, then a smooth figure in space, with an IMU and a motion capture.
 
 `sim:thesis`, `sim:roundtrip` and `sim:hover` go through the simulated world with sensors of choice: see
-`worlds`; `sim:plane` is a point in the plane: see `plane`. What follows is the figure of `sim`.
+`worlds`; `sim:plane` is a point in the plane: see `plane`; `sim:drive` is a car: see
+`drive`. What follows is the figure of `sim`.
 
 Position and yaw are sums of sinusoids of a phase that starts slowly, so every derivative is exact. Thrust
 must carry gravity and the acceleration, which fixes the body's z axis; with the yaw that fixes the attitude,
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights import plane, worlds
+from flowgraph.blocks.flights import drive, plane, worlds
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
@@ -44,7 +45,13 @@ DEFAULTS: Mapping[str, float] = {
 """Settings: seconds, Hz, continuous densities, standard deviations of the constant biases, and of the motion
 capture in m and rad."""
 
-SETTINGS: Mapping[str, str | float] = {**worlds.SETTINGS, **plane.DEFAULTS, **DEFAULTS}
+SETTINGS: Mapping[str, str | float] = {
+    **drive.DEFAULTS,
+    "unit": "of a drive: " + ", ".join(drive.GRADES),
+    **worlds.SETTINGS,
+    **plane.DEFAULTS,
+    **DEFAULTS,
+}
 """All settings that `load` understands: `DEFAULTS` for the figure, `worlds.SETTINGS` for the worlds, whose
 values when left out are their own."""
 
@@ -56,7 +63,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
 
     Args:
         argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`);
-            plane for a point in the plane (see `plane`).
+            plane for a point in the plane (see `plane`); drive for a car (see `drive`).
         seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
             change of one setting does not change the draws of another.
         settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
@@ -74,9 +81,11 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         return worlds.load_world(argument, seed=seed, settings=settings)
     if argument == "plane":
         return plane.load_plane(seed=seed, settings=settings)
+    if argument == "drive":
+        return drive.load_drive(seed=seed, settings=settings)
     if argument not in ("", "quadrotor"):
         raise UnknownNameError(
-            "simulated flight", argument, ["quadrotor", "plane", *worlds.WORLDS], path="sim"
+            "simulated flight", argument, ["quadrotor", "plane", "drive", *worlds.WORLDS], path="sim"
         )
     s = _settings(settings or {})
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])

@@ -4,12 +4,14 @@
 error-state Kalman filter's prediction, and `ImuNoise`, the densities by which all filters here know a unit.
 `aiding` corrects that belief by measured positions and attitudes. `alignment` finds the attitude and biases
 to start from, `calibration` takes out what a unit reads too much while it rests, and `imu_calibration` finds
-what a count of its converters is worth by what a motion capture saw.
+what a count of its converters is worth by what a motion capture saw. Over the Earth, `navigation` predicts
+where it turns and is round, and estimates more; `outdoors` aids by satellites, heights, directions and
+wheels; `moving` aligns a body in motion by the positions that come after.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
+from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position, correct_belief
 from flowgraph.blocks.inertial.alignment import (
     Start,
     StartSpread,
@@ -23,7 +25,7 @@ from flowgraph.blocks.inertial.alignment import (
     usable,
 )
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, carried, error_jacobian, predict
 from flowgraph.blocks.inertial.imu_calibration import (
     CountsCalibration,
     calibrated,
@@ -34,15 +36,42 @@ from flowgraph.blocks.inertial.imu_calibration import (
     window_means,
     windows_of,
 )
+from flowgraph.blocks.inertial.moving import Motion, align_moving
+from flowgraph.blocks.inertial.navigation import (
+    PARAMETERS,
+    Earth,
+    Parameter,
+    earth_at,
+    extended,
+    gravity_at,
+    navigation_crossing,
+    places,
+    predict_navigation,
+)
+from flowgraph.blocks.inertial.outdoors import (
+    AT_UNIT,
+    Antenna,
+    Resting,
+    aid_antennas,
+    aid_compass,
+    aid_gnss_position,
+    aid_gnss_velocity,
+    aid_height,
+    aid_wheels,
+    standing,
+)
 
 __all__ = [
     "need_usable",
     "usable",
     "GRAVITY",
     "ImuNoise",
+    "error_jacobian",
     "predict",
     "aid_attitude",
     "aid_position",
+    "correct_belief",
+    "carried",
     "Start",
     "StartSpread",
     "align_static",
@@ -61,4 +90,25 @@ __all__ = [
     "sum_counts",
     "window_means",
     "windows_of",
+    "Motion",
+    "align_moving",
+    "PARAMETERS",
+    "Earth",
+    "Parameter",
+    "earth_at",
+    "extended",
+    "gravity_at",
+    "navigation_crossing",
+    "places",
+    "predict_navigation",
+    "AT_UNIT",
+    "Antenna",
+    "Resting",
+    "aid_antennas",
+    "aid_compass",
+    "aid_gnss_position",
+    "aid_gnss_velocity",
+    "aid_height",
+    "aid_wheels",
+    "standing",
 ]

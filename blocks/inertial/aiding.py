@@ -32,7 +32,7 @@ from flowgraph.blocks.geometry.rotations import (
 from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
-__all__ = ["aid_attitude", "aid_position"]
+__all__ = ["aid_attitude", "aid_position", "correct_belief"]
 
 Spread = float | tuple[float, float, float]
 """A standard deviation: one number for three axes, or one each."""
@@ -81,7 +81,7 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
 
 
 @block
@@ -115,7 +115,7 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    return _correct(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
 
 
 def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:
@@ -150,9 +150,11 @@ def _attitude_residual(q: Array, z: Array, mount: tuple[float, ...], xp: Any) ->
 
 
 class _Group(NamedTuple):
-    """The error as one of the group SE_2(3), at an attitude: that of position and velocity turns with it."""
+    """The error as one of the group SE_2(3), at an attitude: that of position and velocity turns with it, and
+    `more` numbers behind the fifteen stay."""
 
     attitude: Array
+    more: int = 0
 
     def reset(self, d: Array, xp: Any) -> Array:
         """The Jacobian (15, 15) of the error when the state moves by d, as `StateSpace.reset` gives it."""
@@ -160,14 +162,27 @@ class _Group(NamedTuple):
         none, stay = 0.0 * swing, 0.0 * swing + xp.eye(3, dtype=d.dtype)
         diagonal = (swing, swing, stay, stay, stay)
         rows = [[none] * k + [part] + [none] * (4 - k) for k, part in enumerate(diagonal)]
-        return xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+        found = xp.concat([xp.concat(row, axis=-1) for row in rows], axis=-2)
+        if not self.more:
+            return found
+        side, corner = 0.0 * found[..., :, : self.more], 0.0 * found[..., : self.more, : self.more]
+        below = xp.concat([side.mT, corner + xp.eye(self.more, dtype=d.dtype)], axis=-1)
+        return xp.concat([xp.concat([found, side], axis=-1), below], axis=-2)
 
 
-def _correct(
-    prior: Belief, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
-) -> tuple[Belief, KalmanInnovation]:
-    """The correction that every Kalman filter shares, folded into the nominal state."""
-    space = _Group(prior.attitude) if invariant else STATE
+def correct_belief(
+    prior: Any, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
+) -> tuple[Any, KalmanInnovation]:
+    """The correction that every Kalman filter shares, folded into the nominal state.
+
+    Args:
+        prior: a `Belief`, or a `NavigationBelief`.
+        apart: measured minus predicted (m); NaN where an entry was not measured.
+        H: (m, n), the Jacobian by the error of the belief. R: (m, m), the covariance of the noise.
+        gate, invariant: as in `aid_position`.
+    """
+    more = prior.covariance.shape[-1] - 15
+    space = _Group(prior.attitude, more) if invariant else _space(more)
     found = correct(prior.covariance, apart, H, R, gate=gate, space=space, xp=xp)
     d, turn = found.shift, found.shift[..., 6:9]
     to_place, to_speed = d[..., 0:3], d[..., 3:6]
@@ -175,12 +190,23 @@ def _correct(
         push, _ = _carried(prior.attitude, turn, xp)
         moved = push @ xp.concat([to_place[..., None], to_speed[..., None]], axis=-1)
         to_place, to_speed = moved[..., 0], moved[..., 1]
-    posterior = Belief(
-        position=prior.position + to_place,
-        velocity=prior.velocity + to_speed,
-        attitude=multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
-        gyro_bias=prior.gyro_bias + d[..., 9:12],
-        accelerometer_bias=prior.accelerometer_bias + d[..., 12:15],
-        covariance=found.covariance,
+    values = {
+        "position": prior.position + to_place,
+        "velocity": prior.velocity + to_speed,
+        "attitude": multiply(prior.attitude, from_rotation_vector(turn, xp=xp), xp=xp),
+        "gyro_bias": prior.gyro_bias + d[..., 9:12],
+        "accelerometer_bias": prior.accelerometer_bias + d[..., 12:15],
+        "covariance": found.covariance,
+    }
+    if more:
+        values["parameters"] = prior.parameters + d[..., 15:]
+    return type(prior)(**values), found.innovation
+
+
+def _space(more: int) -> StateSpace:
+    """`STATE`, with so many numbers behind it."""
+    if not more:
+        return STATE
+    return StateSpace(
+        position=euclidean(3), velocity=euclidean(3), attitude=quaternion(), biases=euclidean(6 + more)
     )
-    return posterior, found.innovation

@@ -25,7 +25,7 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.blocks.signals import GRAVITY, Belief, Imu
 
-__all__ = ["GRAVITY", "ImuNoise", "predict"]
+__all__ = ["GRAVITY", "ImuNoise", "carried", "error_jacobian", "predict"]
 
 
 @dataclass(frozen=True)
@@ -137,31 +137,56 @@ def predict(
 
     Fires when its inputs do. No state of its own.
     """
-    kind = belief.position.dtype
+    pull = xp.asarray(gravity, dtype=belief.position.dtype)
+    values, F = carried(belief, imu, pull, dt, xp)
+    Q = xp.asarray(_density(noise), dtype=pull.dtype) * (0.5 * dt)
+    P = F @ (belief.covariance + Q) @ F.mT + Q
+    return Belief(
+        **values,
+        gyro_bias=belief.gyro_bias,
+        accelerometer_bias=belief.accelerometer_bias,
+        covariance=0.5 * (P + P.mT),
+    )
+
+
+def carried(belief: Any, imu: Imu, gravity: Array, dt: Any, xp: Any) -> tuple[dict[str, Array], Array]:
+    """Position, velocity and attitude of `predict`, by name, and F (15, 15)."""
+    by_half, middle, R, back, force = _turned(belief, imu, dt, xp)
+    acceleration = (R @ force[..., None])[..., 0] + gravity
+    step = acceleration * dt
+    values = {
+        "position": belief.position + (belief.velocity + 0.5 * step) * dt,
+        "velocity": belief.velocity + step,
+        "attitude": normalize((by_half @ middle)[..., 0], xp=xp),
+    }
+    return values, _jacobian(R, back, force, dt, xp)
+
+
+def error_jacobian(belief: Belief, imu: Imu, dt: Any, xp: Any) -> Array:
+    """F (15, 15) of `predict`: how the error of a belief goes on over dt seconds."""
+    _, _, R, back, force = _turned(belief, imu, dt, xp)
+    return _jacobian(R, back, force, dt, xp)
+
+
+def _turned(belief: Belief, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array, Array, Array]:
+    """Half the step's turn, as a product; the attitude half-way, as a column, and as a matrix; half the turn
+    back; and the force."""
     rate = imu.gyro - belief.gyro_bias
     force = imu.specific_force - belief.accelerometer_bias
     half = from_rotation_vector(rate * (0.5 * dt), xp=xp)
     by_half = right_product(half, xp=xp)
-    middle = by_half @ belief.attitude[..., None]  # the attitude half-way, as a column
+    middle = by_half @ belief.attitude[..., None]
     both = to_matrix(xp.concat([middle.mT, half[..., None, :]], axis=-2), xp=xp)
-    R, back = both[..., 0, :, :], both[..., 1, :, :].mT
-    acceleration = (R @ force[..., None])[..., 0] + xp.asarray(gravity, dtype=kind)
-    step = acceleration * dt
+    return by_half, middle, both[..., 0, :, :], both[..., 1, :, :].mT, force
 
+
+def _jacobian(R: Array, back: Array, force: Array, dt: Any, xp: Any) -> Array:
+    """F, of what `_turned` gives."""
+    kind = R.dtype
     # d(velocity')/d(attitude, gyro bias, accelerometer bias); the position's are dt/2 times these
     turned = R @ skew(force * -dt, xp=xp) @ back
     pull = xp.concat([turned, turned * (-0.5 * dt), R * -dt], axis=-1)
     turn = xp.concat([back @ back, back * -dt, 0.0 * back], axis=-1)
     biases = _like(_BIASES_STAY, R, xp)
     moved = _like(xp.asarray(_STAYS, dtype=kind) + xp.asarray(_DRIFTS, dtype=kind) * dt, R, xp)
-    F = xp.concat([moved, xp.concat([pull * (0.5 * dt), pull, turn, biases], axis=-2)], axis=-1)
-    Q = xp.asarray(_density(noise), dtype=kind) * (0.5 * dt)
-    P = F @ (belief.covariance + Q) @ F.mT + Q
-    return Belief(
-        position=belief.position + (belief.velocity + 0.5 * step) * dt,
-        velocity=belief.velocity + step,
-        attitude=normalize((by_half @ middle)[..., 0], xp=xp),
-        gyro_bias=belief.gyro_bias,
-        accelerometer_bias=belief.accelerometer_bias,
-        covariance=0.5 * (P + P.mT),
-    )
+    return xp.concat([moved, xp.concat([pull * (0.5 * dt), pull, turn, biases], axis=-2)], axis=-1)

@@ -4,12 +4,23 @@
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open, `robust` for outliers, and `learned` for a noise
-that nobody knows. `smoothing` goes back over a run and adds to each state what later measurements say of it.
-What moves and what is measured is not said here: see `models`.
+that nobody knows. `smoothing` goes back over a run and adds to each state what later measurements say of it;
+`backward` is that as a graph, and `learning` finds the linear model that explains a recording. What moves and
+what is measured is not said here: see `models`.
 """
 
 from __future__ import annotations
 
+from flowgraph.blocks.kalman.backward import (
+    Crossing,
+    backwards,
+    collect_steps,
+    cross_covariance,
+    forwards,
+    go_back,
+    sizes_of,
+    smoother,
+)
 from flowgraph.blocks.kalman.filters import (
     Correction,
     Vector,
@@ -19,6 +30,7 @@ from flowgraph.blocks.kalman.filters import (
     update_linear,
 )
 from flowgraph.blocks.kalman.learned import learned_noise, update_learned
+from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import (
     FARTHEST,
@@ -36,7 +48,17 @@ from flowgraph.blocks.kalman.lost import (
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.robust import Robust, huber, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
-from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.kalman.smoothing import (
+    Steps,
+    fixed_lag,
+    gone_back,
+    lag_ticks,
+    rauch_tung_striebel,
+    smooth,
+    smoother_gain,
+    smoothing_pass,
+    steps_of,
+)
 from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
@@ -46,6 +68,8 @@ __all__ = [
     "student_t",
     "learned_noise",
     "update_learned",
+    "Crossing",
+    "gone_back",
     "noise_matrix",
     "observation_matrix",
     "FARTHEST",
@@ -61,6 +85,10 @@ __all__ = [
     "lost_variances",
     "covariance_root",
     "LinearModel",
+    "LinearGaussian",
+    "Learned",
+    "LEARNT",
+    "learn",
     "Correction",
     "Vector",
     "correct",
@@ -77,6 +105,17 @@ __all__ = [
     "fixed_lag",
     "lag_ticks",
     "rauch_tung_striebel",
+    "smooth",
+    "smoother_gain",
+    "smoothing_pass",
+    "steps_of",
+    "backwards",
+    "collect_steps",
+    "cross_covariance",
+    "forwards",
+    "go_back",
+    "sizes_of",
+    "smoother",
     "Gaussian",
     "KalmanInnovation",
 ]

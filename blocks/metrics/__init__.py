@@ -3,13 +3,13 @@
 `errors` compares an estimate with a truth: metres, degrees, and the NEES, the squared error in deviations of
 the filter's own. `chi_square` says how large such a square is when all is well, which gives bands for the
 average and gates for single measurements. `consistency` has what needs no truth, the NIS of innovations, and
-`bound` how small the errors can be. All run on the host after a run, but for the limits of a gate, which
-become constants of the graph.
+`bound` how small the errors can be. `states` compares a state of one's own, part by part. All run on the host
+after a run, but for the limits of a gate, which become constants of the graph.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.metrics.bound import posterior_bound
+from flowgraph.blocks.metrics.bound import posterior_bound, smoothing_bound
 from flowgraph.blocks.metrics.chi_square import (
     chi_square,
     chi_square_band,
@@ -32,10 +32,15 @@ from flowgraph.blocks.metrics.errors import (
     tilt_and_heading_nees,
     within_truth,
 )
+from flowgraph.blocks.metrics.states import ALIGNMENTS, StateErrors, true_parts
 from flowgraph.blocks.metrics.truth import known, truth_remarks
 
 __all__ = [
+    "ALIGNMENTS",
+    "StateErrors",
+    "true_parts",
     "posterior_bound",
+    "smoothing_bound",
     "chi_square",
     "chi_square_band",
     "chi_square_gate",

@@ -10,6 +10,12 @@ had it linearised there. A filter whose controls are measured knows the trajecto
 flight has a bound of its own; the mean of their traces bounds the mean squared error over flights. What is
 carried on is P = J^-1, for Q may be singular and a start exact.
 
+A smoother's errors have a bound too, which knows the later measurements: from the end back,
+
+    S_n = P_n      S_k = P_k + C_k (S_{k+1} - P-_{k+1}) C_k^T      C_k = P_k F^T (P-_{k+1})^-1
+
+with P-_{k+1} = F P_k F^T + Q: the block of a tick in the inverse of the whole trajectory's information.
+
 Source: P. Tichavsky, C. Muravchik, A. Nehorai, "Posterior Cramér-Rao bounds for discrete-time nonlinear
 filtering", IEEE Trans. Signal Processing 46(5), 1998 (eqs. 21 and 34 to 36).
 """
@@ -19,7 +25,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["posterior_bound"]
+__all__ = ["posterior_bound", "smoothing_bound"]
 
 
 def posterior_bound(
@@ -55,3 +61,21 @@ def posterior_bound(
             P = 0.5 * (P + P.mT)
         bound[k] = P
     return bound
+
+
+def smoothing_bound(F: np.ndarray, Q: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """The covariance (n, ..., k, k) below which that of no smoother's error lies, at each of n ticks.
+
+    Args:
+        F, Q: as for `posterior_bound`.
+        bound: which that gave.
+    """
+    Q = np.broadcast_to(Q, F.shape)
+    smoothed = bound.copy()
+    for k in range(len(bound) - 2, -1, -1):
+        across = F[k] @ bound[k]
+        ahead = across @ F[k].mT + Q[k]
+        C = np.linalg.solve(ahead, across).mT
+        P = bound[k] + C @ (smoothed[k + 1] - ahead) @ C.mT
+        smoothed[k] = 0.5 * (P + P.mT)
+    return smoothed

@@ -11,6 +11,7 @@ The rooms of methods (`kalman`, `unscented`, `particles`) know nothing of bodies
     plane           a point in the plane: the smallest problem for particles
     tracking        points, vehicles that turn and a pendulum, for any method of `filtering`
     inertial_pose   the pose that an IMU carries, for any method
+    navigation      the same with what is estimated outdoors beside it
 
 Several have a `STATE` and a `move`, so the modules are what is public: `from flowgraph.blocks.models import
 pose`, or names from a module. None is imported before it is asked for: those that see by a camera load
@@ -29,4 +30,5 @@ __all__ = [
     "plane",
     "tracking",
     "inertial_pose",
+    "navigation",
 ]

@@ -18,12 +18,13 @@ printed dx/dt leaves out of the second and third line, are in both.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, block
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.euler import (
     NEAR,
     angles_from_matrix,
@@ -41,11 +42,14 @@ from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import Correction, correct
 from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
 __all__ = [
     "STATE",
     "euler_angles",
+    "euler_steps",
+    "extended_crossing",
     "measured_angles",
     "move",
     "move_jacobians",
@@ -174,6 +178,17 @@ def predict_extended(
     return Gaussian(mean=STATE.plus(moved, xp.zeros_like(x), xp), covariance=0.5 * (P + P.mT))
 
 
+def extended_crossing(order: str) -> Callable[..., Array]:
+    """What `cross_covariance` asks of a filter that predicts with `predict_extended`."""
+
+    def crossing(belief: Gaussian, imu: Imu, dt: Any, xp: Any) -> Array:
+        turn, push = increments(belief.mean, imu, dt)
+        F, _ = move_jacobians(belief.mean, turn, push, dt, order=order, xp=xp)
+        return belief.covariance @ F.mT
+
+    return crossing
+
+
 def measured_angles(attitude: Array, prior: Array, *, order: str, xp: Any) -> Array:
     """The angles (..., 3) of a measured quaternion: of the two triples that mean it, the one nearer to the
     prior's.
@@ -283,6 +298,17 @@ def navigation_belief(belief: Gaussian, *, order: str, xp: Any) -> Belief:
         accelerometer_bias=x[..., 12:15],
         covariance=0.5 * (P + P.mT),
     )
+
+
+def euler_steps(result: Result, order: str) -> Steps:
+    """Those of a run of a filter over `STATE` that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        values = navigation_belief.step(belief, order=order, xp=np)
+        return Series(smoothed.time, values, name=smoothed.name)
+
+    return steps_of(result, STATE)._replace(named=named)
 
 
 @block

@@ -13,16 +13,26 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array
+from flowgraph import Array, Result, Series
 from flowgraph.blocks.geometry.groups import SE_2
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, error_jacobian
+from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.models.pose import POSE
 from flowgraph.blocks.models.unscented_pose import carry_pose, imu_density, see_pose
-from flowgraph.blocks.signals import Imu
+from flowgraph.blocks.signals import Belief, Gaussian, Imu
 from flowgraph.blocks.statespace import MeasurementModel, MotionModel
 
-__all__ = ["INERTIAL", "INERTIAL_BIASED", "INERTIAL_GROUP", "inertial_motion", "pose_seen"]
+__all__ = [
+    "INERTIAL",
+    "INERTIAL_BIASED",
+    "INERTIAL_GROUP",
+    "inertial_crossing",
+    "inertial_motion",
+    "inertial_steps",
+    "pose_seen",
+    "stacked",
+]
 
 INERTIAL = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quaternion())
 """m and m/s in the world, body to world."""
@@ -88,3 +98,26 @@ def pose_seen(
 
     noise = np.repeat([position_noise**2, attitude_noise**2], 3)
     return MeasurementModel(space, observe, noise=noise, measured_space=POSE)
+
+
+def inertial_crossing(belief: Belief, imu: Imu, dt: Any, xp: Any) -> Array:
+    """What `cross_covariance` asks of a filter that predicts with `inertial.predict`."""
+    return belief.covariance @ error_jacobian(belief, imu, dt, xp).mT
+
+
+def inertial_steps(result: Result) -> Steps:
+    """Those of a run of `ins_eskf` that was wired for a smoother; over `INERTIAL_BIASED`."""
+    prior, posterior = (Series(s.time, stacked(s.values)) for s in (result["prior"], result["belief"]))
+    return Steps(prior, posterior, result["cross"], INERTIAL_BIASED, _beliefs)
+
+
+def stacked(belief: Belief) -> Gaussian:
+    """A belief, or one at each tick, over `INERTIAL_BIASED`."""
+    mean = np.concatenate([getattr(belief, part) for part in INERTIAL_BIASED.names], axis=-1)
+    return Gaussian(mean=mean, covariance=np.asarray(belief.covariance))
+
+
+def _beliefs(smoothed: Series) -> Series:
+    p, v, q, b_g, b_a = np.split(smoothed["mean"], (3, 6, 10, 13), axis=-1)
+    belief = Belief(p, v, q, b_g, b_a, smoothed["covariance"])
+    return Series(smoothed.time, belief, name=smoothed.name)

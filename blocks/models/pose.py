@@ -35,6 +35,7 @@ from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, Pose
 __all__ = [
     "between_imu",
     "driving",
+    "in_tangent_space",
     "move",
     "move_jacobian",
     "observe_jacobian",
@@ -283,7 +284,9 @@ def pose_steps(result: Result) -> Steps:
 
     The state is (position, velocity, attitude), ten numbers, and its errors are the nine of `PoseBelief`.
     """
-    prior, posterior = (_in_tangent_space(result[name]) for name in ("prior", "posterior"))
+    prior, posterior = (
+        Series(s.time, in_tangent_space(s.values)) for s in (result["prior"], result["posterior"])
+    )
     rows = zip(
         posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
         np.diff(posterior.time) * 1e-9, strict=True,
@@ -298,11 +301,11 @@ def pose_steps(result: Result) -> Steps:
     return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
 
 
-def _in_tangent_space(series: Series) -> Series:
-    """A series of `QuaternionBelief` as `Gaussian` of (position, velocity, attitude)."""
-    belief = pose_belief.step(series.values, xp=np)
-    mean = np.concatenate([belief.position, belief.velocity, belief.attitude], axis=-1)
-    return Series(series.time, Gaussian(mean=mean, covariance=belief.covariance), name=series.name)
+def in_tangent_space(belief: QuaternionBelief) -> Gaussian:
+    """A belief, or one at each tick, over (position, velocity, attitude)."""
+    named = pose_belief.step(belief, xp=np)
+    mean = np.concatenate([named.position, named.velocity, named.attitude], axis=-1)
+    return Gaussian(mean=mean, covariance=named.covariance)
 
 
 def _to_angle(q: Array, xp: Any) -> Array:

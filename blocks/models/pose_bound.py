@@ -20,7 +20,7 @@ import numpy as np
 
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.metrics.bound import posterior_bound
+from flowgraph.blocks.metrics.bound import posterior_bound, smoothing_bound
 
 __all__ = ["pose_bound"]
 
@@ -36,6 +36,7 @@ def pose_bound(
     attitude_noise: float,
     start: np.ndarray | None = None,
     gravity: tuple[float, float, float] = GRAVITY,
+    smoothing: bool = False,
 ) -> np.ndarray:
     """The covariance (n, ..., 9, 9) that no filter's error falls below, in the order of `PoseBelief`.
 
@@ -48,6 +49,7 @@ def pose_bound(
         position_noise, attitude_noise: standard deviations of the pose, m and rad.
         start: (9, 9), how well the start is known; exactly where it is left out.
         gravity: m/s^2, world.
+        smoothing: that of a smoother, which knows the later poses too.
     """
     dt = np.diff(time) * 1e-9
     turned = np.asarray(to_matrix(attitude, xp=np))
@@ -66,11 +68,13 @@ def pose_bound(
         white = noise.accelerometer**2 * step
         Q[k, :6, :6] = white * np.kron([[step**2 / 3.0, step / 2.0], [step / 2.0, 1.0]], one)
         Q[k, 6:, 6:] = noise.gyro**2 * step * one
-    return posterior_bound(
+    Q = Q.reshape(len(dt), *[1] * (velocity.ndim - 2), 9, 9)
+    bound = posterior_bound(
         F,
-        Q.reshape(len(dt), *[1] * (velocity.ndim - 2), 9, 9),
+        Q,
         np.delete(np.eye(9), (3, 4, 5), axis=0),
         np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3),
         start=np.zeros((9, 9)) if start is None else start,
         measured=measured,
     )
+    return smoothing_bound(F, Q, bound) if smoothing else bound

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, block
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, rotate
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Gaussian, Imu, PoseBelief
 
-__all__ = ["STATE", "carry_pose", "imu_density", "named_pose", "see_pose", "start_state"]
+__all__ = ["STATE", "carry_pose", "imu_density", "named_pose", "see_pose", "start_state", "unscented_steps"]
 
 STATE = StateSpace(euclidean(6), quaternion())
 """Position, velocity, attitude."""
@@ -84,3 +85,13 @@ def named_pose(belief: Gaussian) -> PoseBelief:
     return PoseBelief(
         position=x[..., :3], velocity=x[..., 3:6], attitude=x[..., 6:], covariance=belief.covariance
     )
+
+
+def unscented_steps(result: Result) -> Steps:
+    """Those of a run of `ukf` that was wired for a smoother."""
+    return steps_of(result, STATE)._replace(named=_named)
+
+
+def _named(smoothed: Series) -> Series:
+    belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+    return Series(smoothed.time, named_pose.step(belief), name=smoothed.name)

@@ -3,7 +3,7 @@
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
 on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
-sensor does to it.
+sensor does to it. `errors` judges navigation by the path of an antenna, and by directions.
 """
 
 from __future__ import annotations
@@ -13,11 +13,14 @@ from flowgraph.blocks.outdoor.belief import (
     OUTDOOR,
     FieldObserver,
     PositionObserver,
+    clone_crossing,
     flow_vector,
     new_picture,
     observe_distance,
     observe_flow,
     outdoor_pose,
+    outdoor_steps,
+    picture_cross,
     predict_clone,
     start_outdoor,
 )
@@ -35,6 +38,7 @@ from flowgraph.blocks.outdoor.corrections import (
     correct_flow,
     correct_position,
 )
+from flowgraph.blocks.outdoor.errors import antenna_errors, at_antenna, directed_errors
 from flowgraph.blocks.outdoor.flight import (
     STREAMS,
     OutdoorSensors,
@@ -44,6 +48,9 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "clone_crossing",
+    "outdoor_steps",
+    "picture_cross",
     "STREAMS",
     "OutdoorSensors",
     "OutdoorStart",
@@ -70,4 +77,7 @@ __all__ = [
     "start_outdoor_cloud",
     "take_outdoor_ancestors",
     "take_picture",
+    "antenna_errors",
+    "at_antenna",
+    "directed_errors",
 ]

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, block
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
@@ -27,6 +27,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.outdoor.flight import OutdoorStart
 from flowgraph.blocks.signals import Gaussian, Imu, OpticalFlow, PoseBelief
 
@@ -35,11 +36,14 @@ __all__ = [
     "FieldObserver",
     "OUTDOOR",
     "PositionObserver",
+    "clone_crossing",
     "flow_vector",
     "new_picture",
     "observe_distance",
     "observe_flow",
     "outdoor_pose",
+    "outdoor_steps",
+    "picture_cross",
     "predict_clone",
     "start_outdoor",
 ]
@@ -90,19 +94,9 @@ def predict_clone(
     """
     p, v, q, p0, q0 = _parts(belief.mean)
     kind = q.dtype
-    half = from_rotation_vector(imu.gyro * (0.5 * dt), xp=xp)
-    middle = multiply(q, half, xp=xp)
-    R, back = to_matrix(middle, xp=xp), to_matrix(half, xp=xp).mT
+    half, middle, R, back = _half_way(q, imu, dt, xp)
     step = (_times(R, imu.specific_force) + xp.asarray(gravity, dtype=kind)) * dt
-    pull = R @ skew(imu.specific_force * -dt, xp=xp) @ back
-    one, zero = 0.0 * R + xp.eye(3, dtype=kind), 0.0 * R
-    wide = xp.concat([zero, zero], axis=-1)
-    rows = [
-        xp.concat([one, one * dt, pull * (0.5 * dt), wide], axis=-1),
-        xp.concat([zero, one, pull, wide], axis=-1),
-        xp.concat([zero, zero, back @ back, wide], axis=-1),
-    ]
-    F = xp.concat([*rows, xp.asarray(_CLONES.T, dtype=kind)], axis=-2)
+    F = _clone_jacobian(R, back, imu, dt, xp)
     power = np.repeat([0.0, noise.accelerometer**2, noise.gyro**2, 0.0, 0.0], 3)
     Q = xp.asarray(np.diag(power), dtype=kind) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
@@ -111,6 +105,32 @@ def predict_clone(
         mean=xp.concat([p + (v + 0.5 * step) * dt, v + step, turned, p0, q0], axis=-1),
         covariance=0.5 * (P + P.mT),
     )
+
+
+def clone_crossing(belief: Gaussian, imu: Imu, dt: Any, xp: Any) -> Array:
+    """What `cross_covariance` asks of a filter that predicts with `predict_clone`."""
+    _, _, R, back = _half_way(_parts(belief.mean)[2], imu, dt, xp)
+    return belief.covariance @ _clone_jacobian(R, back, imu, dt, xp).mT
+
+
+def _half_way(q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array, Array]:
+    """Half the step's turn, the attitude half-way, its matrix, and that of half the turn back."""
+    half = from_rotation_vector(imu.gyro * (0.5 * dt), xp=xp)
+    middle = multiply(q, half, xp=xp)
+    return half, middle, to_matrix(middle, xp=xp), to_matrix(half, xp=xp).mT
+
+
+def _clone_jacobian(R: Array, back: Array, imu: Imu, dt: Any, xp: Any) -> Array:
+    """F (15, 15) of `predict_clone`."""
+    pull = R @ skew(imu.specific_force * -dt, xp=xp) @ back
+    one, zero = 0.0 * R + xp.eye(3, dtype=R.dtype), 0.0 * R
+    wide = xp.concat([zero, zero], axis=-1)
+    rows = [
+        xp.concat([one, one * dt, pull * (0.5 * dt), wide], axis=-1),
+        xp.concat([zero, one, pull, wide], axis=-1),
+        xp.concat([zero, zero, back @ back, wide], axis=-1),
+    ]
+    return xp.concat([*rows, xp.asarray(_CLONES.T, dtype=R.dtype)], axis=-2)
 
 
 class PositionObserver:
@@ -192,10 +212,31 @@ def new_picture(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gauss
 
 
 @block
+def picture_cross(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gaussian:
+    """What `new_picture` makes of a mean, and in place of a covariance P that of the belief before it (rows)
+    with the one after, P T^T: what a smoother goes back by."""
+    if flow is None:
+        return belief
+    p, v, q, _, _ = _parts(belief.mean)
+    T = xp.asarray(_TAKEN, dtype=p.dtype)
+    return Gaussian(mean=xp.concat([p, v, q, p, q], axis=-1), covariance=belief.covariance @ T.mT)
+
+
+@block
 def outdoor_pose(belief: Gaussian) -> PoseBelief:
     """What is believed of now, without the clones."""
     p, v, q, _, _ = _parts(belief.mean)
     return PoseBelief(position=p, velocity=v, attitude=q, covariance=belief.covariance[..., :9, :9])
+
+
+def outdoor_steps(result: Result) -> Steps:
+    """Those of a run of `outdoor_eskf` that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, outdoor_pose.step(belief), name=smoothed.name)
+
+    return steps_of(result, OUTDOOR)._replace(named=named)
 
 
 def start_outdoor(start: OutdoorStart) -> Gaussian:

@@ -5,12 +5,14 @@ graphs do; `point` does so for linear filters, and `euler` for those with Euler 
 noise that a filter is told, in its settings or in the flight, and `covariances` reads a whole one; `streams`
 makes the streams that it asks for out of those that a flight has. `scorer` compares a run with the truth:
 errors, consistency, and the same for the smoothed run; `orientation` counts only the times that a recording
-says count, and `calibration` how well one explains its windows. `settings`, `point`, `euler` and
+says count, and `calibration` how well one explains its windows. `own` makes a case where nobody says how, and
+`outdoors` has the streams and the start of a flight with satellites. `settings`, `point`, `euler`, `own` and
 `calibration` are imported by their own names.
 """
 
 from __future__ import annotations
 
+from flowgraph.blocks.scoring.capture import on_capture
 from flowgraph.blocks.scoring.cases import (
     Factors,
     Gated,
@@ -23,11 +25,17 @@ from flowgraph.blocks.scoring.cases import (
     Scored,
     Smoothed,
     SmoothedPoseFilter,
-    on_capture,
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
+from flowgraph.blocks.scoring.late import Late, built_for, late_streams, places, rewound_graph
 from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
+from flowgraph.blocks.scoring.outdoors import (
+    POSITIONS,
+    Outdoors,
+    World,
+    declination,
+)
 from flowgraph.blocks.scoring.readings import Ranges, gap_notes, pause, taken
 from flowgraph.blocks.scoring.scorer import SMOOTHED, Scorer
 from flowgraph.blocks.scoring.start import (
@@ -64,6 +72,7 @@ __all__ = [
     "settings",
     "point",
     "euler",
+    "own",
     "calibration",
     "Covariance",
     "six_by_six",
@@ -101,4 +110,13 @@ __all__ = [
     "counted",
     "counted_errors",
     "scored_errors",
+    "Late",
+    "built_for",
+    "late_streams",
+    "places",
+    "rewound_graph",
+    "POSITIONS",
+    "Outdoors",
+    "World",
+    "declination",
 ]

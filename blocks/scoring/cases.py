@@ -19,20 +19,22 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowgraph import Case, Flight, Result, Series, clocks_of
+from flowgraph import Case, Flight, Result, Series
+from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.smoothing import Steps
-from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
 from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
-from flowgraph.blocks.scoring.start import Started, StartPose
-from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of, reading_of, unbiased_factors
+from flowgraph.blocks.scoring.start import Started
+from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
+from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
 
 __all__ = [
@@ -47,7 +49,6 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
-    "on_capture",
     "on_flight",
 ]
 
@@ -63,12 +64,14 @@ class OnFlight:
         flight: as it was loaded, or as `told` has completed it.
         inputs: the streams that were needed, by name.
         notes: what is assumed while the case is made; see `note`.
+        rewind: s, as the setting of `Late`.
     """
 
     graph: GraphFunction
     flight: Flight
     inputs: dict[str, Series]
     notes: list[str] = field(default_factory=list)
+    rewind: float | None = None
 
     @property
     def name(self) -> str:
@@ -150,7 +153,9 @@ class OnFlight:
         for name in noted:
             self.usual_step(inputs[name])
         self.notes.extend(gap_notes(inputs, noted))
-        built = self.graph.build(**clocks_of(inputs), sizes=sizes, **settings)
+        smoothed = getattr(score, "smoothing", False)
+        built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
+        self.notes.extend(said_of_late)
         return Case(
             built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
         )
@@ -183,7 +188,7 @@ def on_flight(
     """
 
     def register(function: Callable[..., Case]) -> Callable[..., Case]:
-        known = spliced(function, **({"ranges": Ranges} if ranged else {}))
+        known = spliced(function, **({"ranges": Ranges} if ranged else {}), late=Late)
         flown = inspect.Parameter("flight", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Flight)
         signature = inspect.Signature([flown, *known.parameters], return_annotation=Case)
 
@@ -201,7 +206,8 @@ def on_flight(
             groups = known.grouped(values)
             flight, notes = taken(flight, groups.pop("ranges", Ranges()), graph.name, measured)
             inputs = flight.need(graph.name, *needs, fix=fix)
-            return function(OnFlight(graph, flight, inputs, notes), **groups)
+            late = groups.pop("late")
+            return function(OnFlight(graph, flight, inputs, notes, late.rewind), **groups)
 
         prepare.__signature__ = signature  # type: ignore[attr-defined]
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
@@ -234,13 +240,15 @@ class Scored(Settings):
         estimate: str = "belief",
         innovations: bool = True,
         steps: Callable[[Result], Steps] | None = None,
+        recording: Recording | None = None,
     ) -> Scorer:
         """The score of a run on that flight; see `Scorer`."""
         truth = on.flight.truth
-        return Scorer(truth, errors, estimate, self.settle, innovations, steps, *self._smoother())
+        more = self._smoother(on, recording)
+        return Scorer(truth, errors, estimate, self.settle, innovations, steps, *more)
 
-    def _smoother(self) -> tuple[str, float | None]:
-        return "none", None
+    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
+        return ()
 
 
 @dataclass(frozen=True)
@@ -248,16 +256,32 @@ class Smoothed(Scored):
     """How a run is scored that can be smoothed.
 
     Args:
-        smooth: "rts" also scores the smoothed run.
+        smooth: "rts" also scores the smoothed run, "batch" the most likely trajectory of the whole
+            recording.
         lag: s; also scores the run smoothed with a fixed lag.
+        loss: what a measurement that is far off counts in a batch: none (its square), huber or cauchy.
     """
 
     judges = True
-    smooth: Annotated[str, one_of("none", "rts")] = "none"
+    smooth: Annotated[str, one_of("none", "rts", "batch")] = "none"
     lag: NotNegative | None = None
+    loss: Annotated[str, one_of(*LOSSES)] = "none"
 
-    def _smoother(self) -> tuple[str, float | None]:
-        return self.smooth, self.lag
+    @property
+    def smoothed(self) -> bool:
+        """Whether a graph is to collect what a smoother needs."""
+        return self.smooth != "none" or self.lag is not None
+
+    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
+        if self.smooth == "batch" and recording is None:
+            raise DeclarationError(
+                "this graph has no batch estimate",
+                path=f"{on.name}.smooth",
+                expected="rts",
+                got="batch",
+                fix="write smooth=rts",
+            )
+        return self.smooth, self.lag, recording, loss_of(self.loss)
 
 
 @dataclass(frozen=True)
@@ -379,46 +403,3 @@ class Particles(Settings):
     def resampling(self) -> dict[str, Any]:
         """What is a setting of the graph itself, by name."""
         return {"resample_below": self.resample_below, "scheme": self.scheme}
-
-
-# -- filters on an IMU and a motion capture --------------------------------------------------------------
-
-
-def on_capture(
-    on: OnFlight,
-    filter: PoseFilter,
-    *,
-    start: Callable[..., Any],
-    steps: Callable[[Result], Steps] | None = None,
-    **settings: Any,
-) -> Case:
-    """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.
-
-    Args:
-        on: with both streams.
-        filter: its factors, where they are left out, are those of `unbiased_factors`.
-        start: `(position, attitude)`, makes what the graph starts from.
-        steps: what a smoother needs of a result.
-        settings: of the graph itself.
-    """
-    vicon, info = on.inputs["vicon"], on.flight.info
-    pose = filter.pose(on, on.inputs, position=vicon, attitude=vicon, usual="file")
-    return on.case(
-        filter.score(on, pose_errors, steps=steps),
-        inputs=pose.inputs,
-        start=_started(start, pose),
-        noise=filter.imu_noise(on, unbiased_factors(on.name, on.flight)),
-        **filter.measured(on),
-        lever=tuple(info.get("vicon_lever", (0.0, 0.0, 0.0))),
-        reading=reading_of(on.flight),
-        gravity=on.gravity,
-        held=filter.held(on, pose.inputs["imu"]),
-        **filter.gating(),
-        **settings,
-    )
-
-
-def _started(start: Callable[..., Any], pose: StartPose) -> Any:
-    """What the graph starts from; with a heading of which nothing is known, as wide about all axes."""
-    more = {} if pose.heading is None else {"attitude_deviation": pose.heading}
-    return start(pose.position, pose.attitude, **more)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,7 +18,13 @@ from flowgraph.blocks.geometry.euler import ORDERS
 from flowgraph.blocks.geometry.rotations import rotate
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.metrics.errors import pose_errors
-from flowgraph.blocks.models.euler_ins import singularity_warning, start_gaussian, with_heading
+from flowgraph.blocks.models.euler_ins import (
+    euler_steps,
+    singularity_warning,
+    start_gaussian,
+    with_heading,
+)
+from flowgraph.blocks.models.recordings import euler_recording
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
     Factors,
@@ -25,8 +32,8 @@ from flowgraph.blocks.scoring.cases import (
     HeldControl,
     OnFlight,
     PoseAided,
-    PoseFilter,
     Scored,
+    SmoothedPoseFilter,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.scorer import Scorer
@@ -92,6 +99,18 @@ class EulerModel(ScaledFactors, Scored):
 
     order: EulerOrder = "zxy"
 
+    def judge(
+        self, on: OnFlight, inputs: Mapping[str, Series], start: Any, known: Mapping[str, Any]
+    ) -> EulerScore:
+        """The score of a run on that flight.
+
+        Args:
+            inputs: by source.
+            start: what the graph starts from.
+            known: settings of the graph itself.
+        """
+        return euler_score(on, self, self.order)
+
     def case(
         self, on: OnFlight, start: Any, *, inputs: Mapping[str, Series] | None = None, **settings: Any
     ) -> Case:
@@ -103,16 +122,15 @@ class EulerModel(ScaledFactors, Scored):
             inputs: by source; those that were needed if left out.
             settings: of the graph itself, beside noise, order and start.
         """
-        return on.case(
-            euler_score(on, self, self.order),
-            inputs=inputs,
-            start=start,
-            noise=self.imu_noise(on),
-            order=self.order,
-            reading=reading_of(on.flight),
-            gravity=on.gravity,
+        known = {
+            "noise": self.imu_noise(on),
+            "order": self.order,
+            "reading": reading_of(on.flight),
+            "gravity": on.gravity,
             **settings,
-        )
+        }
+        given_ = on.inputs if inputs is None else inputs
+        return on.case(self.judge(on, given_, start, known), inputs=inputs, start=start, **known)
 
 
 @dataclass(frozen=True)
@@ -165,8 +183,17 @@ class EulerPose(EulerModel, PoseAided):
 
 
 @dataclass(frozen=True)
-class EulerFilter(EulerKalman, EulerPose, PoseFilter):
+class EulerFilter(EulerKalman, EulerPose, SmoothedPoseFilter):
     """What is set of a Kalman filter with Euler angles that is corrected by measured poses."""
+
+    def judge(
+        self, on: OnFlight, inputs: Mapping[str, Series], start: Any, known: Mapping[str, Any]
+    ) -> EulerScore:
+        """The score of a run, and of the smoothed one."""
+        steps = partial(euler_steps, order=self.order)
+        told = ("noise", "order", "reading", "gravity", "R", "lever", "held")
+        recording = euler_recording(inputs, start=start, **{name: known[name] for name in told})
+        return EulerScore(self.score(on, pose_errors, steps=steps, recording=recording), self.order)
 
 
 @dataclass(frozen=True)

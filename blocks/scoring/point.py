@@ -66,7 +66,7 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
 
 def positions(vicon: Series) -> Series:
     """The positions of a motion capture."""
-    return Series(vicon.time, Position(position=vicon["position"]), name="position", gaps=vicon.gaps)
+    return vicon.holding(Position(position=vicon["position"]), "position")
 
 
 def readings(flight: Flight) -> Series:

@@ -50,7 +50,10 @@ MEASURED = (
 )  # fmt: skip
 
 GAP, MEASURED_GAP = 4.0, 10.0
-"""Of how many median steps a gap is: of a control, and of a measurement, which must last a second, too."""
+"""Of how many usual steps a gap is: of a control, and of a measurement, which must last a second, too."""
+
+BURSTS = 0.02
+"""The share of steps that must be waits for readings to come in bursts."""
 
 PAUSE, USUAL = 10.0, 100.0
 """s, and median steps of all streams together: what is longer is a jump of the stamps, or a pause."""
@@ -148,7 +151,8 @@ def _finite(name: str, series: Series, entries: bool) -> tuple[Series, list[str]
         kept = np.hstack(known).any(axis=1) & (np.arange(n) >= int(np.argmax(whole))) & whole.any()
         leaves = (np.where(np.isfinite(leaf), leaf, np.nan) for leaf in series.leaves.values())
         values = unflatten(series.type, leaves)
-        series = Series(series.time, values, type=series.type, name=series.name, gaps=True)
+        stamp = series.stamp if series.is_late else None
+        series = Series(series.time, values, type=series.type, name=series.name, gaps=True, stamp=stamp)
     said, part = [], int((kept & ~whole).sum())
     if not kept.all():
         said.append(note("skipped", f"{name}: {int((~kept).sum())} of {n} readings are not finite"))
@@ -206,17 +210,32 @@ def gap_notes(inputs: Mapping[str, Series], noted: Collection[str]) -> Iterator[
 
 
 def gaps(series: Series, *, control: bool = True) -> tuple[np.ndarray, float]:
-    """The steps that are gaps, and the median step, s."""
+    """The steps that are gaps, and the usual step, s."""
     steps = np.diff(series.time) * 1e-9
-    usual = float(np.median(steps)) if len(steps) else 0.0
+    usual = usual_step(steps)
     least = GAP * usual if control else max(MEASURED_GAP * usual, 1.0)
     return steps[steps > least], usual
+
+
+def usual_step(steps: np.ndarray) -> float:
+    """The median of steps (s), or where readings come in bursts the step in which half of the time lies.
+
+    A reading is as old as the wait between two bursts over and over again, so that is the sensor's own period.
+    Waits that are fewer than a fiftieth of all steps are no bursts.
+    """
+    if not len(steps):
+        return 0.0
+    median = float(np.median(steps))
+    by_size = np.sort(steps)
+    wait = float(by_size[np.searchsorted(np.cumsum(by_size), 0.5 * by_size.sum())])
+    often = np.count_nonzero(steps >= wait) >= BURSTS * len(steps)
+    return wait if wait > 2.0 * median and often else median
 
 
 def gap_note(name: str, wide: np.ndarray, usual: float) -> str:
     """What is said of the gaps of a stream."""
     many = "a gap of" if len(wide) == 1 else f"{len(wide)} gaps, the longest of"
-    return note("bridged", f"{name}: {many} {wide.max():.3g} s (median step {usual:.3g} s)")
+    return note("bridged", f"{name}: {many} {wide.max():.3g} s (usual step {usual:.3g} s)")
 
 
 def pause(inputs: Mapping[str, Any]) -> tuple[float, str] | None:

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from flowgraph import Graph, Result, Series
+from flowgraph.blocks.filtering.batch import Loss, Recording
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
 from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
+from flowgraph.drawing.states import Quantity, seconds_of
 from flowgraph.types import leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
@@ -28,6 +30,8 @@ SMOOTHED = (
     "position_max_m",
     "velocity_rmse_mps",
     "attitude_rmse_deg",
+    "tilt_rmse_deg",
+    "heading_rmse_deg",
     "nees_mean",
     "nees_inside",
 )
@@ -47,8 +51,11 @@ class Scorer:
         settle: seconds at the start that the errors leave out.
         innovations: whether those that a run collects are summed up too.
         steps: what a smoother needs of a result.
-        smooth: "rts" smooths the whole run, "none" does not.
+        smooth: "rts" smooths the whole run, "batch" takes the most likely trajectory of the recording, "none"
+            does neither.
         lag: s: with one, each tick is smoothed with what came until so much later.
+        recording: what the filter was given, for a batch.
+        loss: of a batch.
     """
 
     truth: Series | None
@@ -59,11 +66,13 @@ class Scorer:
     steps: Callable[[Result], Steps] | None = None
     smooth: str = "none"
     lag: float | None = None
+    recording: Recording | None = None
+    loss: Loss | None = None
 
     @property
     def smoothing(self) -> bool:
         """Whether the smoothed runs are compared too."""
-        asked = self.smooth == "rts" or self.lag is not None
+        asked = self.smooth != "none" or self.lag is not None
         return asked and self.steps is not None and self.truth is not None
 
     def reads(self, graph: Graph) -> list[str]:
@@ -82,8 +91,10 @@ class Scorer:
         smoothed: dict[str, Any] = {}
         if self.smoothing and self.steps is not None:
             prior, posterior, transition, space, named = self.steps(result)
-            if self.smooth == "rts":
+            if self.smooth != "none":
                 smoothed["smoothed"] = rauch_tung_striebel(prior, posterior, transition, space=space)
+            if self.smooth == "batch" and self.recording is not None:
+                smoothed["smoothed"] = self.recording(smoothed["smoothed"], self.loss)
             if self.lag is not None:
                 ticks = lag_ticks(posterior.time, self.lag)
                 smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
@@ -103,6 +114,15 @@ class Scorer:
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
+
+    def pictured(self, result: Result) -> list[Quantity]:
+        """The numbers of the estimate, as pictures show them; none where the errors know no state."""
+        quantities = getattr(self.errors, "quantities", None)
+        estimate = result.series.get(self.estimate)
+        if quantities is None or estimate is None or not len(estimate):
+            return []
+        found: list[Quantity] = quantities(estimate, self.truth, seconds_of(estimate, result))
+        return found
 
     def _sums_up(self, leaves: Mapping[str, object]) -> bool:
         return self.innovations and "nis" in leaves

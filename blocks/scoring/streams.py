@@ -54,9 +54,9 @@ def with_parts(flight: Flight) -> Flight:
         imu = streams["imu"]
         if "gyro" not in streams:
             info.update(gyro_oversample=info.get("imu_oversample", 1), gyro_turn=info.get("imu_turn", False))
-        streams.setdefault("gyro", Series(imu.time, Gyro(rate=imu["gyro"]), name="gyro", gaps=imu.gaps))
+        streams.setdefault("gyro", imu.holding(Gyro(rate=imu["gyro"]), "gyro"))
         force = SpecificForce(force=imu["specific_force"])
-        streams.setdefault("accelerometer", Series(imu.time, force, name="accelerometer", gaps=imu.gaps))
+        streams.setdefault("accelerometer", imu.holding(force, "accelerometer"))
     return replace(flight, streams=streams, info=info)
 
 

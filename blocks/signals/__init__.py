@@ -13,7 +13,9 @@ from flowgraph.blocks.signals.beliefs import (
     AttitudeRateBelief,
     Bank,
     Belief,
+    CrossCovariance,
     EulerAngles,
+    FilterStep,
     Gaussian,
     GaussianInformation,
     GaussianRoot,
@@ -24,6 +26,7 @@ from flowgraph.blocks.signals.beliefs import (
     PointBelief,
     PoseBelief,
     QuaternionBelief,
+    SmoothedBelief,
 )
 from flowgraph.blocks.signals.calibration import (
     Alignment,
@@ -46,6 +49,15 @@ from flowgraph.blocks.signals.motion import (
     Velocity,
     WorldAcceleration,
     WorldForce,
+)
+from flowgraph.blocks.signals.navigation import (
+    GnssFix,
+    GnssHeading,
+    GnssPosition,
+    GnssVelocity,
+    Height,
+    NavigationBelief,
+    WheelSpeed,
 )
 from flowgraph.blocks.signals.particles import (
     Ancestors,
@@ -115,6 +127,9 @@ __all__ = [
     "GaussianRoot",
     "GaussianInformation",
     "Bank",
+    "CrossCovariance",
+    "FilterStep",
+    "SmoothedBelief",
     "KalmanInnovation",
     "Innovation",
     "Belief",
@@ -145,4 +160,11 @@ __all__ = [
     "Window",
     "NormalEquations",
     "vector_of",
+    "GnssFix",
+    "GnssHeading",
+    "GnssPosition",
+    "GnssVelocity",
+    "Height",
+    "NavigationBelief",
+    "WheelSpeed",
 ]

@@ -12,6 +12,9 @@ __all__ = [
     "Gaussian",
     "GaussianRoot",
     "Bank",
+    "CrossCovariance",
+    "FilterStep",
+    "SmoothedBelief",
     "KalmanInnovation",
     "Innovation",
     "Belief",
@@ -54,6 +57,39 @@ class Bank(Signal):
     weight: Array = real("models")
     mean: Array = real("models", "n")
     covariance: Array = real("models", "t", "t")
+
+
+class CrossCovariance(Signal):
+    """What a belief and what was predicted of it have in common: the covariance of the errors of the belief
+    before a step (rows) and of the prediction after it (columns). Of a linear prediction it is P F^T."""
+
+    covariance: Array = real("t", "t")
+
+
+class FilterStep(Signal):
+    """One tick of a filter, as a smoother needs it.
+
+    mean, covariance: the belief after the tick's measurements. prior_mean, prior_covariance: before them.
+    cross: of the belief of the tick before (rows) and this prior; of the first tick it does not matter.
+    """
+
+    mean: Array = real("n")
+    covariance: Array = real("t", "t")
+    prior_mean: Array = real("n")
+    prior_covariance: Array = real("t", "t")
+    cross: Array = real("t", "t")
+
+
+class SmoothedBelief(Signal):
+    """A belief that knows what was measured later.
+
+    mean, covariance: as of a `Gaussian`. lag_one: the covariance of the error of the tick after it (rows) and
+    of its own, zero at the last.
+    """
+
+    mean: Array = real("n")
+    covariance: Array = real("t", "t")
+    lag_one: Array = real("t", "t")
 
 
 class KalmanInnovation(Signal):

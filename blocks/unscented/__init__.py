@@ -8,9 +8,11 @@ are those of `models` and `orientation`, or your own.
 from __future__ import annotations
 
 from flowgraph.blocks.unscented.filters import (
+    motion_cross,
     predict_unscented,
     through_motion,
     through_observation,
+    unscented_crossing,
     update_unscented,
 )
 from flowgraph.blocks.unscented.sigma_points import (
@@ -23,6 +25,8 @@ from flowgraph.blocks.unscented.sigma_points import (
 )
 
 __all__ = [
+    "unscented_crossing",
+    "motion_cross",
     "GAUSSIAN",
     "MEANS",
     "Cluster",

@@ -12,7 +12,8 @@ exact numbers, and stays positive in single precision.
 
 Source: E. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000;
 on manifolds C. Hertzberg et al., "Integrating generic sensor fusion algorithms with sound
-state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3.
+state representations through encapsulation of manifolds", Information Fusion 14(1), 2013, table 3; S.
+Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE TAC 53(3), 2008.
 """
 
 from __future__ import annotations
@@ -32,7 +33,14 @@ from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
 from flowgraph.language.block import Limit
 
-__all__ = ["predict_unscented", "through_motion", "through_observation", "update_unscented"]
+__all__ = [
+    "motion_cross",
+    "predict_unscented",
+    "through_motion",
+    "through_observation",
+    "unscented_crossing",
+    "update_unscented",
+]
 
 
 @block
@@ -74,13 +82,7 @@ def predict_unscented(
     t, kind = belief.covariance.shape[-1], belief.mean.dtype
     added = None if Q is None else noise_matrix(Q, t, "predict_unscented.Q", kind=kind, xp=xp) * dt
     P = belief.covariance + added if added is not None and Q_first else belief.covariance
-    shaken = None
-    if noise is not None:
-        # the root of a constant, scaled: the noise over no time has none
-        extra = np.atleast_1d(np.asarray(noise)).shape[-1]
-        density = noise_matrix(noise, extra, "predict_unscented.noise", kind=np.float64, xp=np)
-        shaken = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
-        shaken = shaken * xp.sqrt(xp.asarray(dt, dtype=kind))
+    shaken = None if noise is None else _shaken(noise, dt, kind, xp)
     carry = lambda x, w: move(x, control, w, dt, xp)
     mean, P = through_motion(belief.mean, P, carry, shaken, space=space, points=points, xp=xp)
     if added is not None and not Q_first:
@@ -108,6 +110,48 @@ def through_motion(
     apart, w, scale = _placed(P, shaken, space, points, xp)
     cluster = points.cluster(carry(_spread(x, apart, space, xp), w), space, scale, xp)
     return cluster.mean, points.covariance(cluster, cluster, scale)
+
+
+def motion_cross(
+    x: Array,
+    P: Array,
+    carry: Callable[..., Array],
+    shaken: Array | None,
+    *,
+    space: StateSpace | None,
+    points: SigmaPoints,
+    xp: Any,
+) -> Array:
+    """The covariance (..., t, t) of a Gaussian (x, P) and of what `through_motion` makes of it: the sum of
+    products of the points, before and after. (Särkkä 2008, eq. 30.)"""
+    apart, w, scale = _placed(P, shaken, space, points, xp)
+    after = points.cluster(carry(_spread(x, apart, space, xp), w), space, scale, xp)
+    return points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), after, scale)
+
+
+def unscented_crossing(
+    move: Callable[..., Array], noise: npt.ArrayLike | None, space: StateSpace | None, points: SigmaPoints
+) -> Callable[..., Array]:
+    """What `cross_covariance` asks of a filter that predicts with `predict_unscented`.
+
+    Args:
+        move, noise, space, points: as there.
+    """
+
+    def crossing(belief: Gaussian, control: Any, dt: Any, xp: Any) -> Array:
+        shaken = None if noise is None else _shaken(noise, dt, belief.mean.dtype, xp)
+        carry = lambda x, w: move(x, control, w, dt, xp)
+        return motion_cross(belief.mean, belief.covariance, carry, shaken, space=space, points=points, xp=xp)
+
+    return crossing
+
+
+def _shaken(noise: npt.ArrayLike, dt: Any, kind: Any, xp: Any) -> Array:
+    """A root of noise of a constant density over dt; it is scaled, since the noise over no time has none."""
+    extra = np.atleast_1d(np.asarray(noise)).shape[-1]
+    density = noise_matrix(noise, extra, "predict_unscented.noise", kind=np.float64, xp=np)
+    root = xp.asarray(semidefinite_root(density, xp=np), dtype=kind)
+    return root * xp.sqrt(xp.asarray(dt, dtype=kind))
 
 
 @block

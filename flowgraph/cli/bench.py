@@ -23,7 +23,8 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.data.files import put
-from flowgraph.data.registry import find_bench, parsed_settings, setting_names
+from flowgraph.data.registry import find_bench
+from flowgraph.data.settings import parsed_settings, setting_names
 from flowgraph.errors import UnknownNameError
 
 

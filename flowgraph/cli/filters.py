@@ -22,10 +22,12 @@ from flowgraph.cli.options import (
     NameOrNone,
     Seed,
     Settings,
+    SettingsFile,
     Truth,
     case_of,
     graph_of,
     one_flight,
+    with_file,
 )
 from flowgraph.cli.pages import runs_before, watcher_of, write_page
 from flowgraph.cli.resume import kept_in, resumed
@@ -83,13 +85,14 @@ def show(
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     seed: Seed = 0,
 ) -> None:
     """Draw a graph: in the terminal, or to a file; an .html is a page in which it unfolds."""
     from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
     from flowgraph.pipeline.costs.places import costs_by_path
 
-    built, _ = graph_of(graph, one_flight(data), settings, seed, truth)
+    built, _ = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
@@ -111,6 +114,7 @@ def run(
     dtype: Annotated[str | None, typer.Option(help="float64 or float32", show_default="float64")] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A page of the run, with diagram, plots and a slider.")
@@ -134,6 +138,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
+    settings = with_file(settings, settings_file) or None
     command = resumed(resume, graph=graph, data=data, truth=truth, engine=engine, dtype=dtype, seed=seed,
                       settings=settings)  # fmt: skip
     graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
@@ -288,10 +293,19 @@ def _pictures(
     # With them comes SciPy, which only pictures need.
     from flowgraph.drawing.attitude import plot_orientation
     from flowgraph.drawing.plot import plot_navigation, plot_result
+    from flowgraph.drawing.states import innovations_of, plot_states
     from flowgraph.drawing.trajectory import plot_space
 
     found: dict[str, Callable[[Path], object]] = {"diagram.svg": lambda file: case.graph.draw(str(file))}
     if estimate is None:
+        return found
+    tell = getattr(case.score, "pictured", None)  # of states that only their filter knows
+    numbers = [] if tell is None else tell(result)
+    if numbers:
+        found["states.png"] = lambda file: plot_states(numbers, file, heading=case.graph.name)
+        residuals = innovations_of(result)
+        if residuals:
+            found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
         seen = next((s for s in _recorded(case).values() if "position" in s.leaves and len(s)), None)

@@ -10,7 +10,18 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson, DataOrNone, Name, Seed, Settings, Truth, graph_of, one_flight
+from flowgraph.cli.options import (
+    AsJson,
+    DataOrNone,
+    Name,
+    Seed,
+    Settings,
+    SettingsFile,
+    Truth,
+    graph_of,
+    one_flight,
+    with_file,
+)
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.data.files import put
 from flowgraph.engines.registry import writers
@@ -30,6 +41,7 @@ def lower(
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
+    settings_file: SettingsFile = None,
     seed: Seed = 0,
     target: Annotated[
         str, typer.Option(metavar="TARGET", help="description, or c for C99 too.")
@@ -61,7 +73,7 @@ def lower(
         if given not in valid:
             raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()), passes=DEFAULT if engine is None else engine.passes)
-    built, inputs = graph_of(graph, one_flight(data), settings, seed, truth)
+    built, inputs = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     pipeline = lower_graph(built, dtype=dtype)
     if name is not None:
         pipeline = renamed(pipeline, name)

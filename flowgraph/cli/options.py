@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
+from flowgraph.data.files import text_of
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.series import Flight
+from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
-Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.")]
+Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.")]
 NameOrNone = Annotated[
-    str | None, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`.", show_default=False)
+    str | None,
+    typer.Argument(
+        metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.", show_default=False
+    ),
 ]
 Data = Annotated[
     list[str],
@@ -50,6 +59,10 @@ Settings = Annotated[
 ]
 SEED_HELP = "Of a simulated flight, and of the graph's draws."
 Seed = Annotated[int, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP)]
+SettingsFile = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="What tune or calibrate found; --set goes before it."),
+]
 Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -140,6 +153,41 @@ def _pair(text: str) -> tuple[str, str]:
             fix=f"write --set {key}=...",
         )
     return key.strip(), value.strip()
+
+
+def with_file(settings: list[str] | None, file: Path | None) -> list[str]:
+    """The `--set` texts, and those of a file that `tune` or `calibrate` wrote for what they do not name.
+
+    Raises:
+        DataError: where there is no such file.
+    """
+    given = list(settings or [])
+    if file is None:
+        return given
+    wrong = functools.partial(
+        DataError,
+        "these are no settings",
+        path=str(file),
+        expected='{"parameters": {KEY: {"value": ...}}}, as tune and calibrate write it',
+        fix="write it with flowgraph tune --out FILE",
+    )
+    try:
+        read = json.loads(text_of(file))
+    except (OSError, ValueError, RecursionError) as error:
+        raise wrong(got=f"{type(error).__name__}: {error}"[:200]) from None
+    parameters = read.get("parameters") if isinstance(read, dict) else None
+    if not isinstance(parameters, dict):
+        raise wrong(got="no parameters")
+    named = pairs(settings)
+    for key, one in parameters.items():
+        value = one.get("value") if isinstance(one, dict) else one
+        try:
+            word = value if isinstance(value, str) else text(np.array(value, dtype=float))
+        except (TypeError, ValueError):
+            raise wrong(got=f"{key}: {value!r}"[:200]) from None
+        if key not in named:
+            given.append(f"{key}={word}")
+    return given
 
 
 def pairs(settings: list[str] | None) -> dict[str, str]:

@@ -52,8 +52,8 @@ class PlainConsole(Console):
             yield Segment(in_characters_of(self.file, text), segment.style)  # type: ignore[arg-type]
 
 
-out_console = PlainConsole(soft_wrap=True)
-err_console = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
+out_console = PlainConsole(soft_wrap=True, emoji=False)
+err_console = PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
 def give_up(message: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from flowgraph.cli.app import app
@@ -52,6 +53,9 @@ def tune(
     by: Annotated[str, typer.Option(help="likelihood of the innovations, or error")] = "likelihood",
     metric: Annotated[str | None, typer.Option(help="The error; the score's first if left out.")] = None,
     method: Annotated[str | None, typer.Option(help="L-BFGS-B, Nelder-Mead or Powell.")] = None,
+    slopes: Annotated[
+        str | None, typer.Option(help="forward or differences; forward where the engine has them.")
+    ] = None,
     engine: Annotated[str, typer.Option(help="In xla and c, recordings go together.")] = "reference",
     most: Annotated[int, typer.Option(min=1, help="Points to try in a search, about.")] = 200,
     settings: Settings = None,
@@ -61,22 +65,22 @@ def tune(
 ) -> None:
     """Find noise parameters that suit recordings best, and judge them by recordings held out."""
     # A fifth of a second, with worker pools, that `list` need not pay.
-    from flowgraph.study.tune import Fit, Recording
+    from flowgraph.study.tune import Fit, Recording, placed
     from flowgraph.study.tune import tune as search
 
-    fits = [Fit(name, *numbers) for name, numbers in map(_span, fit)]
+    fits = [Fit(name, *numbers, scale="linear") if placed(name) else Fit(name, *numbers)
+            for name, numbers in map(span, fit)]  # fmt: skip
     train = [Recording(d, s) for d in data for s in range(seeds)]
     later = [Recording(d, s) for d in data for s in range(seeds, seeds + held_out_seeds)]
     judges = later + [Recording(d) for d in held_out or []]
     hidden = quiet or as_json
 
     def watch(count: int, best: Any, value: float) -> None:
-        said = ", ".join(f"{n}={v:.4g}" for n, v in best.items())
-        err_console.print(f"{count} tried: {value:.6g} at {said}", markup=False)
+        err_console.print(f"{count} tried: {value:.6g} at {said_of(best)}", markup=False)
 
     found = search(
         graph, fits, train, judges, folds=folds, measure=by, metric=metric, settings=dict(pairs(settings)),
-        method=method, engine=engine, most=most, watch=None if hidden else watch,
+        method=method, slopes=slopes, engine=engine, most=most, watch=None if hidden else watch,
     )  # fmt: skip
     report = _report(found)
     if out is not None:
@@ -85,11 +89,14 @@ def tune(
     if as_json:
         return print_json(report)
     print_whole(table(_lines(found)))
-    out_console.print(f"before: {_said(found.start)}", markup=False)
+    out_console.print(f"before: {said_of(found.start)}", markup=False)
     for k, part in enumerate(found.folds):
-        out_console.print(f"after, without fold {k}: {_said(part.parameters)}", markup=False)
+        out_console.print(f"after, without fold {k}: {said_of(part.parameters)}", markup=False)
     whole = "of all: " if found.folds else "after: "
-    out_console.print(whole + " ".join(f"--set {n}={v:.5g}" for n, v in found.parameters.items()))
+    out_console.print(whole + " ".join(f"--set {n}={shown(v)}" for n, v in found.parameters.items()))
+    sure = {n: d for n, d in found.deviations.items() if d is not None}
+    if sure:
+        out_console.print("standard deviations: " + said_of(sure), markup=False)
     for said in _notes(found):
         err_console.print(f"note: {said}", markup=False)
     bounds = {f.name: {"low": f.low, "high": f.high} for f in fits}
@@ -127,8 +134,24 @@ def _searches(found: Tuned) -> list[tuple[str, Found]]:
     return [*parts, (" over all" if parts else "", found)]
 
 
-def _said(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{n}={v:.5g}" for n, v in values.items())
+def said_of(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{n}={shown(v)}" for n, v in values.items())
+
+
+def shown(value: Any) -> str:
+    """A number or an array as `--set` takes it, to five digits."""
+    if isinstance(value, float | int):
+        return f"{value:.5g}"
+    return ";".join(",".join(f"{x:.5g}" for x in row) for row in np.atleast_2d(value))
+
+
+def plain_parameters(values: Mapping[str, Any], deviations: Mapping[str, Any]) -> dict[str, Any]:
+    """What `run --settings` reads: each value with its standard deviation, None where it is not known."""
+    return {n: {"value": _plain(v), "deviation": _plain(deviations.get(n))} for n, v in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _lines(found: Tuned) -> list[dict[str, Any]]:
@@ -177,19 +200,21 @@ def _report(found: Tuned) -> dict[str, Any]:
 
     def search(one: Found) -> dict[str, Any]:
         return {
-            "parameters": one.parameters, "evaluations": one.evaluations, "converged": one.converged,
-            "message": one.message, "at_bound": one.at_bound,
+            "parameters": plain_parameters(one.parameters, one.deviations),
+            "evaluations": one.evaluations, "converged": one.converged, "message": one.message,
+            "at_bound": one.at_bound,
         }  # fmt: skip
 
     return {
-        "graph": found.graph, "start": found.start, "measure": found.measure, "metric": found.metric,
+        "graph": found.graph, "start": {n: _plain(v) for n, v in found.start.items()},
+        "measure": found.measure, "metric": found.metric,
         **search(found), "folds": [search(part) for part in found.folds], "recordings": rows,
         "without_effect": list(found.without_effect), "notes": _notes(found),
         "mean": {n: dict(zip(three, m, strict=True)) for n, m in means.items() if m is not None},
     }  # fmt: skip
 
 
-def _span(given: str) -> tuple[str, list[float]]:
+def span(given: str, option: str = "--fit") -> tuple[str, list[float]]:
     name, _, span = given.partition("=")
     try:
         numbers = [float(x) for x in span.split(":")]
@@ -198,9 +223,9 @@ def _span(given: str) -> tuple[str, list[float]]:
     except ValueError:
         raise DeclarationError(
             "a parameter to find has bounds",
-            path="--fit",
+            path=option,
             expected="NAME=LOW:HIGH or NAME=LOW:HIGH:START",
             got=repr(given),
-            fix="write --fit position_noise=0.001:0.1",
+            fix=f"write {option} position_noise=0.001:0.1",
         ) from None
     return name, numbers

@@ -1,4 +1,4 @@
-"""What a run gave back, in the forms that other tools read: TUM text for trajectories, xarray for arrays.
+"""Recordings and what a run gave back, in forms that other tools read: TUM text, tables, xarray.
 
 Times go out as exactly as they came: all nanoseconds of a stamp are written.
 """
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowgraph.data.files import put
-from flowgraph.data.series import Series
+from flowgraph.data.frames import part_words
+from flowgraph.data.series import Flight, Series
 from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError
 from flowgraph.types import leaves_of
 
@@ -51,9 +52,47 @@ def write_tum(series: Series, file: str | Path) -> None:
         )
     lines = ["# t[s] x[m] y[m] z[m] qx qy qz qw" + ("" if placed else "; attitude only, positions are zero")]
     for time, row in zip(series.time.tolist(), table.tolist(), strict=True):
-        sign, (seconds, rest) = "-" if time < 0 else "", divmod(abs(time), 10**9)
-        lines.append(f"{sign}{seconds}.{rest:09d} " + " ".join(map(repr, row)))
+        lines.append(f"{_seconds(time)} " + " ".join(map(repr, row)))
     put(file, "\n".join(lines) + "\n")
+
+
+def write_table(flight: Flight, file: str | Path) -> None:
+    """Write the streams and the truth of a flight as one csv table, which `table:FILE` reads.
+
+    The head is `time`, in seconds with nine decimals, and a column a number, with its unit:
+    `fix.position.0 [m]`. A row is a time at which any of them has a value; what has none then is empty.
+
+    Args:
+        flight: of streams of real numbers.
+        file: to be written.
+
+    Raises:
+        OutputError: where the file cannot be written.
+    """
+    streams = {**flight.streams, **({} if flight.truth is None else {"truth": flight.truth})}
+    times = np.unique(np.concatenate([s.time for s in streams.values()]))
+    names, columns = ["time"], []
+    for stream, series in streams.items():
+        rows = np.searchsorted(times, series.time)
+        for (field, type_), array in zip(leaves_of(series.type), series.leaves.values(), strict=True):
+            unit = f" [{type_.unit}]" if type_.unit and "," not in type_.unit else ""
+            for at in np.ndindex(*array.shape[1:]):
+                word = [] if field == "value" else [field]
+                names.append(".".join([stream, *word, *part_words(field, array.shape[1:], at)]) + unit)
+                column = [""] * len(times)
+                values = array[(slice(None), *at)].tolist()
+                for row, value in zip(rows.tolist(), values, strict=True):
+                    column[row] = repr(value) if value == value else ""
+                columns.append(column)
+    lines = [",".join(names)]
+    lines += [",".join([_seconds(t), *row]) for t, *row in zip(times.tolist(), *columns, strict=True)]
+    put(file, "\n".join(lines) + "\n")
+
+
+def _seconds(time: int) -> str:
+    """A time in ns as decimal seconds, to the last digit."""
+    sign, (seconds, rest) = "-" if time < 0 else "", divmod(abs(time), 10**9)
+    return f"{sign}{seconds}.{rest:09d}"
 
 
 _AXES = {3: ["x", "y", "z"], 4: ["w", "x", "y", "z"]}
@@ -99,4 +138,4 @@ def to_xarray(result: Result) -> Any:
     return tree
 
 
-__all__ = ["to_xarray", "write_tum"]
+__all__ = ["to_xarray", "write_table", "write_tum"]

@@ -15,7 +15,7 @@ import numpy as np
 from flowgraph.errors import DataError, DeclarationError, MissingDependencyError, UnknownNameError
 from flowgraph.types import ArrayType, StructType, Type, leaves_of, struct_type
 
-__all__ = ["frame_of", "signal_of", "stamps_of"]
+__all__ = ["frame_of", "part_words", "signal_of", "stamps_of"]
 
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 """Of numbers that are stamps, in ns."""
@@ -228,12 +228,12 @@ def frame_of(time: np.ndarray, leaves: Mapping[str, np.ndarray], type_: Type) ->
         lone = isinstance(type_, ArrayType)
         for at in np.ndindex(*array.shape[1:]):
             words = [] if lone else [name]
-            words += _axis(name, array.shape[1:], at)
+            words += part_words(name, array.shape[1:], at)
             columns[".".join(words) or name] = array[(slice(None), *at)]
     return pandas.DataFrame(columns, index=pandas.Index(time, name="time"))
 
 
-def _axis(name: str, shape: tuple[int, ...], at: tuple[int, ...]) -> list[str]:
+def part_words(name: str, shape: tuple[int, ...], at: tuple[int, ...]) -> list[str]:
     """What to call a number of a field."""
     turn = any(word in name for word in ("attitude", "quaternion", "orientation"))
     if shape == (3,) or (shape == (4,) and turn):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.arrival import with_stamps
 from flowgraph.data.series import Flight, Series, unmasked
 from flowgraph.data.tape import need_near
 from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
@@ -139,6 +140,7 @@ def prepare(
         for name in given:
             if name not in graph.sources:
                 raise UnknownNameError("source", name, graph.sources, path=graph.name)
+    given = with_stamps(graph.sources, given)
     found: dict[str, Series | Iterator[tuple[int, Any]]] = {}
     before = dict(last or dict.fromkeys(graph.sources, NEVER))
     resumed = max(before.values(), default=NEVER)

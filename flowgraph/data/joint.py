@@ -32,14 +32,14 @@ Claims = Callable[[str, Mapping[str, Any]], Iterable[str]]
 
 
 def parts_of(spec: str, kinds: Iterable[str]) -> list[str]:
-    """The parts of a SPEC: a `+` begins one where an installed kind and a colon follow it.
+    """The parts of a SPEC: a `+` begins one where an installed kind, or a file of code, and a colon follow.
 
     Any other `+` is of a file's name, and so is each where a file of the whole name exists.
     """
     if Path(spec.partition(":")[2]).expanduser().exists():
         return [spec]
     names = "|".join(map(re.escape, kinds))
-    return re.split(rf"\+(?=(?:{names}):)", spec)
+    return re.split(rf"\+(?=(?:{names}|[^+:]+\.py):)", spec)
 
 
 def numbered(names: Sequence[Iterable[str]]) -> list[str]:

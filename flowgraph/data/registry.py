@@ -4,14 +4,13 @@ A package offers a graph under the entry point group `flowgraph.graphs` (a `@gra
 `on_flight`), a source of flights under `flowgraph.flights` (a function `load(argument, *, seed, settings)`),
 and an experiment under `flowgraph.benches` (a function of keyword settings that returns a `Report`). Ours are
 found the same way as a user's. What cannot be imported is a `PluginError` to those who ask for it, and
-stands in nobody else's way.
+stands in nobody else's way. A name FILE.py:NAME is looked for in that file; see `own`.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import math
 import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -19,12 +18,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.arrival import LATENCY, delayed_flight
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
+from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
-from flowgraph.errors import DataError, DeclarationError, FlowgraphError, PluginError, UnknownNameError
+from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
 
@@ -82,6 +83,7 @@ class Report:
 # What packages offer, by the group of their entry points.
 KINDS = {
     "flowgraph.graphs": "graph",
+    "flowgraph.cases": "way to make a case",
     "flowgraph.flights": "kind of flight",
     "flowgraph.benches": "bench",
     "flowgraph.engines": "engine",
@@ -159,12 +161,20 @@ def find_bench(name: str) -> Callable[..., Report]:
 
 
 def find_graph(name: str) -> GraphFunction:
-    """The installed graph of that name.
+    """The installed graph of that name, or that of a file, FILE.py:NAME, which is then run.
+
+    One in a file that says nothing of flights takes the streams of a flight by their names.
 
     Raises:
-        UnknownNameError: listing the names that exist; PluginError: if its package cannot be imported.
+        UnknownNameError: listing the names that exist; PluginError: if its package or file cannot be
+            imported; DeclarationError: where there is no such file, or the name in it is no graph's.
     """
-    found: GraphFunction = find_entry("flowgraph.graphs", name)
+    if not is_in_file(name):
+        found: GraphFunction = find_entry("flowgraph.graphs", name)
+        return found
+    found = graph_in_file(name)
+    if found.prepare is None:
+        found.on_flight(find_entry("flowgraph.cases", "by_names")(found))
     return found
 
 
@@ -186,10 +196,12 @@ def load_flight(
     """Load the flight that a text such as "sim" or "euroc:PATH" names.
 
     Args:
-        spec: KIND or KIND:WHERE; several, of one flight, are joined by `+`: "csv:imu.csv+csv:mocap.csv".
+        spec: KIND or KIND:WHERE, where KIND may be FILE.py:NAME; several, of one flight, are joined by `+`:
+            "csv:imu.csv+csv:mocap.csv".
         seed: of what is simulated.
         settings: of the loaders by name. Of several parts, each takes those that it has; `2.NAME` is for the
-            second alone.
+            second alone. Every kind has `STREAM.latency`, the seconds after which a stream arrives; LOW:HIGH
+            for random ones.
         truth: a SPEC whose truth, or only stream of poses, is the flight's truth; its settings have the
             number after the last part.
 
@@ -199,92 +211,73 @@ def load_flight(
         DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong, or
             parts do not fit together.
     """
+    late = {k: v for k, v in (settings or {}).items() if k.endswith(LATENCY)}
+    rest = {k: v for k, v in (settings or {}).items() if k not in late}
+    flight = _load(spec, seed, rest, truth)
+    return delayed_flight(flight, late, seed=seed) if late else flight
+
+
+def _load(spec: str, seed: int, settings: Mapping[str, str], truth: str | None) -> Flight:
     specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
-    loaders = [find_entry("flowgraph.flights", s.partition(":")[0]) for s in specs]
-    each = [dict(settings or {})]
+    kinds = [_kind(s) for s in specs]
+    each = [dict(settings)]
     if len(specs) > 1:
-        claims = [getattr(inspect.getmodule(load), "claims", None) for load in loaders]
-        names = [flight_settings(s) for s in specs]
-        given = of_a_truth(settings or {}, names) if truth is not None else settings or {}
-        each = shared(specs, names, claims, given)
-    found = [_read(load, s, seed, given) for load, s, given in zip(loaders, specs, each, strict=True)]
+        names = [kind.settings for kind in kinds]
+        given = of_a_truth(settings, names) if truth is not None else settings
+        each = shared(specs, names, [kind.claims for kind in kinds], given)
+    found = [_read(kind, s, seed, given) for kind, s, given in zip(kinds, specs, each, strict=True)]
     if truth is None:
         return found[0] if len(found) == 1 else joined(specs, found)
     whole = found[0] if len(found) == 2 else joined(specs[:-1], found[:-1])
     return with_truth(whole, truth, found[-1])
 
 
-def _read(load: Callable[..., Flight], spec: str, seed: int, settings: Mapping[str, str]) -> Flight:
-    kind, _, argument = spec.partition(":")
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of flight: what loads it, its settings, and which of several parts' settings it claims."""
+
+    load: Callable[..., Flight]
+    settings: list[str]
+    claims: Any = None
+
+
+def _kind(spec: str) -> _Kind:
+    name, _ = kind_and_place(spec)
+    if is_in_file(name):
+        return _Kind(*flight_in_file(name))
+    load = find_entry("flowgraph.flights", name)
+    module = inspect.getmodule(load)
+    names = list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {})))
+    return _Kind(load, names, getattr(module, "claims", None))
+
+
+def _read(kind: _Kind, spec: str, seed: int, settings: Mapping[str, str]) -> Flight:
+    name, place = kind_and_place(spec)
     try:
-        return load(argument, seed=seed, settings=settings)
+        return kind.load(place, seed=seed, settings=settings)
     except FlowgraphError:
         raise
     except Exception as error:  # of a damaged file a library may say anything
         raise DataError(
             "this recording cannot be read",
             path=spec,
-            expected=f"a whole recording of the kind {kind}",
+            expected=f"a whole recording of the kind {name}",
             got=f"{type(error).__name__}: {error}"[:300],
             fix="restore the file; if it is whole, please report it to the package that reads this kind",
         ) from error
 
 
-def flight_settings(spec: str, truth: str | None = None) -> list[str]:
-    """The settings that the loaders of a SPEC understand; of several parts, for all and for each."""
-    specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
-    names = []
-    for one in specs:
-        module = inspect.getmodule(find_entry("flowgraph.flights", one.partition(":")[0]))
-        names.append(list(getattr(module, "SETTINGS", getattr(module, "DEFAULTS", {}))))
-    return names[0] if len(names) == 1 else numbered(names)
+def flight_settings(spec: str, truth: str | None = None, *, run: bool = True) -> list[str]:
+    """The settings that the loaders of a SPEC understand; of several parts, for all and for each.
 
-
-def setting_names(function: Callable[..., Any]) -> list[str]:
-    """The keyword-only arguments of a function."""
-    return [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
-
-
-def parsed_settings(
-    function: Callable[..., Any], given: Mapping[str, str], *, also: Sequence[str], path: str
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Split `--set` texts into keyword arguments of `function`, as its annotations say, and those of `also`.
-
-    Raises:
-        UnknownNameError: for a key that is in neither; DeclarationError: for a text that is no such value.
+    Args:
+        spec, truth: as of `load_flight`.
+        run: whether a file of code may be run for it; otherwise it is only read.
     """
-    hints = typing.get_type_hints(function)
-    own = setting_names(function)
-    mine: dict[str, Any] = {}
-    rest: dict[str, str] = {}
-    for key, text in given.items():
-        name = key.replace(".", "_")  # start.heading is the argument start_heading
-        if key in also:
-            rest[key] = text
-        elif name in own:
-            mine[name] = _parse(text, hints.get(name, str), f"{path}.{key}")
-        elif "STREAM." + key.rpartition(".")[2] in also:  # a setting that streams of any name have
-            rest[key] = text
-        else:
-            raise UnknownNameError("setting", key, [*own, *also], path=path)
-    return mine, rest
-
-
-def _parse(text: str, annotation: Any, path: str) -> Any:
-    kinds = [k for k in (typing.get_args(annotation) or (annotation,)) if k is not type(None)]
-    if text.lower() == "none" and type(None) in typing.get_args(annotation):
-        return None
-    words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-    try:
-        value = words[text.lower()] if kinds[0] is bool else kinds[0](text)
-        if kinds[0] in (int, float) and ("_" in text or not math.isfinite(value)):
-            raise ValueError
-        return value
-    except (KeyError, OverflowError, TypeError, ValueError):
-        raise DeclarationError(
-            "this setting cannot be read",
-            path=path,
-            expected=" or ".join(("finite " if k is float else "") + k.__name__ for k in kinds),
-            got=repr(text),
-            fix=f"write --set {path.rsplit('.', 1)[-1]}=VALUE",
-        ) from None
+    specs = [*parts_of(spec, flight_names()), *([truth] if truth is not None else [])]
+    kinds = [kind_and_place(one)[0] for one in specs]
+    names = [
+        settings_by_text(kind) if is_in_file(kind) and not run else _kind(one).settings
+        for kind, one in zip(kinds, specs, strict=True)
+    ]
+    return [*(names[0] if len(names) == 1 else numbered(names)), "STREAM" + LATENCY]

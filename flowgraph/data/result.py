@@ -13,18 +13,19 @@ from flowgraph.errors import UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.verbs import verb
 
+COUNTED = ("expired", "late_")
+"""How the parts of a block's state begin that are counts for `run.stats`."""
+
 
 def statistics(graph: Graph, state: Mapping[str, Any]) -> dict[str, int]:
-    """Counters of what joins discarded by definition: `{"match.expired_a": 3}`."""
+    """Counters of what joins discarded by definition, and of late events: `{"match.expired_a": 3}`."""
     counts = {}
     for _, call in graph.calls:
         if call.state is not None:
             path = graph.nodes[call.state].path
             part = state["registers"][path]
             if isinstance(part, Mapping):
-                counts.update(
-                    {f"{call.path}.{n}": int(v) for n, v in part.items() if n.startswith("expired")}
-                )
+                counts.update({f"{call.path}.{n}": int(v) for n, v in part.items() if n.startswith(COUNTED)})
     return counts
 
 

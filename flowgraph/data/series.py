@@ -40,11 +40,13 @@ class Series:
         type: the type of one value; found from `values` where it is left out.
         name: what to call it in messages.
         gaps: whether a NaN is data, an entry that was not measured; otherwise a run refuses it.
+        stamp: (n,) int64 ns, when each value was true, where that is before `time`, when it arrived and makes
+            a tick; in any order. Left out, a value is true when it arrives, and nothing is kept.
 
     A leaf is an attribute (`series.position`) or an item (`series["pose.position"]`).
 
     Raises:
-        DataError: when lengths differ.
+        DataError: when lengths differ, or a value was true after it arrived.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Series:
         type: Type | None = None,
         name: str = "series",
         gaps: bool = False,
+        stamp: npt.ArrayLike | None = None,
     ) -> None:
         if isinstance(time, np.ma.MaskedArray) and np.ma.is_masked(time):
             raise _only_real(f"{name}: time")
@@ -86,6 +89,7 @@ class Series:
                 fix="check the unit of the stamps: they are nanoseconds",
             )
         self.time = stamps.astype(np.int64)
+        self._stamp = None if stamp is None else _true_at(stamp, self.time, name)
         self.name, self.gaps = name, gaps
         self.type = type if type is not None else _one_of(values, name)
         self._leaves: list[np.ndarray] = []
@@ -164,9 +168,23 @@ class Series:
         return unflatten(self.type, iter(self._leaves))
 
     @property
+    def stamp(self) -> np.ndarray:
+        """(n,) int64 ns, when each value was true; `time` where nothing else was said."""
+        return self.time if self._stamp is None else self._stamp
+
+    @property
+    def is_late(self) -> bool:
+        """Whether stamps of its own say when its values were true."""
+        return self._stamp is not None
+
+    @property
     def seconds(self) -> np.ndarray:
         """(n,) times in seconds since the first."""
         return (self.time - self.time[0]) * 1e-9 if len(self.time) else np.zeros(0)
+
+    def holding(self, values: Any, name: str | None = None) -> Series:
+        """Other values at the times and stamps of this series, with its rule for gaps."""
+        return Series(self.time, values, name=name or self.name, gaps=self.gaps, stamp=self._stamp)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -196,7 +214,8 @@ class Series:
         if np.ndim(self.time[key]) == 0:
             return unflatten(self.type, iter(picked))
         part = unflatten(self.type, iter(picked))
-        return Series(self.time[key], part, type=self.type, name=self.name, gaps=self.gaps)
+        stamp = None if self._stamp is None else self._stamp[key]
+        return Series(self.time[key], part, type=self.type, name=self.name, gaps=self.gaps, stamp=stamp)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -236,6 +255,32 @@ def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:
             got=str(error),
             fix="give rows of one length, padded where they are shorter",
         ) from None
+
+
+def _true_at(stamp: npt.ArrayLike, time: np.ndarray, name: str) -> np.ndarray:
+    """The times of validity (n,) of values that arrived at `time`."""
+    found = _array(stamp, f"{name}.stamp")
+    if found.shape != time.shape or found.dtype.kind not in "iu":
+        raise DataError(
+            "the stamps are not one a value",
+            path=f"{name}.stamp",
+            expected=f"int64 ns of shape {time.shape}",
+            got=f"{found.dtype} of shape {found.shape}",
+            fix="give the time of validity of each value, or leave stamp out",
+        )
+    early = np.flatnonzero(found > time)
+    if len(early):
+        row = int(early[0])
+        raise DataError(
+            "a value was true only after it arrived",
+            path=f"{name}.stamp, row {row} ({len(early)} in all)",
+            expected=f"at most {int(time[row])} ns, its arrival",
+            got=f"{int(found[row])} ns",
+            fix="bring both times to one clock: STREAM.time_offset moves the stamps of a recording",
+        )
+    found = found.astype(np.int64)
+    found.flags.writeable = False
+    return found
 
 
 def unmasked(values: Any, name: str, dtype: Any = None) -> Any:

@@ -16,7 +16,6 @@ from flowgraph.data.series import Series
 from flowgraph.drawing.angles import between, turn_between
 from flowgraph.drawing.fields import STATES, find
 
-LOW, HIGH = 0.025, 0.975
 FAR = 2.0
 """A mean that is so many times too large or too small is worth a warning."""
 
@@ -100,11 +99,18 @@ def _squared(error: np.ndarray, P: np.ndarray) -> np.ndarray:
         return np.array(one)
 
 
-def bounds(degrees: int) -> tuple[float, float]:
-    """Between which 95 % of a chi-squared variable lie."""
+def bounds(degrees: float, outside: float = 0.05) -> tuple[float, float]:
+    """Between which a chi-squared variable lies but for a share of cases, half of them on each side."""
     from scipy.special import gammaincinv  # SciPy is slow to import, and only needed here
 
-    return tuple(2.0 * float(gammaincinv(degrees / 2.0, p)) for p in (LOW, HIGH))  # type: ignore[return-value]
+    low, high = (2.0 * float(gammaincinv(degrees / 2.0, p)) for p in (outside / 2, 1 - outside / 2))
+    return low, high
 
 
-__all__ = ["bounds", "covariance_of", "error_of", "nees", "places"]
+def is_far(mean: float, degrees: float) -> bool:
+    """Whether a mean per number, of squares of so many numbers in all, is far from 1, and not by chance."""
+    low, high = bounds(degrees, outside=1e-4)
+    return not 1 / FAR < mean < FAR and not low < mean * degrees < high
+
+
+__all__ = ["bounds", "covariance_of", "error_of", "is_far", "nees", "places"]

@@ -250,6 +250,8 @@ class _Diagram:
 
     def source_node(self, node: SourceNode) -> str:
         tip = f"source {node.path}: {node.type}, {node.clock.timing}"
+        if node.path != node.clock.name:
+            tip = f"when the values of {node.clock.name} were true: {node.type}, with each of them"
         shape = {"TB": "invhouse", "BT": "house"}.get(self.rankdir, "cds")
         return self.node(node.path, "source", f"<b>{_escaped(node.path)}</b>", shape, tip, margin="0.14,0.08")
 

@@ -55,8 +55,15 @@ def diagram_page(
     return written(made, file)
 
 
-def page(kind: str, title: str, words: str, data: Mapping[str, Any], scripts: tuple[str, ...]) -> str:
-    """A page of a kind that `front/src` knows, with its data as JSON by the id of the element."""
+def page(
+    kind: str, title: str, words: str, data: Mapping[str, Any], scripts: tuple[str, ...], *, asks: str = ""
+) -> str:
+    """A page of a kind that `front/src` knows, with its data as JSON by the id of the element.
+
+    Args:
+        asks: the one address that it may connect to.
+    """
+    policy = f"{_POLICY}; connect-src {asks}" if asks else _POLICY
     stored = "\n".join(
         f'<script type="application/json" id="{html.escape(name)}">{data_text(value)}</script>'
         for name, value in data.items()
@@ -67,7 +74,7 @@ def page(kind: str, title: str, words: str, data: Mapping[str, Any], scripts: tu
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
 <title>{html.escape(title)}</title>
 <link rel="icon" href="data:,">
 <style>{_part("style.css")}</style>

@@ -90,6 +90,17 @@ class Recorder:
         self, time: int, seen: Mapping[Wire, tuple[int, Any]], read: Mapping[int, tuple[int, Any]]
     ) -> None:
         """Keep what a page can show of this tick."""
+        self._times.append(time)
+        self._rows.append(self.row(time, seen, read))
+        if self._cloud is not None and self._cloud.wire in seen:
+            self._clouds[time] = self._cloud.places(seen[self._cloud.wire][1])
+        if len(self._times) >= 2 * self._most:
+            self._thin()
+
+    def row(
+        self, time: int, seen: Mapping[Wire, tuple[int, Any]], read: Mapping[int, tuple[int, Any]]
+    ) -> dict[str, tuple[int, np.ndarray]]:
+        """By wire, the time of its value and the numbers that are shown of it."""
         row: dict[str, tuple[int, Any]] = {f"{w.node}.{w.output}": found for w, found in seen.items()}
         for index, series in self._sources.items():
             at = int(np.searchsorted(series.time, time, side="right")) - 1
@@ -99,12 +110,14 @@ class Recorder:
             found = row.get(f"{feed.node}.{feed.output}") if role == "latest" else read.get(index)
             if found is not None:
                 row[f"{index}.0"] = found
-        self._times.append(time)
-        self._rows.append({key: (at, self._small(key, value)) for key, (at, value) in row.items()})
-        if self._cloud is not None and self._cloud.wire in seen:
-            self._clouds[time] = self._cloud.places(seen[self._cloud.wire][1])
-        if len(self._times) >= 2 * self._most:
-            self._thin()
+        return {key: (at, self._small(key, value)) for key, (at, value) in row.items()}
+
+    def parts(self) -> dict[str, list[dict[str, Any]]]:
+        """By wire, what its numbers are."""
+        return {
+            key: [{"name": p.name, "way": p.way, "size": p.size, "unit": p.type.unit or ""} for p in parts]
+            for key, parts in self._parts.items()
+        }
 
     def _ticks(self) -> int:
         """How many there will be; 0 where that is unknown."""
@@ -129,7 +142,7 @@ class Recorder:
 
     def data(self, begin: int) -> dict[str, Any]:
         """What was kept, with times in seconds after `begin` (ns), as `front/src/model.ts` declares it."""
-        wires = {}
+        wires, shown = {}, self.parts()
         for key, parts in self._parts.items():
             size = sum(p.size for p in parts)
             rows = [row.get(key) for row in self._rows]
@@ -138,9 +151,7 @@ class Recorder:
             wires[key] = {
                 "at": packed([(row[0] - begin) * 1e-9 if row is not None else np.nan for row in rows]),
                 "values": packed([row[1] if row is not None else np.full(size, np.nan) for row in rows]),
-                "parts": [
-                    {"name": p.name, "way": p.way, "size": p.size, "unit": p.type.unit or ""} for p in parts
-                ],
+                "parts": shown[key],
             }
         found: dict[str, Any] = {
             "times": packed([(t - begin) * 1e-9 for t in self._times]), "stride": self.stride, "wires": wires,

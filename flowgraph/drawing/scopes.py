@@ -18,13 +18,16 @@ from flowgraph.data.result import Result
 from flowgraph.data.series import Series
 from flowgraph.drawing.angles import NAMES, between, euler_angles, euler_variances
 from flowgraph.drawing.canvas import SETTLING, deviation
-from flowgraph.drawing.consistency import FAR, bounds, covariance_of, error_of, nees
+from flowgraph.drawing.consistency import bounds, covariance_of, error_of, is_far, nees
 from flowgraph.drawing.fields import STATES, components, find, unit_words
 from flowgraph.drawing.recorder import packed
 from flowgraph.types import leaves_of
 
 POINTS = 6000
 """Of a line, at most: more than a screen has pixels."""
+
+WIDER = 3.0
+"""A start that makes a scale wider than this by factors is left out of it."""
 
 _FIELDS = (*STATES, "rate")
 _DEGREES = {"attitude": ("deg", np.rad2deg(1.0))}
@@ -170,14 +173,14 @@ class Scopes:
         low, high = bounds(max(typical, 1))
         inside = float(np.mean((value[known] >= low) & (value[known] <= high)))
         words = f"mean {mean:.3g} of 1 per number, {100 * inside:.0f} % inside (95 % is right)"
-        if not 1 / FAR < mean < FAR:
+        wrong = is_far(mean, float(degrees[known].sum()))
+        if wrong:
             self.notes.append(
                 note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
             )
         lines = {"value": np.where(known, value, np.nan), "expected": degrees}
         panel = self._panel("Consistency", title, "", time, lines, None, dots=dots)
         top = max(2.5 * high, float(np.quantile(value[known], 0.99)))
-        wrong = not 1 / FAR < mean < FAR
         panel |= {"range": [0.0, top], "whole": None, "words": words, "bounds": [low, high], "wrong": wrong}
         yield panel
 
@@ -254,6 +257,8 @@ def _scale(time: np.ndarray, lines: Sequence[np.ndarray], ends: Sequence[np.ndar
     begun, whole = _range(lines), _range(ends)
     if late is None or own is None or begun is None or whole is None:
         return {"range": [0.0, 1.0], "words": f"none of {len(time)} values is finite"}
+    if begun[1] - begun[0] <= WIDER * (late[1] - late[0]):  # the start hides nothing
+        late, own = (min(late[0], begun[0]), max(late[1], begun[1])), begun
     if late[1] - late[0] > 12 * (own[1] - own[0]) > 0:  # a band so wide that it would hide what it is of
         room = 3 * (own[1] - own[0])
         late = max(late[0], own[0] - room), min(late[1], own[1] + room)

@@ -47,6 +47,8 @@ def clock_words(graph: Graph, wire: Wire) -> str:
     node = graph.nodes[wire.node]
     if isinstance(node, SourceNode):
         timing = node.clock.timing
+        if node.path != node.clock.name:
+            return f"with {node.clock.name}: when it was true"
         return f"≤ {timing.max_rate:g} Hz" if timing.period is None and timing.max_rate else str(timing)
     if isinstance(clock, Condition) and isinstance(node, CallNode) and node.dynamic[wire.output]:
         return f"some of {clock.parent}"

@@ -17,6 +17,7 @@ from time import perf_counter, perf_counter_ns, sleep
 from types import TracebackType
 from typing import Any
 
+from flowgraph.data.arrival import stamp_events
 from flowgraph.data.columns import Columns
 from flowgraph.data.inputs import Inputs, prepare, rule_of
 from flowgraph.data.notes import note
@@ -218,6 +219,7 @@ class Live:
         begun = perf_counter_ns()
         values = {self._names[e.source]: e.value for e in events}
         try:
+            stamp_events(self.graph.sources, stamp, values)
             admitted = self._entrance.admit(stamp, values, self._steps.time, checked=True)
         except (ClockError, DataError) as error:
             for name in values:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.arrival import with_stamps
 from flowgraph.data.inputs import prepare
 from flowgraph.data.series import Flight, Series
 from flowgraph.data.tape import Tape, tape
@@ -81,11 +82,12 @@ def given_events(pipeline: Pipeline, inputs: Any) -> dict[str, Any]:
             got=type(inputs).__name__,
             fix=f"pass {{{', '.join(repr(p.name) + ': ...' for p in pipeline.inputs)}}}",
         )
-    given = inputs.streams if isinstance(inputs, Flight) else inputs
+    given: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs
     names = [p.name for p in pipeline.inputs]
     for name in given if inputs is given else ():
         if name not in names:
             raise UnknownNameError("input", name, names, path=pipeline.name)
+    given = with_stamps(names, given)
     found: dict[str, Any] = {}
     for port in pipeline.inputs:
         if port.name not in given:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.result import Result
+from flowgraph.data.result import COUNTED, Result
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape
 from flowgraph.engines.checkpoint import Keeper, identity, pipeline_digest
@@ -89,11 +89,13 @@ def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engi
         for (name, before), s in zip(start.last.items(), events.series, strict=True)
     }
     state = state_of(pipeline, outcome.cells, last, start.seed)
+    calls = {f.register: f.path for f in pipeline.faults}
     stats = {
-        f"{f.path}.{name}": int(count)
-        for f in pipeline.faults
-        for name, count in state["registers"][f.register].items()
-        if name.startswith("expired")
+        f"{calls.get(r.path, r.path.removesuffix('.state'))}.{name}": int(count)
+        for r in pipeline.registers
+        if r.role in ("join", "state") and isinstance(state["registers"][r.path], Mapping)
+        for name, count in state["registers"][r.path].items()
+        if name.startswith(COUNTED)
     }
     return Result(pipeline.name, engine, series, state, stats, len(events.time), outcome.wall_s)
 

@@ -88,15 +88,21 @@ class LoweredGraph(Subject):
 
 
 class LoadedPipeline(Subject):
-    """A pipeline alone: no graph and no block need be importable."""
+    """A pipeline alone: no graph and no block need be importable.
 
-    def __init__(self, pipeline: Pipeline) -> None:
-        self.pipeline, self.name = pipeline, pipeline.name
+    Args:
+        pipeline: that is played.
+        cells: where its register cells start, in order, in place of their resets.
+    """
+
+    def __init__(self, pipeline: Pipeline, cells: Sequence[Any] | None = None) -> None:
+        self.pipeline, self.name, self._first = pipeline, pipeline.name, cells
         self.types = [type_of_leaves(p.type, p.leaves) for p in pipeline.outputs]
         self._names = [p.name for p in pipeline.inputs]
 
     def _begin(self, options: RunOptions) -> Start:
         cells = cells_at_start(self.pipeline, options.init)  # type: ignore[arg-type]
+        cells = cells if self._first is None else list(self._first)
         return Start(cells, dict.fromkeys(self._names, NEVER), options.seed)
 
     def _resumed(self, state: Mapping[str, Any]) -> Start:

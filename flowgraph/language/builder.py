@@ -59,9 +59,10 @@ class Builder:
                 got=repr(name),
                 fix='give another name, such as name="gate_2"',
             )
-        return self._claim("/".join((*self._scope, name)), given=given)
+        return self.claim("/".join((*self._scope, name)), given=given)
 
-    def _claim(self, base: str, *, given: bool = False) -> str:
+    def claim(self, base: str, *, given: bool = False) -> str:
+        """`base`, whatever the scope, or where it is taken and was not given, with a number behind it."""
         path = base
         if path in self._taken and given:
             raise DeclarationError(
@@ -125,7 +126,7 @@ class Builder:
         """The register that keeps when a clock last ticked; nodes of one clock share it."""
         if firing not in self._stamps:
             node = RegisterNode(
-                self._claim(f"last({firing})"), "stamp", ArrayType((), "int64", "ns"), np.int64(NEVER)
+                self.claim(f"last({firing})"), "stamp", ArrayType((), "int64", "ns"), np.int64(NEVER)
             )
             self._stamps[firing] = self.add(node)
         return self._stamps[firing]

@@ -54,6 +54,13 @@ def _root(clock: Clock) -> Clock:
     return _root(clock.parent) if isinstance(clock, Counted) else clock
 
 
+def _over(root: Clock, clock: Clock) -> Clock:
+    """The same part of another root."""
+    if isinstance(clock, Counted):
+        return Counted(_over(root, clock.parent), clock.period, clock.offsets)
+    return root
+
+
 def _span(clock: Clock) -> int:
     return clock.period * _span(clock.parent) if isinstance(clock, Counted) else 1
 
@@ -65,6 +72,8 @@ def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
         ClockError: where the rates differ, are only nominally equal, or cannot be known.
     """
     root = _root(a)
+    if root != _root(b) and clocks.equal(root, _root(b)):
+        b = _over(root, b)  # one clock by two names
     if root != _root(b):
         sources = [c for c in (root, _root(b)) if isinstance(c, Source)]
         rates = {f"{c.timing.period}" for c in sources if c.timing.period is not None}

@@ -216,6 +216,11 @@ def _(x: Type, *, n: int, kind: Type, out: Type) -> Any:
     return empty_queue(kind, n)
 
 
+def _alone(x, *, kind, out, xp):  # type: ignore[no-untyped-def]
+    """A value as a batch of one."""
+    return unflatten(out, iter([xp.expand_dims(leaf, axis=0) for leaf in flatten(x, kind)]))
+
+
 def batch(n: int, stream: Stream[Any], *, name: str | None = None) -> Stream[Any]:
     """`n` consecutive values as one, along a new first axis; none is in two batches.
 
@@ -226,6 +231,9 @@ def batch(n: int, stream: Stream[Any], *, name: str | None = None) -> Stream[Any
     need_count(name or "batch", "n", n, least=1)
     need_stream(name or "batch", stream)
     out = stacked(stream.type, n)
+    if n == 1:
+        one: Block[Any] = Block(_alone, name="batch", output=lambda _, settings: settings["out"])
+        return typing.cast("Stream[Any]", one(stream, kind=stream.type, out=out, name=name))
     return typing.cast("Stream[Any]", _batch(stream, n=n, kind=stream.type, out=out, name=name))
 
 

@@ -38,6 +38,7 @@ from flowgraph.pipeline.pipeline import (
     type_of_leaves,
 )
 from flowgraph.recorder.ops import OPS, Spec
+from flowgraph.recorder.replay import Body
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, leaves_of
 
@@ -227,7 +228,10 @@ def _read_stage(r: Mapping[str, Any]) -> Stage:
 
 def _read_instruction(r: Mapping[str, Any]) -> Instruction:
     spec = Spec(tuple(r["shape"]), r["dtype"])
-    return Instruction(r["op"], tuple(r["args"]), r.get("attrs", {}), r["value"], spec, r["line"])
+    attrs = r.get("attrs", {})
+    if isinstance(attrs.get("body"), dict):
+        attrs = {**attrs, "body": Body(attrs["body"])}
+    return Instruction(r["op"], tuple(r["args"]), attrs, r["value"], spec, r["line"])
 
 
 _SPELLED = {"nan", "inf", "-inf"}

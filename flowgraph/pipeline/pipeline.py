@@ -23,6 +23,7 @@ from flowgraph.errors import LoweringError, PipelineError, UnknownNameError
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
 from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES, ArrayType, StructType, Type
 from flowgraph.verbs import verb
@@ -328,6 +329,9 @@ def work(i: Instruction, specs: Mapping[int, Spec]) -> int:
     if i.op == "solve":
         n = specs[i.args[0]].shape[-1]
         return size * n + math.ceil(math.prod(specs[i.args[0]].shape) * n / 3)
+    if i.op == "replay":
+        turns = ({t.out: t.spec for t in case.turns} for case in body_of(i.attrs["body"]).cases)
+        return i.spec.shape[0] * max(sum(math.prod(s.shape) for s in turn.values()) for turn in turns)
     if i.op in ("sum", "prod", "max", "min", "mean", "any", "all", "argmax", "argmin"):
         return math.prod(specs[i.args[0]].shape)
     return (

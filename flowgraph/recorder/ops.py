@@ -11,21 +11,14 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 from flowgraph.recorder import ranges
-from flowgraph.types import DTYPES
-
-
-class Spec(NamedTuple):
-    """Shape and dtype of a value in a pipeline."""
-
-    shape: tuple[int, ...]
-    dtype: str
-
-
-class ShapeError(ValueError):
-    """The arguments of an operation do not fit together."""
+from flowgraph.recorder.replay import Body, Turn, body_of, play
+from flowgraph.recorder.specs import ShapeError as ShapeError
+from flowgraph.recorder.specs import Spec as Spec
+from flowgraph.types import DTYPES, dtype_name
 
 
 @dataclass(frozen=True)
@@ -266,6 +259,40 @@ def _same(x: Spec, **_: Any) -> Spec:
     return x
 
 
+def _replay(history: Spec, rows: Spec, first: Spec, count: Spec, *, body: Any) -> Spec:
+    if len(history.shape) != 2 or len(rows.shape) != 2 or history.shape[0] != rows.shape[0]:
+        raise ShapeError(f"replay needs a row for each place, not {history.shape} and {rows.shape}")
+    if (history.dtype, rows.dtype, first, count) != ("real", "real", Spec((), "int32"), Spec((), "int32")):
+        raise ShapeError("replay needs a history and rows of reals, and the first place and a count in int32")
+    _check_body(body_of(body), history.shape[1], rows.shape[1])
+    return history
+
+
+def _check_body(body: Body, before: int, row: int) -> None:
+    """Refuse turns that are no lists of instructions from one vector to the next; once for each body."""
+    if (before, row) in body.checked:
+        return
+    for case in body.cases:
+        specs = {0: Spec((before,), "real"), 1: Spec((row,), "real")}
+        specs |= {n: Spec(a.shape, dtype_name(a)) for n, a in case.constants.items()}
+        for turn in case.turns:
+            op = OPS.get(turn.op)
+            if (
+                op is None
+                or turn.op == "replay"
+                or turn.out in specs
+                or any(a not in specs for a in turn.args)
+            ):
+                raise ShapeError(f"a turn of replay cannot do {turn.op}{list(turn.args)}")
+            found = op.rule(*(specs[a] for a in turn.args), **turn.attrs)
+            if found != turn.spec:
+                raise ShapeError(f"{turn.op} in a turn of replay gives {found}, not {turn.spec}")
+            specs[turn.out] = found
+        if specs.get(case.result) != specs[0]:
+            raise ShapeError(f"a turn of replay gives {specs.get(case.result)}, not {specs[0]}")
+    body.checked.add((before, row))
+
+
 def _int_of(x: Spec, v: Spec, *, side: str = "left") -> Spec:
     if len(x.shape) != 1:
         raise ShapeError(f"searchsorted needs a vector to search in, not {x.shape}")
@@ -309,6 +336,18 @@ def _run_reduce(name: str) -> Callable[..., Any]:
         return getattr(xp, name)(x, axis=tuple(axis) if isinstance(axis, list) else axis, keepdims=keepdims)
 
     return run
+
+
+def _run_replay(xp: Any, *args: Any, body: Any) -> Any:
+    """In a namespace that has a loop of its own, by that; else in NumPy, turn by turn."""
+    if hasattr(xp, "replay"):
+        return xp.replay(*args, body=body)
+
+    def bind(turn: Turn, real: Any) -> Callable[..., Any]:
+        return partial(OPS[turn.op].run, xp, **bound_attrs(turn.op, turn.attrs, real))
+
+    history, rows, first, count = args
+    return play(history, rows, first, count, body, bind)
 
 
 def _table() -> dict[str, Op]:
@@ -369,6 +408,7 @@ def _table() -> dict[str, Op]:
     ops["reshape"] = Op("reshape", _reshape, _run_shape("reshape"))
     ops["broadcast_to"] = Op("broadcast_to", _broadcast_to, _run_shape("broadcast_to"))
     ops["getitem"] = Op("getitem", _getitem, _run_getitem)
+    ops["replay"] = Op("replay", _replay, _run_replay)
     ops["take"] = Op("take", _take, lambda xp, x, i, *, axis: xp.take(x, i, axis=axis, mode="clip"))
     return ops
 

@@ -8,6 +8,7 @@ more, leaves 0, or -1 of a negative number shifted right. docs/semantics.md has 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,16 @@ def cast(xp: Any, x: Any, dtype: Any) -> Any:
     return _whole(xp, x, kind) if x.dtype.kind == "f" and kind.kind in "iu" else x.astype(kind)
 
 
+_limits = lru_cache(np.iinfo)
+
+
 def _whole(xp: Any, x: Any, kind: np.dtype[Any]) -> Any:
-    limits = np.iinfo(kind)
+    limits = _limits(kind)
+    if isinstance(x, np.generic | np.ndarray) and not x.ndim:  # one number, as one meets it most
+        number = float(x)
+        if not limits.min <= number < 2.0 ** (limits.bits - (kind.kind == "i")):
+            number = limits.min if number < 0.0 else limits.max if number > 0.0 else 0
+        return kind.type(int(number))
     least, beyond = x.dtype.type(limits.min), x.dtype.type(2.0 ** (limits.bits - (kind.kind == "i")))
     fits = (x >= least) & (x < beyond)  # False for NaN
     inside = xp.where(fits, x, x.dtype.type(0)).astype(kind)

@@ -17,7 +17,7 @@ def caller() -> str:
     return place(frame.f_globals, frame.f_lineno)
 
 
-_MODULES = """namespaces ops ranges refusals symbolic symbolic_namespace trace
+_MODULES = """loop namespaces ops ranges replay specs refusals symbolic symbolic_namespace trace
 tangents dual dual_rules dual_elements dual_moves dual_products derivatives"""
 
 MACHINERY = tuple(f"{__package__}.{name}" for name in _MODULES.split())

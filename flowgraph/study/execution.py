@@ -15,6 +15,7 @@ from typing import Any
 
 from flowgraph.data.registry import find_graph, load_flight
 from flowgraph.data.series import Flight
+from flowgraph.data.settings import text
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DeclarationError
@@ -22,7 +23,7 @@ from flowgraph.pipeline import digests
 from flowgraph.pipeline.lowering import lower
 from flowgraph.study import keys
 from flowgraph.study.executors import Executor, Finished, InProcess, ProcessPool
-from flowgraph.study.spec import Study, Value, text
+from flowgraph.study.spec import Study, Value
 from flowgraph.study.store import Row, Store, import_pyarrow
 from flowgraph.study.tasks import Done, RunSpec, Task, flight_part, lost, prepared, run_task, said
 

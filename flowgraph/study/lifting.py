@@ -20,7 +20,8 @@ from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Cell, Pipeline, Register
 from flowgraph.types import ArrayType, flatten
 
-_PREFIX = "constants/"
+CONSTANTS = "constants/"
+"""What stands before the number of a constant in the path of its register."""
 
 
 def lifted(graph: Graph) -> Graph:
@@ -33,8 +34,8 @@ def lifted(graph: Graph) -> Graph:
     """
     pipeline = lower(graph)
     registers, nodes = [], []
-    for number, array in _real(pipeline.constants).items():
-        path, unnamed = f"{_PREFIX}{number}", (None,) * array.ndim
+    for number, array in real_constants(pipeline.constants).items():
+        path, unnamed = f"{CONSTANTS}{number}", (None,) * array.ndim
         cell = Cell("value", number, number, array.shape, "real", array, axes=unnamed)
         registers.append(Register(path, "delay", (cell,)))
         nodes.append(RegisterNode(path, "delay", ArrayType(array.shape, "real"), array))
@@ -51,7 +52,7 @@ def start_of(graph: Graph) -> dict[str, Any]:
         for index, node in graph.registers
         if node.role != "stamp" and index not in joins
     }
-    found.update({f"{_PREFIX}{n}": a for n, a in _real(lower(graph).constants).items()})
+    found.update({f"{CONSTANTS}{n}": a for n, a in real_constants(lower(graph).constants).items()})
     return found
 
 
@@ -99,5 +100,6 @@ def _skeleton(graph: Graph) -> list[Any]:
     return found
 
 
-def _real(constants: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+def real_constants(constants: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Those constants of a pipeline that are lifted."""
     return {n: a for n, a in constants.items() if a.dtype.kind == "f"}

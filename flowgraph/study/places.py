@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import inspect
 import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from flowgraph.data.joint import parts_of
+from flowgraph.data.own import is_in_file, kind_and_place
 from flowgraph.data.registry import find_entry, flight_names
 from flowgraph.errors import DeclarationError
 
-__all__ = ["absolute", "beside"]
+__all__ = ["absolute", "beside", "placed_graphs"]
 
 
 def absolute(spec: str, folder: Path) -> str:
@@ -23,8 +25,26 @@ def absolute(spec: str, folder: Path) -> str:
     return "+".join(_absolute(part, folder) for part in parts_of(spec, flight_names()))
 
 
+def placed_graphs(graphs: Iterable[Any], parameters: Any, folder: Path) -> tuple[list[Any], Any]:
+    """Graphs of a study in that folder, each FILE.py:NAME with the absolute path of its file; and the
+    parameters, of which those of one graph stand under its name."""
+    names = list(graphs)
+    placed = {name: _absolute_name(name, folder) for name in names if isinstance(name, str)}
+    if isinstance(parameters, Mapping):
+        parameters = {placed.get(n, n): values for n, values in parameters.items()}
+    return [placed[n] if isinstance(n, str) else n for n in names], parameters
+
+
+def _absolute_name(name: str, folder: Path) -> str:
+    return _path(folder, os.path.expanduser(name)) if is_in_file(name) else name
+
+
 def _absolute(spec: str, folder: Path) -> str:
     kind, colon, rest = spec.partition(":")
+    if is_in_file(kind_and_place(spec)[0]):
+        own, place = kind_and_place(spec)
+        further = _path(folder, place) if _is_in(folder, place) else place
+        return _absolute_name(own, folder) + (f":{further}" if place else "")
     if not rest or not _has_place(kind):
         return spec
     whole, more = rest, ""

@@ -20,9 +20,9 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.registry import flight_settings
+from flowgraph.data.settings import text
 from flowgraph.drawing import canvas
 from flowgraph.errors import UnknownNameError, plain
-from flowgraph.study.spec import text
 from flowgraph.study.statistics import compared, differing, finite_values, grouped, metrics_of, quantiles
 from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
 
@@ -123,7 +123,7 @@ def write_comparison(
     metrics = [m for m in metrics_of(theirs, names) if m in metrics_of(ours, names)]
     if metric is not None and metric not in metrics:
         raise UnknownNameError("metric", metric, metrics, path=f"{a}, {b}")
-    flown = {n for spec in {r["data"] for r in (*ours, *theirs)} for n in flight_settings(spec)}
+    flown = {n for spec in {r["data"] for r in (*ours, *theirs)} for n in flight_settings(spec, run=False)}
     for name in across:
         if name not in names or name not in flown:
             raise UnknownNameError(
@@ -296,7 +296,10 @@ def _worst(rows: Sequence[Mapping[str, Any]], names: list[str], metric: str, sto
             file = store.trajectory_file(row["key"]).relative_to(store.folder)
             line["trajectory"] = _Raw(f'<a href="{_safe(file.as_posix())}">{_safe(row["key"][:8])}.npz</a>')
         lines.append(line)
-    return _table(_shown(lines)) if lines else "<p>None.</p>"
+    if not lines:
+        return "<p>None.</p>"
+    words = "With <code>--html worst.html --beside</code> after each of them, they are compared on one page."
+    return f"<p>{words}</p>{_table(_shown(lines))}"
 
 
 def _setting(row: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:

@@ -12,12 +12,10 @@ import functools
 import itertools
 import json
 import math
-import re
 import sys
-import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import InitVar, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +23,14 @@ import numpy as np
 
 from flowgraph.data.files import text_of
 from flowgraph.data.joint import parts_of
-from flowgraph.data.registry import find_graph, flight_names, flight_settings, parsed_settings
+from flowgraph.data.own import is_in_file, kind_and_place
+from flowgraph.data.registry import find_graph, flight_names, flight_settings
+from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.options import DTYPES
 from flowgraph.engines.registry import engine_names, find_engine
 from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError
-from flowgraph.study.places import absolute, beside
+from flowgraph.study.places import absolute, beside, placed_graphs
+from flowgraph.study.toml_text import toml_of
 
 Value = bool | int | float | str
 Point = Mapping[str, Value]
@@ -43,11 +44,6 @@ MOST_RUNS = 10**7
 MOST_BYTES = 2**26
 """Of a study's file."""
 
-MOST_DOTS = 64
-"""In a key: Python's reader of TOML takes time with the square of their number."""
-
-_WORD = r"(?:[A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')"
-_DOTTED = re.compile(rf"{_WORD}(?:[ \t]*\.[ \t]*{_WORD})*")
 SCALES = ("linear", "log")
 
 
@@ -56,7 +52,7 @@ class Study:
     """Graphs x data x seeds x parameters, and how to run them.
 
     Args:
-        graphs: names, as `flowgraph list` gives them.
+        graphs: names, as `flowgraph list` gives them, or FILE.py:NAME; kept with absolute paths.
         data: flights, such as "sim" or "euroc:PATH"; kept with absolute paths.
         seeds: how many (0, 1, ...), or which.
         parameters: settings of graphs or flights by name: one value, a list, `{"linspace": [first, last,
@@ -70,6 +66,8 @@ class Study:
         chunk: how many runs go together where the engine can; also the unit of resuming.
         keep: whether to keep whole trajectories.
         out: the folder for results.
+        checked: whether each graph is asked for its settings. What only reads results does not ask, for that
+            runs the files that graphs and flights are in.
 
     Raises:
         DeclarationError, UnknownNameError: naming the key.
@@ -87,10 +85,13 @@ class Study:
     chunk: int = CHUNK
     keep: bool = False
     out: str | None = None
+    checked: InitVar[bool] = True
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, checked: bool) -> None:
         put: Callable[[str, Any], None] = functools.partial(object.__setattr__, self)
-        put("graphs", _names("graphs", self.graphs))
+        graphs, parameters = placed_graphs(_names("graphs", self.graphs), self.parameters, Path.cwd())
+        put("graphs", tuple(graphs))
+        put("parameters", parameters)
         put("data", tuple(absolute(spec, Path.cwd()) for spec in _names("data", self.data)))
         put("seeds", _seeds(self.seeds))
         put("metrics", None if self.metrics is None else _names("metrics", self.metrics))
@@ -111,12 +112,16 @@ class Study:
         put("sample", None)
         grid = _grid(self.parameters, self.graphs)
         put("parameters", grid)
-        self._check_runs()
+        self._check_names()
+        if checked:
+            self._check_runs()
 
-    def _check_runs(self) -> None:
+    def _check_names(self) -> None:
         for spec in self.data:
             for part in parts_of(spec, flight_names()):
-                _one_of("data", part.partition(":")[0], flight_names(), kind="kind of flight")
+                kind, _ = kind_and_place(part)
+                if not is_in_file(kind):
+                    _one_of("data", kind, flight_names(), kind="kind of flight")
         swept = {
             name for name, _ in self.parameters.items() if not isinstance(self.parameters[name], Mapping)
         }
@@ -124,6 +129,8 @@ class Study:
             for name in point:
                 if name in swept:
                     raise _wrong(f"points[{k}].{name}", "a parameter of one kind", "a grid has it too")
+
+    def _check_runs(self) -> None:
         for graph in self.graphs:
             prepare = find_graph(graph).prepare
             if prepare is None:
@@ -175,8 +182,12 @@ class Study:
         return {n: v for n, v in found.items() if v is not None}
 
     @classmethod
-    def load(cls, file: str | Path) -> Study:
+    def load(cls, file: str | Path, *, checked: bool = True) -> Study:
         """Read a study from a `.toml` file, or from the `.json` of a resolved one. Its paths start there.
+
+        Args:
+            file: to read.
+            checked: as of `Study`.
 
         Raises:
             DataError: where it cannot be read; DeclarationError, UnknownNameError: naming the key.
@@ -184,7 +195,7 @@ class Study:
         path = Path(file)
         try:
             content = text_of(path, most=MOST_BYTES)
-            found = json.loads(content) if path.suffix == ".json" else _toml(content)
+            found = json.loads(content) if path.suffix == ".json" else toml_of(content)
         except (OSError, ValueError, RecursionError) as error:
             raise DataError(
                 "no study can be read here",
@@ -198,16 +209,19 @@ class Study:
         folder = path.resolve().parent
         if isinstance(found.get("data"), list):
             found["data"] = [beside(spec, folder) for spec in found["data"]]
+        if isinstance(found.get("graphs"), list):
+            parameters = found.get("parameters", {})
+            found["graphs"], found["parameters"] = placed_graphs(found["graphs"], parameters, folder)
         if isinstance(found.get("out"), str):
             found["out"] = str(folder / found["out"])
         try:
-            return cls.from_mapping(found)
+            return cls.from_mapping(found, checked=checked)
         except FlowgraphError as error:
             error.path = f"{path}, {error.path}" if error.path else str(path)
             raise
 
     @classmethod
-    def from_mapping(cls, given: Mapping[str, Any]) -> Study:
+    def from_mapping(cls, given: Mapping[str, Any], *, checked: bool = True) -> Study:
         """A study from the keys of its file."""
         valid = [f.name for f in fields(cls)]
         for name in given:
@@ -216,26 +230,7 @@ class Study:
         for name in ("graphs", "data"):
             if name not in given:
                 raise _wrong(name, "a list of names", "nothing")
-        return cls(**given)
-
-
-def _toml(content: str) -> Any:
-    """TOML, but for keys of so many parts that only a reader's time is meant.
-
-    Raises:
-        ValueError: where it is none; RecursionError: where it is nested too deeply.
-    """
-    for match in _DOTTED.finditer(content):
-        if match[0].count(".") > MOST_DOTS:
-            raise ValueError(f"a key of {match[0].count('.') + 1} parts: {match[0][:40]}...")
-    return tomllib.loads(content)
-
-
-def text(value: Value) -> str:
-    """A value as `--set` writes it; a float to its last bit."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value) if isinstance(value, float) else str(value)
+        return cls(**given, checked=checked)
 
 
 _EXAMPLES = {

@@ -224,7 +224,7 @@ def read_study(folder: str | Path) -> Study:
     Raises:
         DataError: where there is none.
     """
-    return Study.load(Path(folder) / RESOLVED)
+    return Study.load(Path(folder) / RESOLVED, checked=False)
 
 
 def as_table(rows: Sequence[Row], first: Iterable[str] = ()) -> Any:

@@ -19,9 +19,10 @@ import numpy as np
 
 from flowgraph.data.batch import Batch
 from flowgraph.data.notes import note
-from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight, parsed_settings
+from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
+from flowgraph.data.settings import of_any_stream, parsed_settings, text
 from flowgraph.engines.many import run_many
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.parts import run_graph
@@ -31,7 +32,7 @@ from flowgraph.language.graph import Graph
 from flowgraph.language.recording import remembering
 from flowgraph.pipeline.digests import structure
 from flowgraph.study.lifting import Lowered, lifted, start_of
-from flowgraph.study.spec import Value, text
+from flowgraph.study.spec import Value
 from flowgraph.study.store import pack_trajectory
 from flowgraph.types import unflatten
 
@@ -89,7 +90,7 @@ class _Lane:
 
 
 def prepared(
-    graph: str, data: str, seed: int, parameters: Mapping[str, Value], flight: Flight | None = None
+    graph: str, data: str, seed: int, parameters: Mapping[str, Any], flight: Flight | None = None
 ) -> tuple[Case, Flight]:
     """A graph made ready for a flight with these settings, as `flowgraph run --set` does.
 
@@ -108,10 +109,16 @@ def prepared(
     return function.case(flight, **mine), flight
 
 
-def flight_part(data: str, parameters: Mapping[str, Value]) -> dict[str, Value]:
+def loaded(data: str, seed: int, parameters: Mapping[str, Any]) -> Flight:
+    """A flight with those of these settings that are its own."""
+    own = {n: text(v) for n, v in flight_part(data, parameters).items()}
+    return load_flight(data, seed=seed, settings=own)
+
+
+def flight_part(data: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Those parameters that are settings of the flight."""
     names = flight_settings(data)
-    return {n: v for n, v in parameters.items() if n in names}
+    return {n: v for n, v in parameters.items() if n in names or of_any_stream(n, names)}
 
 
 _flights: OrderedDict[Any, Flight] = OrderedDict()

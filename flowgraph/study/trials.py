@@ -14,6 +14,7 @@ so that a recording counts by how much better it gets and not by how hard it is.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -25,17 +26,23 @@ import numpy as np
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight
+from flowgraph.data.settings import text
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.parts import run_graph
 from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError
 from flowgraph.language.recording import remembering
 from flowgraph.pipeline.digests import digest
+from flowgraph.study.coordinates import Parameter
+from flowgraph.study.slopes import Slopes
 from flowgraph.study.spec import Value
-from flowgraph.study.tasks import grouped, prepared, simulate_together
+from flowgraph.study.tasks import flight_part, grouped, loaded, prepared, simulate_together
 
 ASTRAY = 1e6
 """What a recording counts on which the filter fails: more than any that works."""
+
+
+_MOVED_KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,8 @@ class Trials:
         self.graph, self.recordings, self.settings = graph, recordings, settings
         self.measure, self.metric, self.engine = measure, metric, engine
         self._flights: list[Flight] = []
+        self._moved: OrderedDict[Any, Flight] = OrderedDict()
+        self._slopes = Slopes(engine)
         self._worked = False
         self._steps: OrderedDict[Any, Any] = OrderedDict()
         for one in recordings:
@@ -93,9 +102,36 @@ class Trials:
             seen[what] = one
         return None
 
-    def _case(self, place: int, point: Mapping[str, float]) -> Case:
+    @property
+    def flights(self) -> list[Flight]:
+        """Those of the recordings."""
+        return list(self._flights)
+
+    def at(self, fixed: Mapping[str, Parameter]) -> Trials:
+        """The same with some settings of the flights fixed at these values."""
+        other = copy.copy(self)
+        other.settings = {**self.settings, **{n: text(v) for n, v in fixed.items()}}
+        other._flights = [self._flight(k, fixed) for k in range(len(self.recordings))]
+        other._moved = OrderedDict()
+        return other
+
+    def _flight(self, place: int, point: Mapping[str, Parameter]) -> Flight:
+        """The flight of a recording, with those of its own settings that a point names."""
         one = self.recordings[place]
-        flight = self._flights[place]
+        own = flight_part(one.data, point)
+        if not own:
+            return self._flights[place]
+        which = (place, tuple(text(v) for v in own.values()))
+        if which not in self._moved:
+            self._moved[which] = loaded(one.data, one.seed, {**self.settings, **own})
+            while len(self._moved) > _MOVED_KEPT:
+                self._moved.popitem(last=False)
+        self._moved.move_to_end(which)
+        return self._moved[which]
+
+    def _case(self, place: int, point: Mapping[str, Parameter]) -> Case:
+        one = self.recordings[place]
+        flight = self._flight(place, point)
         with remembering(self._steps):  # only the blocks whose settings move are recorded anew
             return prepared(self.graph, one.data, one.seed, {**self.settings, **point}, flight)[0]
 
@@ -132,7 +168,43 @@ class Trials:
         single = options.but(runs_at_once=1)
         return [self._together([c], [s], program, single)[0] for c, s in zip(cases, seeds, strict=True)]
 
-    def measured(self, points: Sequence[Mapping[str, float]], places: Sequence[int]) -> np.ndarray:
+    @property
+    def slopes(self) -> bool:
+        """Whether a slope may come with the measure."""
+        return self.measure == "likelihood" and self._slopes.possible
+
+    def sloped(
+        self, place: int, point: Mapping[str, Parameter],
+        ends: Sequence[tuple[Mapping[str, Parameter], Mapping[str, Parameter]]], widths: Sequence[float],
+    ) -> tuple[float, float, np.ndarray]:  # fmt: skip
+        """The measure of one recording, of how many values it is, and its slope (p,); NaN where it has none.
+
+        Args:
+            place: of the recording.
+            point: at which.
+            ends: beyond it and before it, for each parameter; widths: how far these are apart.
+        """
+        case = self._case(place, point)
+        around = [(self._case(place, a), self._case(place, b)) for a, b in ends]
+        try:
+            value, count, slope = self._slopes.of(case, around, widths, self.recordings[place].seed)
+        except DataError:
+            raise
+        except Exception:
+            if not self._worked:
+                raise
+            return ASTRAY, 0.0, np.zeros(len(ends))
+        if np.isnan(slope).all():
+            return math.nan, 0.0, slope
+        if not count:
+            whole = run_graph(case.graph, case.inputs, RunOptions(engine=self.engine))
+            surprise(whole)  # says what it lacks
+        self._worked = True
+        if not math.isfinite(value) or not value < ASTRAY:
+            return ASTRAY, count, np.zeros(len(ends))
+        return value, count, slope
+
+    def measured(self, points: Sequence[Mapping[str, Parameter]], places: Sequence[int]) -> np.ndarray:
         """The measure (points, recordings) on the recordings at some places."""
         pairs = [(p, k) for p in points for k in places]
         cases = [self._case(k, p) for p, k in pairs]
@@ -140,6 +212,11 @@ class Trials:
         self._need_one(results)
         found = [self._value(c, r) for c, r in zip(cases, results, strict=True)]
         return np.array(found).reshape(len(points), len(places))
+
+    def values_at(self, place: int, point: Mapping[str, Parameter]) -> float:
+        """How many values were measured of one recording."""
+        (result,) = self._results([self._case(place, point)], [place])
+        return 0.0 if isinstance(result, Exception) else measured_values(result)
 
     def _need_one(self, results: Sequence[Result | Exception]) -> None:
         """Until something has worked, what every run raises is no matter of the parameters: raise it."""
@@ -174,7 +251,7 @@ class Trials:
         return float(score[self.metric])
 
     def judged(
-        self, places: Sequence[int], start: Mapping[str, float], point: Mapping[str, float], *,
+        self, places: Sequence[int], start: Mapping[str, Parameter], point: Mapping[str, Parameter], *,
         held_out: bool, fold: int | None = None,
     ) -> list[Judged]:  # fmt: skip
         """Recordings at the start, with what was found, and with the graph's own settings."""
@@ -191,6 +268,12 @@ class Trials:
             metrics = {n: (float(a), float(b), float(c)) for n, (a, b, c) in all_of.items()}
             found.append(Judged(self.recordings[k], held_out, before, after, own, metrics, fold))
         return found
+
+
+def measured_values(result: Result) -> float:
+    """How many numbers the innovations of a run are of."""
+    held = [s.leaves for s in result.series.values() if {"residual", "covariance"} <= set(s.leaves)]
+    return float(sum(n["parts"].sum() if "parts" in n else n["residual"].size for n in held))
 
 
 def surprise(result: Result) -> float:

@@ -1,9 +1,13 @@
 """Tuning: noise parameters of one graph, fitted to several recordings, and judged by others.
 
-What is sought is the logarithm of each parameter, between bounds; what is made small stands in
-`flowgraph/study/trials.py`. Recordings that are held out take no part in the search. With folds each
-recording is held out once, of a search over others. Each is judged at the start of the search, with what was
-found, and with the graph's own settings.
+What is sought is the logarithm of each parameter, between bounds (`coordinates`); what is made small stands
+in `trials`. The slope of a likelihood comes with it where it has one (`slopes`), else it is of differences. A
+parameter found by likelihood has a standard deviation: the root of the inverse of the observed information,
+the second derivative of the likelihood of all that was measured.
+
+Recordings that are held out take no part in the search. With folds each recording is held out once, of a
+search over others. Each is judged at the start of the search, with what was found, and with the graph's own
+settings.
 """
 
 from __future__ import annotations
@@ -12,14 +16,16 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from flowgraph.data.registry import find_graph, parsed_settings
+from flowgraph.data.registry import find_graph, flight_settings
+from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
-from flowgraph.study.spec import Value, text
+from flowgraph.study.coordinates import Coordinates, Fit, Parameter
+from flowgraph.study.search import Found, Search
+from flowgraph.study.spec import Value
 from flowgraph.study.tasks import flight_part
 from flowgraph.study.trials import ASTRAY, Judged, Recording, Trials, surprise
 
@@ -27,36 +33,10 @@ __all__ = ["MEASURES", "METHODS", "Fit", "Found", "Judged", "Recording", "Tuned"
 
 MEASURES = ("likelihood", "error")
 METHODS = ("L-BFGS-B", "Nelder-Mead", "Powell")
-_STEP = 1e-3
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A parameter to find: a setting of the graph between `low` and `high`, positive; from `start`."""
-
-    name: str
-    low: float
-    high: float
-    start: float | None = None
-
-
-@dataclass(frozen=True)
-class Found:
-    """Where a search ended.
-
-    Args:
-        parameters: the values found.
-        evaluations: how many points were tried, on all its recordings each.
-        converged: whether the search ended by itself; `message` says how.
-        at_bound: parameters that ended at a bound, so that the least lies beyond it, each with "low" or
-            "high".
-    """
-
-    parameters: dict[str, float]
-    evaluations: int
-    converged: bool
-    message: str
-    at_bound: dict[str, str]
+SLOPES = ("forward", "differences")
+TRIPLES = ("lever", "mount")
+PLACED = ("time_offset", *TRIPLES)
+"""Settings of a flight's streams that are parameters: when a sensor was read, where it sits and how."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +54,7 @@ class Tuned(Found):
     """
 
     graph: str
-    start: dict[str, float]
+    start: dict[str, Parameter]
     measure: str
     metric: str | None
     judged: tuple[Judged, ...]
@@ -104,9 +84,10 @@ def tune(
     metric: str | None = None,
     settings: Mapping[str, Value] | None = None,
     method: str | None = None,
+    slopes: str | None = None,
     engine: str = "reference",
     most: int = 200,
-    watch: Callable[[int, Mapping[str, float], float], None] | None = None,
+    watch: Callable[[int, Mapping[str, Parameter], float], None] | None = None,
 ) -> Tuned:
     """Find the parameters of a graph that suit the recordings best.
 
@@ -121,8 +102,10 @@ def tune(
         measure: "likelihood" of the innovations or "error" against the truth.
         metric: the error to make small; the first that the graph's score has if left out.
         settings: other settings of graph and flights, as `--set`.
-        method: "L-BFGS-B" (by central differences; the default for likelihood), "Nelder-Mead" (the default
-            for an error, which may be rough) or "Powell".
+        method: "L-BFGS-B" (by slopes; the default for likelihood), "Nelder-Mead" (the default for an error,
+            which may be rough) or "Powell".
+        slopes: "forward" derivatives of the likelihood, where it has any, or "differences"; forward in an
+            engine that plays pipelines if left out.
         engine: in "xla" and "c" all recordings of the same ticks and all points of a gradient go together.
         most: points to try at most, about, in each search.
         watch: told the number of points tried, the best so far and its measure.
@@ -134,6 +117,7 @@ def tune(
     method = method or ("L-BFGS-B" if measure == "likelihood" else "Nelder-Mead")
     for kind, given, valid in (
         ("measure", measure, MEASURES), ("method", method, METHODS), ("engine", engine, engine_names()),
+        ("slopes", slopes or SLOPES[0], SLOPES),
     ):  # fmt: skip
         if given not in valid:
             raise UnknownNameError(kind, given, valid, path="tune")
@@ -142,11 +126,12 @@ def tune(
     problem = Trials(graph, [*recordings, *held_out], settings, measure, metric, engine)
     if same := problem.twice():
         raise _wrong("data", "recordings that differ, each once, fitted to or held out", same)
-    start = {f.name: _start(graph, f) for f in fits}
+    start = {f.name: start_of_fit(graph, f) for f in fits}
     whole = range(len(recordings))
 
     def search(places: Sequence[int]) -> Found:
-        return _search(problem, fits, start, places, method, most, watch)
+        searched = Search(problem, Coordinates(fits, start), places, forward=slopes != "differences")
+        return searched.run(method, most, watch)
 
     parts: list[Found] = []
     judged: list[Judged] = []
@@ -162,16 +147,16 @@ def tune(
     judged.sort(key=lambda j: problem.recordings.index(j.recording))
     return Tuned(
         found.parameters, found.evaluations, found.converged, found.message, found.at_bound,
-        graph, start, measure, problem.metric, tuple(judged), tuple(parts),
+        found.deviations, graph, start, measure, problem.metric, tuple(judged), tuple(parts),
         _without_effect(problem, fits, found.parameters, whole),
     )  # fmt: skip
 
 
 def _without_effect(
-    problem: Trials, fits: Sequence[Fit], found: Mapping[str, float], places: Sequence[int]
+    problem: Trials, fits: Sequence[Fit], found: Mapping[str, Parameter], places: Sequence[int]
 ) -> tuple[str, ...]:
     """The parameters that move no measure to the last bit, from what was found to the farther bound."""
-    far = [{f.name: f.high if found[f.name] ** 2 < f.low * f.high else f.low} for f in fits]
+    far = [{f.name: _far(f, found[f.name])} for f in fits]
     base, *moved = problem.measured([dict(found), *({**found, **one} for one in far)], places)
     works = base < ASTRAY
     return tuple(
@@ -179,75 +164,39 @@ def _without_effect(
     )
 
 
-def _start(graph: str, fit: Fit) -> float:
+def placed(name: str) -> bool:
+    """Whether a parameter says when a sensor was read, or where it sits: it may have either sign."""
+    return "." in name and name.rpartition(".")[2] in PLACED
+
+
+def _far(fit: Fit, found: Parameter) -> Parameter:
+    """The farther bound of a number; of an array, all of it so much larger or smaller."""
+    if fit.scale == "linear":
+        middle = 0.5 * (fit.low + fit.high)
+        return (
+            np.where(np.asarray(found) < middle, fit.high, fit.low)
+            if np.ndim(found)
+            else (fit.high if found < middle else fit.low)
+        )
+    if np.ndim(found) == 0:
+        return fit.high if float(found) ** 2 < fit.low * fit.high else fit.low
+    return np.asarray(found) * 10.0
+
+
+def start_of_fit(graph: str, fit: Fit) -> Parameter:
     """Where to begin: as told, or at the graph's own value, or in the middle of the bounds."""
     prepare = find_graph(graph).prepare
     if fit.start is not None:
-        return float(fit.start)
+        return np.asarray(fit.start, dtype=float) if np.ndim(fit.start) else float(fit.start)
     known = None if prepare is None else inspect.signature(prepare).parameters.get(fit.name)
     own = None if known is None else known.default
+    if isinstance(own, np.ndarray):
+        return own
     if isinstance(own, float | int) and not isinstance(own, bool) and fit.low <= own <= fit.high:
         return float(own)
-    return math.sqrt(fit.low * fit.high)
-
-
-def _search(
-    problem: Trials,
-    fits: Sequence[Fit],
-    begin: Mapping[str, float],
-    places: Sequence[int],
-    method: str,
-    most: int,
-    watch: Callable[[int, Mapping[str, float], float], None] | None,
-) -> Found:
-    """Make the mean measure over some recordings small, in the logarithms of the parameters."""
-    low, high = (np.log([getattr(f, n) for f in fits]) for n in ("low", "high"))
-    start = np.clip(np.log([begin[f.name] for f in fits]), low, high)
-    count, best = 0, (math.inf, start)
-
-    def named(x: np.ndarray) -> dict[str, float]:
-        return {f.name: float(v) for f, v in zip(fits, np.exp(x), strict=True)}
-
-    def values(points: np.ndarray) -> np.ndarray:
-        nonlocal count, best
-        found = problem.measured([named(x) for x in points], places).mean(axis=1)
-        count += len(points)
-        if found.min() < best[0]:
-            best = float(found.min()), points[int(found.argmin())]
-        if watch is not None:
-            watch(count, named(best[1]), best[0])
-        return np.asarray(found)
-
-    def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The measure and its slope, by central differences that stay within the bounds."""
-        ends = [np.clip(x + s * _STEP * e, low, high) for e in np.eye(len(x)) for s in (1.0, -1.0)]
-        found = values(np.array([x, *ends]))
-        steps = np.array([(a - b).sum() for a, b in zip(ends[::2], ends[1::2], strict=True)])
-        return float(found[0]), (found[1::2] - found[2::2]) / steps
-
-    from scipy import optimize  # half a second that only a search needs
-
-    minimize: Callable[..., Any] = optimize.minimize
-    limits: dict[str, Any]
-    how: dict[str, Any] = {"method": method, "bounds": list(zip(low, high, strict=True))}
-    if method == "L-BFGS-B":
-        limits = {"maxfun": max(1, most // (2 * len(fits) + 1)), "ftol": 1e-8}
-        ended = minimize(with_slope, start, jac=True, options=limits, **how)
-    else:
-        names = {"Nelder-Mead": ("xatol", "fatol"), "Powell": ("xtol", "ftol")}[method]
-        limits = {"maxfev": most, names[0]: 1e-3, names[1]: 1e-6}
-        if method == "Nelder-Mead":  # scipy's own first steps are a part of x, which is next to none at x = 0
-            limits["initial_simplex"] = np.vstack([start, start + np.diag(_first_steps(start, low, high))])
-        ended = minimize(lambda x: float(values(x[None])[0]), start, options=limits, **how)
-    ends = zip(fits, best[1], low, high, strict=True)
-    at_bound = {f.name: "low" if x - a < b - x else "high" for f, x, a, b in ends if min(x - a, b - x) < 2e-3}
-    return Found(named(best[1]), count, bool(ended.success), str(ended.message), at_bound)
-
-
-def _first_steps(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """A quarter of the way between the bounds, at most a factor e, towards the farther one."""
-    sign = np.where(high - start >= start - low, 1.0, -1.0)
-    return np.asarray(sign * np.minimum(1.0, 0.25 * (high - low)))
+    if fit.name.rpartition(".")[2] in TRIPLES:
+        return np.full(3, 0.5 * (fit.low + fit.high))
+    return 0.5 * (fit.low + fit.high) if fit.scale == "linear" else math.sqrt(fit.low * fit.high)
 
 
 def _wrong(place: str, expected: str, got: object) -> DeclarationError:
@@ -264,30 +213,57 @@ def _check(
     graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
     settings: Mapping[str, Value], most: int, folds: int | None,
 ) -> None:  # fmt: skip
-    if not fits:
-        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
-    if not recordings:
-        raise _wrong("data", "one recording or more", "none")
+    check_fits(graph, fits, recordings, held_out, settings)
     if type(most) is not int or most < 1:
         raise _wrong("most", "a whole number from 1", most)
     if folds is not None and (type(folds) is not int or not 2 <= folds <= len(recordings)):
         raise _wrong("folds", f"a whole number from 2 to that of the recordings, {len(recordings)}", folds)
     if folds is not None and held_out:
         raise _wrong("folds", "either folds or recordings that are held out", f"{len(held_out)} held out")
+
+
+def check_fits(
+    graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
+    settings: Mapping[str, Value],
+) -> None:  # fmt: skip
+    """Refuse what cannot be sought: bounds that are none, what is no parameter of a filter or of its sensors.
+
+    Raises:
+        DeclarationError, UnknownNameError: naming the parameter.
+    """
+    if not fits:
+        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
+    if not recordings:
+        raise _wrong("data", "one recording or more", "none")
     prepare = find_graph(graph).prepare
     for fit in fits:
-        numbers = [fit.low, fit.low if fit.start is None else fit.start, fit.high]
+        numbers = [fit.low, fit.low if fit.start is None or np.ndim(fit.start) else fit.start, fit.high]
+        least = -math.inf if fit.scale == "linear" else 0.0
         if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers) or not (
-            0 < fit.low < fit.high and fit.low <= numbers[1] <= fit.high
+            least < fit.low < fit.high and fit.low <= numbers[1] <= fit.high  # type: ignore[operator]
         ):
-            raise _wrong(f"fit {fit.name}", "0 < low <= start <= high, low < high", fit)
+            expected = "0 < low" if fit.scale == "log" else "low"
+            raise _wrong(f"fit {fit.name}", f"{expected} <= start <= high, low < high", fit)
+        matrix = start_of_fit(graph, fit)
+        if np.ndim(matrix) == 2 and not _is_covariance(matrix):
+            raise _wrong(f"fit {fit.name}", "a start that is a covariance", matrix)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
             raise _wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
         if fit.name in getattr(prepare, "scoring", ()):
             raise _wrong(
                 f"fit {fit.name}", "a setting of the filter; this one changes how a run is scored", fit.name
             )
+        if placed(fit.name):
+            for r in (*recordings, *held_out):
+                if not flight_part(r.data, {fit.name: fit.low}):
+                    raise UnknownNameError("setting", fit.name, flight_settings(r.data), path=r.data)
+            continue
         if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
             raise _wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
         if prepare is not None:
-            parsed_settings(prepare, {fit.name: text(float(fit.low))}, also=(), path=graph)
+            parsed_settings(prepare, {fit.name: text(start_of_fit(graph, fit))}, also=(), path=graph)
+
+
+def _is_covariance(value: Parameter) -> bool:
+    S = np.asarray(value)
+    return S.shape[0] == S.shape[1] and bool((S == S.T).all()) and bool((np.linalg.eigvalsh(S) > 0).all())

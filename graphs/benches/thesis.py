@@ -8,7 +8,8 @@ unit in a world without gravity. Its gyroscope measures the rotation since its l
 The thesis prints as RMSE what its code computes without a root: the mean of |p - p_true|^2, and the mean of
 the square of |R - R_true|_F^2. These, the "thesis metric", stand beside its figures; the errors in metres and
 degrees are root mean squares. The bound is the posterior Cramér-Rao bound along the truth, of the same
-flights, noise and ticks, for a start that is known exactly: no filter on these readings is better.
+flights, noise and ticks, for a start that is known exactly: no filter on these readings is better. A filter's
+run can be smoothed too (`eskf_smoothed`); the bound beside it is then that of smoothers.
 
 Source: R. Fiszel, thesis (2017), the tables of its results; for the bound see `blocks/metrics/bound.py`.
 """
@@ -17,27 +18,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Flight, Graph, Report, Series, clocks_of, simulate_many
 from flowgraph.blocks.flights.worlds import load_world
+from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.kalman.smoothing import smoother_gain, smoothing_pass
 from flowgraph.blocks.metrics.errors import nees, state_error
+from flowgraph.blocks.models.inertial_pose import INERTIAL_BIASED, stacked
 from flowgraph.blocks.models.pose import start_pose
 from flowgraph.blocks.models.pose_bound import pose_bound
-from flowgraph.blocks.models.unscented_pose import start_state
+from flowgraph.blocks.models.unscented_pose import STATE, start_state
 from flowgraph.blocks.particles.cloud import start_cloud
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.tuning import WEIGHTLESS, reading_of, with_imu
-from flowgraph.blocks.signals import Attitude, PoseEstimate
+from flowgraph.blocks.signals import Attitude, Gaussian, PoseEstimate
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
+from flowgraph.graphs.benches.thesis_picture import draw
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
@@ -97,7 +101,7 @@ class Noise:
 class Trial:
     """A filter on one flight: what it is fed, and the register that holds its start."""
 
-    graph: Callable[[], Graph]
+    graph: Callable[..., Graph]
     inputs: Mapping[str, Series]
     start: Mapping[str, Any]
 
@@ -120,8 +124,8 @@ def fly(seed: int, noise: Noise, *, duration: float = 20.0) -> Flight:
 def _acf(flight: Flight, noise: Noise, _: int) -> Trial:
     p, v, q = _at_first(flight)
     start = PoseEstimate(position=p, velocity=v, attitude=q)
-    build = lambda: augmented_complementary.build(
-        **clocks_of(flight.streams), start=start, gravity=WEIGHTLESS, reading=reading_of(flight)
+    build = lambda **more: augmented_complementary.build(
+        **clocks_of(flight.streams), start=start, gravity=WEIGHTLESS, reading=reading_of(flight), **more
     )
     return Trial(build, flight.streams, {"previous": start})
 
@@ -172,7 +176,7 @@ def _told(
 ) -> Trial:
     """A filter of a pose on the flight's streams, or on `inputs`; told how the unit reads, if it asks."""
     inputs = flight.streams if inputs is None else inputs
-    build = lambda: graph.build(
+    build = lambda **more: graph.build(
         **clocks_of(inputs),
         start=start,
         noise=noise.imu,
@@ -180,6 +184,7 @@ def _told(
         attitude_noise=noise.pose,
         gravity=WEIGHTLESS,
         **({"reading": reading_of(flight)} if "reading" in graph.parameters[1] else {}),
+        **more,
     )
     return Trial(build, inputs, {register: start})
 
@@ -193,6 +198,15 @@ FILTERS: Mapping[str, Callable[[Flight, Noise, int], Trial]] = {
 }
 """By name: what runs the filter on a flight, told the noise, with a number of particles."""
 
+SMOOTHED: Mapping[str, tuple[str, Callable[[Any], Gaussian], StateSpace]] = {
+    "eskf": ("belief", stacked, INERTIAL_BIASED),
+    "ukf": ("posterior", lambda belief: belief, STATE),
+}
+"""Those whose runs can be smoothed: the stream of their beliefs, these as Gaussians, and over what space."""
+
+SMOOTHED_AT_ONCE = 10
+"""Flights whose covariances, priors and cross-covariances are held in memory together."""
+
 
 def thesis(
     *,
@@ -202,6 +216,7 @@ def thesis(
     seed: int = 0,
     settings: str = ",".join(SETTINGS),
     filters: str = ",".join(FILTERS),
+    smoothed: str = "eskf",
     engine: str = "auto",
 ) -> Report:
     """The thesis's table: ACF, EKF, UKF, RBPF and an error-state filter in six settings of noise.
@@ -212,6 +227,7 @@ def thesis(
         duration: of a flight, s, at most 20.
         seed: of the first flight; the others follow.
         settings, filters: those to run, with commas between.
+        smoothed: of the filters, those whose runs are smoothed too: eskf, ukf, both or none.
         engine: as for `simulate_many`; "auto" is c where there is a compiler, else xla or python.
 
     Returns:
@@ -223,6 +239,7 @@ def thesis(
     need_count("thesis", "particles", particles, least=1)
     engine = engine_of(engine, many=True)
     names, codes = _listed("filter", filters, FILTERS), _listed("setting", settings, SETTINGS)
+    better = [name for name in _listed("filter that is smoothed", smoothed, SMOOTHED) if name in names]
     rows = []
     for code in codes:
         noise = Noise.of(code)
@@ -231,7 +248,11 @@ def thesis(
         for name in names:
             errors = _errors(FILTERS[name], flown, noise, particles, engine)
             rows.append(_row(code, name, errors, bound))
-    figures = {"thesis.png": lambda path: _draw(rows, path)}
+        least = _bound(flown, noise, smoothing=True) if better else bound
+        for name in better:
+            errors = _smoothed_errors(name, flown, noise, engine)
+            rows.append(_row(code, f"{name}_smoothed", errors, least))
+    figures = {"thesis.png": lambda path: draw(rows, path)}
     return Report(rows, figures, (f"{flights} flights of {duration:g} s, {particles} particles, {engine}",))
 
 
@@ -248,8 +269,8 @@ class Errors:
     nees: np.ndarray
 
 
-def _bound(flown: list[Flight], noise: Noise) -> tuple[float, float]:
-    """The root mean squares below which no filter's errors are, m and rad."""
+def _bound(flown: list[Flight], noise: Noise, *, smoothing: bool = False) -> tuple[float, float]:
+    """The root mean squares below which no filter's errors are, or no smoother's; m and rad."""
     squares = []
     for first in range(0, len(flown), AT_ONCE):
         some = flown[first : first + AT_ONCE]
@@ -266,6 +287,7 @@ def _bound(flown: list[Flight], noise: Noise) -> tuple[float, float]:
             position_noise=noise.pose,
             attitude_noise=noise.pose,
             gravity=WEIGHTLESS,
+            smoothing=smoothing,
         )
         variances = np.diagonal(P, axis1=-2, axis2=-1).mean(0)
         squares.append(np.stack([variances[:, :3].sum(-1), variances[:, 6:].sum(-1)], axis=-1))
@@ -289,19 +311,60 @@ def _errors(make: Any, flown: list[Flight], noise: Noise, particles: int, engine
             keep=[output],
             runs_at_once=min(len(trials), 10),
         )
-        parts += [_compared(batch[output], k, _truth(flight)) for k, flight in enumerate(some)]
+        found = batch[output]
+        for k, flight in enumerate(some):
+            pose = (found[name][k] for name in ("position", "velocity", "attitude"))
+            P = found["covariance"][k][:, :9, :9] if "covariance" in found.leaves else None
+            parts.append(_compared(found.time, _truth(flight), *pose, P))
     return Errors(*np.array(parts).T)
 
 
-def _compared(found: Any, run: int, truth: Series) -> tuple[float, float, float, float]:
+def _smoothed_errors(name: str, flown: list[Flight], noise: Noise, engine: str) -> Errors:
+    """Those of the smoothed runs of a filter; all flights go back together."""
+    stream, gaussian, space = SMOOTHED[name]
+    make, parts = FILTERS[name], []
+    graph = make(flown[0], noise, 1).graph(smoothing=True)
+    for first in range(0, len(flown), SMOOTHED_AT_ONCE):
+        some = flown[first : first + SMOOTHED_AT_ONCE]
+        trials = [make(flight, noise, 1) for flight in some]
+        batch = simulate_many(
+            graph,
+            [trial.inputs for trial in trials],
+            range(first, first + len(some)),
+            engine=engine,
+            init=[trial.start for trial in trials],
+            keep=["prior", stream, "cross"],
+            runs_at_once=len(trials),
+        )
+        before, after = (
+            gaussian(graph_type(**{leaf: np.swapaxes(batch[of][leaf], 0, 1) for leaf in batch[of].leaves}))
+            for of, graph_type in (("prior", _class_of(graph, "prior")), (stream, _class_of(graph, stream)))
+        )
+        cross = np.swapaxes(batch["cross"]["covariance"], 0, 1)
+        gains = np.asarray(smoother_gain(cross[1:], np.asarray(before.covariance)[1:], np))
+        mean, P, _ = smoothing_pass(
+            gains, before.mean, before.covariance, after.mean, after.covariance, space
+        )
+        for k, flight in enumerate(some):
+            pose = np.split(mean[:, k], (3, 6, 10), axis=-1)[:3]
+            parts.append(_compared(batch[stream].time, _truth(flight), *pose, P[:, k, :9, :9]))
+    return Errors(*np.array(parts).T)
+
+
+def _class_of(graph: Graph, output: str) -> Any:
+    """The signal of a collected stream."""
+    wire = next(c.wire for c in graph.collected if c.name == output)
+    return graph.port(wire).type.cls
+
+
+def _compared(
+    time: np.ndarray, truth: Series, p: np.ndarray, v: np.ndarray, q: np.ndarray, P: np.ndarray | None
+) -> tuple[float, float, float, float]:
     """The mean over one flight of squared position error, attitude error, the thesis's of it, and NEES."""
-    np.testing.assert_array_equal(found.time, truth.time)
-    p, v, q = (found[name][run] for name in ("position", "velocity", "attitude"))
+    np.testing.assert_array_equal(time, truth.time)
     squared = np.sum((p - truth["position"]) ** 2, axis=-1)
     angle = np.radians(geodesic_angle(q, truth["attitude"]))
-    honest = np.array([np.nan])
-    if "covariance" in found.leaves:
-        honest = nees(state_error(found.time, truth, p, v, q), found["covariance"][run][:, :9, :9])
+    honest = np.array([np.nan]) if P is None else nees(state_error(time, truth, p, v, q), P)
     means = (np.mean(x) for x in (squared, angle**2, (8.0 * np.sin(0.5 * angle) ** 2) ** 2, honest))
     a, b, c, d = map(float, means)
     return a, b, c, d
@@ -348,44 +411,3 @@ def _listed(kind: str, text: str, valid: Any) -> list[str]:
         if name not in valid:
             raise UnknownNameError(kind, name, list(valid), path="thesis")
     return names
-
-
-def _draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Bars of the errors with their intervals and the bound, and the thesis's metric beside its figures."""
-    from matplotlib.figure import Figure  # slow to import, and only a picture needs it
-
-    codes, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("setting", "filter"))
-    figure = Figure(figsize=(13, 8), layout="constrained")
-    axes = figure.subplots(2, 2)
-    panels = (
-        ("position_rmse_m", None, "position RMSE [m]"),
-        ("attitude_rmse_deg", None, "attitude RMSE [deg]"),
-        ("thesis_metric_position", "thesis_position", "mean squared position error [m²]"),
-        ("thesis_metric_attitude", "thesis_attitude", "mean of |R − R_true|⁴ (Frobenius)"),
-    )
-    width = 0.8 / len(names)
-    for ax, (key, published, label) in zip(axes.flat, panels, strict=True):
-        for n, name in enumerate(names):
-            mine = [row for row in rows if row["filter"] == name]
-            at = (
-                np.array([codes.index(row["setting"]) for row in mine]) + (n - 0.5 * (len(names) - 1)) * width
-            )
-            values = np.array([row[key] for row in mine])
-            ax.bar(at, values, width * 0.95, label=name)
-            if key == "position_rmse_m":
-                ends = [[row["position_rmse_low_m"], row["position_rmse_high_m"]] for row in mine]
-                ax.errorbar(at, values, np.abs(np.array(ends).T - values), fmt="none", ecolor="0.2", lw=1)
-            if published:
-                seen = [np.nan if row[published] is None else row[published] for row in mine]
-                ax.plot(at, seen, "k_", ms=9, mew=2, label="thesis's figure" if n == 0 else None)
-                ax.set_yscale("log")
-        if key.endswith(("rmse_m", "rmse_deg")):
-            for n, code in enumerate(codes):
-                least = next(row[f"bound_{key}"] for row in rows if row["setting"] == code)
-                ax.hlines(least, n - 0.45, n + 0.45, "k", "--", lw=1, label="bound" if n == 0 else None)
-        ax.set_xticks(range(len(codes)), codes)
-        ax.set_ylabel(label)
-        ax.grid(axis="y", alpha=0.3)
-        ax.legend(fontsize=8, ncols=2)
-    figure.suptitle("Five filters on the thesis's flights (motion capture, accelerometer, gyroscope)")
-    figure.savefig(path, dpi=110)

@@ -31,11 +31,11 @@ def in_xla(*, ticks: int = 2000, particles: int = 1000, repeats: int = 15) -> li
     import jax
     import jax.numpy as jnp
 
-    from flowgraph.engines.xla.scan import _JaxNamespace
+    from flowgraph.engines.xla.namespace import JaxNamespace
 
     shape = (3, particles)
     site = Site("bench", "normal", shape)
-    xp = _JaxNamespace(jax)
+    xp = JaxNamespace(jax)
     key = jax.random.key(SEED)
 
     def ours(time: Any, words: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -74,3 +75,10 @@ def test_a_page_that_cannot_be(more: list[str], status: int, words: str, tmp_pat
     done = call(*SHORT, *(part.format(folder=tmp_path) for part in more))
     assert done.exit_code == status
     assert words in done.stderr
+
+
+def test_a_run_to_watch_says_where_and_ends_by_itself_where_nobody_is_waited_for() -> None:
+    done = call("watch", "ins_eskf", "--data", "sim", "--set", "duration=1", "--speed", "0", "--no-wait")
+    assert done.exit_code == 0, done.output
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\n", done.stdout)
+    assert "ended: 201 ticks" in done.stderr

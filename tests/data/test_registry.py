@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from flowgraph import PluginError, UnknownNameError, find_graph, load_flight
 from flowgraph.cli import app
-from flowgraph.data.registry import KINDS, find_bench, graph_names, installed
+from flowgraph.data.registry import KINDS, find_bench, find_entry, graph_names, installed
 from flowgraph.engines.registry import find_engine, find_pipeline_engine, writers
 from tests.support import Install
 
@@ -133,6 +133,7 @@ def test_an_unknown_name_lists_what_there_is(group, kind):
         "kind of flight": load_flight,
         "bench": find_bench,
         "engine": find_engine,
+        "way to make a case": lambda name: find_entry("flowgraph.cases", name),
     }
     find = finders[kind]
     with pytest.raises(UnknownNameError, match=f"no {kind} is called 'nothing'") as caught:

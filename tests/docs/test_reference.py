@@ -77,7 +77,7 @@ def test_the_section_of_ins_eskf_names_its_sources_and_settings() -> None:
 
 
 def test_every_join_is_listed() -> None:
-    rooms = [f"flowgraph.language.{name}" for name in ("joins", "pairs")]
+    rooms = [f"flowgraph.language.{name}" for name in ("joins", "late", "pairs")]
     joins = {name for name in flowgraph.__all__ if getattr(flowgraph, name).__module__ in rooms}
     assert {"latest", "zip", "match", "merge", "every", "sink"} <= joins
     assert joins | {"apply", "delay"} <= code_words(page("blocks"))

@@ -12,7 +12,7 @@ import pytest
 
 from flowgraph import Array, DataError, Result, Series, Signal, Stream, block, graph, latest, periodic, real
 from flowgraph.drawing import recorder as recorders
-from flowgraph.drawing.consistency import bounds, covariance_of, error_of, nees, places
+from flowgraph.drawing.consistency import bounds, covariance_of, error_of, is_far, nees, places
 from flowgraph.drawing.recorder import Recorder
 from flowgraph.drawing.run_page import describe_run, run_page, runs_of_page
 from flowgraph.drawing.scopes import POINTS, Scopes, extremes
@@ -120,6 +120,16 @@ def test_a_scale_is_of_what_comes_after_the_start_and_says_what_the_start_reache
     assert panel["whole"][1] >= 80
 
 
+def test_what_only_moves_on_is_shown_whole() -> None:
+    belief, _ = flown()
+    position = np.array(belief["position"]) + np.linspace(0.0, 100.0, len(belief))[:, None]
+    moving = Series(belief.time, belief.values.replace(position=position), name="belief")
+    panel = panels_of(Scopes(result_of(belief=moving), "belief", None))["position x"]
+    assert "words" not in panel
+    assert panel["range"][0] <= position[:, 0].min()
+    assert panel["range"][1] >= position[:, 0].max()
+
+
 @pytest.mark.parametrize(("size", "warned"), [(1.0, False), (2.0, True), (0.5, True)])
 def test_a_filter_that_is_wrong_about_itself_is_a_warning(size: float, warned: bool) -> None:
     belief, truth = flown(size=size)
@@ -133,6 +143,14 @@ def test_a_filter_that_is_wrong_about_itself_is_a_warning(size: float, warned: b
         panel["bounds"], [2.7004, 19.0228], rtol=1e-4
     )  # chi-squared of 9, 2.5 and 97.5 %
     assert [n.partition(":")[0] for n in scopes.notes] == ["warning"] * warned
+
+
+@pytest.mark.parametrize(
+    ("mean", "numbers_in_all", "far"),
+    [(0.2, 6, False), (0.2, 600, True), (1.9, 600, False), (2.2, 600, True), (2.2, 8, False), (9.0, 8, True)],
+)
+def test_a_few_squares_may_be_small_by_chance(mean: float, numbers_in_all: int, far: bool) -> None:
+    assert is_far(mean, numbers_in_all) is far
 
 
 def test_innovations_and_their_nis() -> None:

@@ -23,6 +23,7 @@ OWN = {
     "orientation_complementary": ("sim:thesis", ["sensors=gyro,coordinate_acceleration,thrust"]),
     "attitude_mekf": ("sim:thesis", ["sensors=body_rate,magnetic_attitude"]),
     "outdoor_eskf": ("sim:thesis", [_THESIS]),
+    "gnss_ins": ("sim:drive", ["gps.rate=5", "sensors=gps,gps_velocity,magnetometer,barometer"]),
     "rbpf_outdoor": ("sim:thesis", [_THESIS, _FEW]),
     "rbpf_indoor": ("sim", [_FEW]),
     "marg": ("sim:thesis", ["sensors=imu,magnetometer"]),

@@ -232,7 +232,7 @@ def test_after_a_gap_of_the_imu_a_filter_is_where_it_was(name, gap, gate):
     assert score["position_rmse_m"] < 3.0 * usual["position_rmse_m"] + 0.05
     longest = max(b - a for a, b in gap)
     (said,) = [n for n in case.remarks(result) if n.startswith("bridged:")]
-    assert f"{longest:g} s (median step 0.005 s)" in said
+    assert f"{longest:g} s (usual step 0.005 s)" in said
 
 
 @pytest.mark.slow
@@ -292,13 +292,11 @@ def spiked(base: Flight, row: int, field: str, by: float) -> Flight:
 ])  # fmt: skip
 @pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose"])
 def test_a_gate_opens_again(name, made):
-    """Seven seconds after the fault, at four poses a second, the error is that of a flight without one; where
-    there are biases, which take longer to be found again, it is below 0.3 m after 50 m of fault."""
-    case = find_graph(name).case(made(), gate=0.999, settle=12.0)
-    whole = find_graph(name).case(flight(16.0), gate=0.999, settle=12.0)
+    """Three seconds after the fault, at four poses a second, the error is that of a flight without one."""
+    case = find_graph(name).case(made(), gate=0.999, settle=8.0)
+    whole = find_graph(name).case(flight(16.0), gate=0.999, settle=8.0)
     score, usual = (c.score(simulate(c.graph, c.inputs)) for c in (case, whole))
-    most = 2.0 * usual["position_rmse_m"] if name == "ekf" else 0.3
-    assert score["position_rmse_m"] < most
+    assert score["position_rmse_m"] < 2.0 * usual["position_rmse_m"]
     assert refused(score) >= 5
 
 

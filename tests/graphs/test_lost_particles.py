@@ -96,6 +96,66 @@ def test_a_world_that_has_moved_is_believed(graph):
     np.testing.assert_allclose(error[-50:], 5.0 * np.sqrt(3.0), atol=0.1)
 
 
+OUTDOOR = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
+
+
+def astray(sensor: str, field: str, rows: Any, by: float, seconds: float = 2.0) -> Flight:
+    """An outdoor flight whose receivers read ten times a second, with some readings off by so much."""
+    settings = {"duration": f"{seconds:g}", "sensors": OUTDOOR, "gps.rate": "10", "gps2.rate": "10"}
+    made = load_flight("sim:thesis", seed=0, settings=settings)
+    series = made.streams[sensor]
+    values = np.array(series[field])
+    values[rows] += by
+    moved = Series(series.time, series.values.replace(**{field: values}), name=sensor)
+    return Flight(made.name, {**made.streams, sensor: moved}, made.truth, made.info)
+
+
+@pytest.mark.parametrize(("sensor", "field", "rows", "by"), [
+    ("gps", "position", [9], 1e160),
+    pytest.param("gps2", "position", range(5, 9), 1e3, marks=pytest.mark.slow),
+    pytest.param("altimeter", "distance", [40, 60], -1e9, marks=pytest.mark.slow),
+    pytest.param("magnetometer", "field", [30], 1.0, marks=pytest.mark.slow),
+    pytest.param("optical_flow", "displacement", [20], 50.0, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_gate_of_the_outdoor_particles_refuses_by_sensor(sensor, field, rows, by):
+    made = astray(sensor, field, rows, by, 1.2)
+    result, error, said = run(rbpf_outdoor, made, gate=0.9999, particles=60)
+    for name in OUTDOOR.split(",")[1:]:
+        accepted = result[f"{name}_innovation"]["accepted"]
+        wrong = list(rows) if name == sensor else []
+        assert not accepted[wrong].any()
+        assert (~accepted).sum() <= len(wrong) + 2  # of some hundred honest ones in ten thousand
+    assert error[100:].max() < 0.5
+    assert not [s for s in said if s.startswith("refused: ")]
+
+
+@pytest.mark.slow
+def test_after_a_run_of_wrong_positions_the_outdoor_particles_come_back():
+    rows = range(8, 20)
+    made = astray("gps", "position", list(rows), 100.0, 4.0)
+    _, error, said = run(rbpf_outdoor, made, gate=0.999, particles=100)
+    late = (rows[-1] + 1) / 10.0 + 1.0
+    assert error[round(late * 200) :].max() < 0.7
+    assert any(s.startswith("refused: gps: ") and "in a row" in s for s in said)
+
+
+@pytest.mark.slow
+def test_engines_agree_over_a_lost_cloud_and_missing_entries():
+    made = astray("gps", "position", list(range(6, 14)), 100.0, 1.8)
+    gps = made.streams["gps"]
+    position = np.array(gps["position"])
+    position[3:, 2] = np.nan
+    partial = Series(gps.time, gps.values.replace(position=position), name="gps", gaps=True)
+    case = rbpf_outdoor.case(
+        Flight(made.name, {**made.streams, "gps": partial}, made.truth, made.info), gate=0.999, particles=40
+    )
+    python, c = (simulate(case.graph, case.inputs, engine=e) for e in ("python", "c"))
+    assert not python["gps_innovation"]["accepted"].all()
+    for name in ("belief", "gps_innovation", "magnetometer_innovation"):
+        for leaf, values in python[name].leaves.items():
+            np.testing.assert_allclose(c[name][leaf], values, rtol=1e-8, atol=1e-8, err_msg=leaf)
+
+
 def test_particles_that_do_not_look_at_the_pose_are_depleted_and_say_so():
     result, _, said = run(ins_particle, sim(seconds=4.0), bandwidth=0.0)
     assert result["depleted"]["depleted"].mean() > 0.2
@@ -105,10 +165,9 @@ def test_particles_that_do_not_look_at_the_pose_are_depleted_and_say_so():
 
 
 def test_every_cloud_says_whether_it_is_depleted():
-    outdoor = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
     flights = {
         particle: load_flight("sim:plane", seed=0),
-        rbpf_outdoor: load_flight("sim:thesis", seed=0, settings={"duration": "1", "sensors": outdoor}),
+        rbpf_outdoor: load_flight("sim:thesis", seed=0, settings={"duration": "1", "sensors": OUTDOOR}),
         rbpf_indoor: sim(),
     }
     for graph, flight in flights.items():

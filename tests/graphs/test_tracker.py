@@ -45,3 +45,6 @@ def test_what_cannot_be_is_refused():
         a_case(method="kalman")
     with pytest.raises(DataError, match="position"):
         tracker.case(load_flight("sim", settings={"duration": "1"}))
+    in_space = load_flight("sim:thesis", settings={"duration": "1", "sensors": "all"})
+    with pytest.raises(DataError, match=r"position: the tracker follows a point in a plane[\s\S]*of 3"):
+        tracker.case(in_space, position_noise=0.1)

@@ -262,7 +262,7 @@ CASES: dict[str, list[tuple[Callable[..., Any], tuple[Any, ...]]]] = {
     "unpacking": [(lambda xp, a: sum(x * x for x in a), (V,))],
 }
 PAIRS = [(name, k) for name, cases in CASES.items() for k in range(len(cases))]
-MACHINERY = {"float32_bits", "materialise"}  # for random numbers and engines, not for blocks
+MACHINERY = {"float32_bits", "materialise", "replay"}  # for random numbers and engines, not for blocks
 
 
 def record(function: Callable[..., Any], arrays: tuple[Any, ...]) -> tuple[Trace, list[int], Any]:

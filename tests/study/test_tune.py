@@ -21,7 +21,8 @@ from flowgraph import (
 )
 from flowgraph.cli import app
 from flowgraph.study import trials
-from flowgraph.study.tune import Fit, Recording, _first_steps, _start, surprise, tune
+from flowgraph.study.search import first_steps
+from flowgraph.study.tune import Fit, Recording, start_of_fit, surprise, tune
 from tests.blocks.datasets.test_datasets import course
 from tests.recordings import recordings
 
@@ -99,10 +100,11 @@ def test_each_recording_is_held_out_once_and_judged_by_the_search_that_did_witho
 
 
 def test_a_search_starts_as_told_or_at_the_own_value_or_in_the_middle():
-    assert _start("quaternion_ukf", Fit("force_noise", 0.1, 40.0)) == 2.0
-    assert _start("quaternion_ukf", Fit("force_noise", 0.1, 40.0, 3.0)) == 3.0
-    assert _start("quaternion_ukf", Fit("force_noise", 4.0, 9.0)) == pytest.approx(6.0)  # its own is outside
-    assert _start("ekf", Fit("position_noise", 1e-3, 0.1)) == pytest.approx(0.01)  # its own is a flight's
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 0.1, 40.0)) == 2.0
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 0.1, 40.0, 3.0)) == 3.0
+    # of these two the own value is outside, or that of a flight
+    assert start_of_fit("quaternion_ukf", Fit("force_noise", 4.0, 9.0)) == pytest.approx(6.0)
+    assert start_of_fit("ekf", Fit("position_noise", 1e-3, 0.1)) == pytest.approx(0.01)
 
 
 def test_a_simplex_moves_each_parameter_at_first_also_from_one():
@@ -114,7 +116,7 @@ def test_a_simplex_moves_each_parameter_at_first_also_from_one():
         watch=lambda count, best, value: seen.append(value),
     )  # fmt: skip
     assert len(seen) == 3
-    steps = _first_steps(np.log([1.0, 10.0]), np.log([0.1, 0.1]), np.log([10.0, 10.0]))
+    steps = first_steps(np.log([1.0, 10.0]), np.log([0.1, 0.1]), np.log([10.0, 10.0]))
     np.testing.assert_allclose(steps, [1.0, -1.0])
 
 
@@ -198,7 +200,7 @@ def test_the_command_prints_what_it_found(tmp_path):
     done = runner.invoke(app, [*words, "--most", "9", "--json", "--out", str(tmp_path / "found.json")])
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "found.json").read_text())
-    assert 0.001 < found["parameters"]["position_noise"] < 0.1
+    assert 0.001 < found["parameters"]["position_noise"]["value"] < 0.1
     assert [r["held_out"] for r in found["recordings"]] == [False, True]
     assert found["recordings"][1]["metrics"]["position_rmse_m"].keys() == {"before", "after", "own"}
     assert found["mean"]["held_out"]["after"] == found["recordings"][1]["after"]

@@ -5,7 +5,7 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 
 const out = process.argv[2];
-const used = { diagram: ["elkjs"], run: ["uplot", "three"] };
+const used = { diagram: ["elkjs"], run: ["uplot", "three"], live: ["uplot"] };
 for (const name of Object.keys(used)) {
   await build({
     entryPoints: [`src/${name}_page.ts`],
@@ -19,7 +19,7 @@ for (const name of Object.keys(used)) {
 await build({ entryPoints: ["src/style.css"], outfile: join(out, "style.css"), bundle: true, minify: true });
 
 const files = { elkjs: "LICENSE.md", uplot: "LICENSE", three: "LICENSE" };
-const notices = Object.values(used).flat().map((name) => {
+const notices = [...new Set(Object.values(used).flat())].map((name) => {
   const about = JSON.parse(readFileSync(join("node_modules", name, "package.json"), "utf8"));
   const source = (about.repository?.url ?? about.repository).replace(/^git\+/, "").replace(/\.git$/, "");
   const licence = readFileSync(join("node_modules", name, files[name]), "utf8").trim();

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.nodes import Node, View
+from flowgraph.engines.c.nodes import Buffer, Node, View
 from flowgraph.engines.c.shapes import JOINS, Shapes, host_kind, within, without_zeros
-from flowgraph.engines.c.values import Value, lanes, space_of, unrolled
+from flowgraph.engines.c.values import Value, lanes, row_major, space_of, unrolled
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import ELEMENTWISE, OPS, Spec, broadcast
+from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
 
 MOST_PRODUCTS = 600
@@ -34,6 +35,9 @@ class Expander(Shapes):
         """
         self.tape.origin = i.line
         args = [self.known[a] for a in i.args]
+        if i.op == "replay":
+            self.known[i.out] = self.replayed(i)
+            return
         rule = _RULES.get(i.op)
         if rule is None and i.op in ELEMENTWISE:
             self.known[i.out] = self.elementwise(i.op, i.spec, args)
@@ -60,6 +64,19 @@ class Expander(Shapes):
         if op in ELEMENTWISE:
             return self.elementwise(op, spec, list(args))
         return _RULES[op](self, spec, *args, **attrs)
+
+    def replayed(self, i: Instruction, into: Buffer | None = None) -> Value:
+        """A replay, into memory of its own, or where its history lies, which nobody else reads."""
+        history, rows, first, count = (self.known[a] for a in i.args)
+        views = [self.form.packed(rows), self.form.stored(first), self.form.stored(count)]
+        if into is None:
+            out = self.fresh(i.spec)
+            views.append(self.form.packed(history))
+        else:
+            out = View(into, i.spec.shape, 0, row_major(i.spec.shape))
+        self.tape.origin = i.line
+        self.tape.macro("replay", views, out, body=body_of(i.attrs["body"]))
+        return self.from_view(i.spec, out)
 
     # -- products ------------------------------------------------------------------------------------
 

@@ -35,10 +35,11 @@ class Expressions:
 
     Args:
         real: "double" or "float".
+        turn: the text of a function, given its name, a case of a replay and the sizes of history and row.
     """
 
-    def __init__(self, real: str) -> None:
-        self.real = real
+    def __init__(self, real: str, turn: Callable[..., str] = lambda *_: "") -> None:
+        self.real, self.turn = real, turn
         self.helpers: set[str] = set()
         self.functions: dict[Any, tuple[str, str]] = {}
 

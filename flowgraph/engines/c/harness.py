@@ -20,7 +20,6 @@ from flowgraph.engines.c.source import generate
 from flowgraph.engines.pipeline_inputs import events_of
 from flowgraph.pipeline.optimise import COMPILED, check_passes, optimise
 from flowgraph.pipeline.pipeline import Pipeline, Port
-from flowgraph.pipeline.program import specialise
 
 
 def write_c(
@@ -44,7 +43,7 @@ def write_c(
         OutputError: where the folder holds another filter's files, or cannot be written.
     """
     chosen = check_passes(COMPILED if passes is None else passes)
-    made = generate(pipeline, dtype, program=lambda p, key: optimise(specialise(p, key), chosen))
+    made = generate(pipeline, dtype, tidy=lambda program: optimise(program, chosen))
     m = made.names.module
     texts = {
         f"{m}.h": made.header,

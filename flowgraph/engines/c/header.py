@@ -75,7 +75,7 @@ def header(
     sizes = [(d, k, n) for d, slots in sorted(pool.items()) for k, n in enumerate(slots)]
     if sizes:
         lines.append("    /* room to work in during a call; nothing in it lasts */")
-        lines += [f"    {ctype(d, real)} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
+        lines += [f"    {ctype(d.rpartition('_')[2], real)} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
     lines += [f"}} {m}_state;", ""]
     lines += [
         "/* Start anew, with the initial values of the graph. */",

@@ -17,10 +17,9 @@ import numpy as np
 
 from flowgraph.engines.c.compile import FLAGS, load
 from flowgraph.engines.c.loop import loop_text
-from flowgraph.engines.c.source import MOST_PATTERNS, generate
+from flowgraph.engines.c.source import every_pattern, generate
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
-from flowgraph.pipeline.program import specialise
 
 _CHUNK_BYTES = 16 * 2**20
 _MOST_TICKS = 65536
@@ -101,12 +100,12 @@ class Compiled:
         passes: tuple[str, ...] = (),
     ) -> None:
         self.pipeline, self.real = pipeline, np.dtype(real)
-        every = 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS
+        every = every_pattern(pipeline) is not None
         self.source = generate(
             pipeline,
             self.real.name,
             patterns=None if every else keys,
-            program=lambda p, key: optimise(specialise(p, key), passes),
+            tidy=lambda program: optimise(program, passes),
             checked=False,  # faults and what is not finite are looked for by whoever plays
         )
         m = self.source.names.module
@@ -261,7 +260,7 @@ def pointers(places: Sequence[int | None]) -> Any:
 
 def compiled(pipeline: Pipeline, real: Any, keys: Sequence[int], passes: tuple[str, ...] = ()) -> Compiled:
     """The pipeline in C, optimised by `passes`; it lives as long as the pipeline does."""
-    every = 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS
+    every = every_pattern(pipeline) is not None
     which = (np.dtype(real).name, None if every else tuple(keys), passes)
     kept: dict[Any, Compiled] = pipeline.__dict__.setdefault("_libraries", {})
     if which not in kept:

@@ -276,6 +276,31 @@ def _sort(w: Lines, m: Macro) -> None:
         w.line("}")
 
 
+def _replay(w: Lines, m: Macro) -> None:
+    """Turn after turn around the ring; a function for each case of the body."""
+    rows, first, count, *given = m.inputs
+    (places, size), wide = m.output.shape, rows.shape[1]
+    history, at_row = w.names(m.output.buffer), w.names(rows.buffer)
+    row = f"{at_row} + {rows.offset} + {wide} * at" if rows.offset else f"{at_row} + {wide} * at"
+    names = [
+        w.write.function((id(case), size, wide), "turn", w.write.turn, case, (size, wide))
+        for case in m.extra["body"].cases
+    ]
+    for view in given:
+        source = w.names(view.buffer) + (f"[{view.offset} + k]" if view.offset else "[k]")
+        w.line(f"for (int32_t k = 0; k < {places * size}; k++) {history}[k] = {source};")
+    w.line(f"for (int32_t k = 0; k < {element(w, count, [])} && k < {places}; k++) {{")
+    w.depth += 1
+    w.line(f"const int32_t at = ({element(w, first, [])} % {places} + {places} + k) % {places};")
+    w.line(f"const {w.write.real} *before = {history} + {size} * ((at + {places - 1}) % {places});")
+    calls = [f"{name}(s, before, {row}, {history} + {size} * at);" for name in names]
+    for k, call in enumerate(calls[:-1]):
+        w.line(f"{'else ' if k else ''}if ({at_row}[{rows.offset} + {wide} * at] < {k + 1}) {call}")
+    w.line(("else " if len(calls) > 1 else "") + calls[-1])
+    w.depth -= 1
+    w.line("}")
+
+
 def _random(w: Lines, m: Macro) -> None:
     name = w.write.helper(f"fg_{m.extra['draws']}")
     blocks = m.output.buffer.size // 4
@@ -295,4 +320,5 @@ _MACROS: dict[str, Callable[[Lines, Macro], None]] = {
     "sort": _sort,
     "argsort": _sort,
     "random": _random,
+    "replay": _replay,
 }

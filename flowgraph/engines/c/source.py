@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -23,14 +24,17 @@ from flowgraph.engines.c.header import NOT_FINITE, header
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
+from flowgraph.engines.c.preamble import MACROS, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.syntax import comment, ctype, number
 from flowgraph.engines.c.values import Value, row_major
 from flowgraph.errors import LoweringError
-from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
+from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline, kind_of
 from flowgraph.pipeline.program import Program, specialise
 from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.replay import Case
+from flowgraph.recorder.trace import Instruction
 
 MOST_PATTERNS = 8
 _LOCAL_BYTES = 512
@@ -67,7 +71,7 @@ def generate(
     dtype: str = "float64",
     *,
     patterns: Sequence[int] | None = None,
-    program: Callable[[Pipeline, int | None], Program] = specialise,
+    tidy: Callable[[Program], Program] = lambda program: program,
     checked: bool = True,
 ) -> Source:
     """The C of a pipeline.
@@ -76,7 +80,7 @@ def generate(
         pipeline: what to write down.
         dtype: "float64" or "float32", what `real` is.
         patterns: the patterns of present inputs that can come; all if left out.
-        program: makes the program of a pattern, or with None that of all patterns.
+        tidy: makes a program shorter: that of a pattern, that of all patterns, or that of a turn of a loop.
         checked: whether what the entry returns says that a queue was full or an output is not finite.
 
     Raises:
@@ -91,22 +95,35 @@ def generate(
             fix="join signals that come together into one struct",
         )
     chosen: list[int] | None = sorted(k for k in patterns if k) if patterns is not None else None
-    if chosen is None and 2 ** len(pipeline.inputs) - 1 <= MOST_PATTERNS:
-        chosen = list(range(1, 2 ** len(pipeline.inputs)))
+    if chosen is None:
+        chosen = every_pattern(pipeline)
     if chosen is not None and len(chosen) > MOST_PATTERNS:
         chosen = None
     real = "double" if dtype == "float64" else "float"
-    return _File(pipeline, real, chosen, program, checked).source()
+    return _File(pipeline, real, chosen, tidy, checked).source()
+
+
+def every_pattern(pipeline: Pipeline) -> list[int] | None:
+    """The patterns of present inputs that can come, where they are few: inputs of one clock come together."""
+    groups: dict[str, int] = {}
+    for k, port in enumerate(pipeline.inputs):
+        groups[port.clock] = groups.get(port.clock, 0) | 1 << k
+    if 2 ** len(groups) - 1 > MOST_PATTERNS:
+        return None
+    found = [0]
+    for mask in groups.values():
+        found += [key | mask for key in found]
+    return sorted(found)[1:]
 
 
 class _File:
     def __init__(
-        self, pipeline: Pipeline, real: str, patterns: list[int] | None, program: Any, checked: bool
+        self, pipeline: Pipeline, real: str, patterns: list[int] | None, tidy: Any, checked: bool
     ) -> None:
-        self.pipeline, self.real, self.patterns, self.program = pipeline, real, patterns, program
+        self.pipeline, self.real, self.patterns, self.tidy = pipeline, real, patterns, tidy
         self.checked = checked
         self.names = names_of(pipeline)
-        self.expressions = Expressions(real)
+        self.expressions = Expressions(real, self.turn)
         self.constants: dict[Any, tuple[str, Buffer]] = {}
         self.pool: dict[str, list[int]] = {}
         self.presence: dict[int | None, tuple[int, int]] = {}
@@ -121,11 +138,11 @@ class _File:
             "#include <math.h>",
             "#include <stddef.h>",
             "",
-            _REFUSED,
-            _MACROS,
+            REFUSED,
+            MACROS,
             helper_text(self.expressions.helpers, self.real),
-            *(text for _, text in self.expressions.functions.values()),
             *(self._constant(name, b) for name, b in self.constants.values()),
+            *(text for _, text in self.expressions.functions.values()),
             reset,
             *reactions,
             entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
@@ -147,13 +164,16 @@ class _File:
     def reaction(self, key: int | None) -> str:
         """The function of one pattern of present inputs."""
         pipeline, tape = self.pipeline, Tape()
-        program = self.program(pipeline, key)
+        program = self.tidy(specialise(pipeline, key))
         values = self._given(tape, program, key)
         expander = Expander(tape, values)
         sites = {site.value: site for site in pipeline.random}
+        places = self._in_place(program)
         for i in program.instructions:
             if i.out in sites:
                 values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
+            elif i.out in places:
+                values[i.out] = expander.replayed(i, places[i.out])
             else:
                 expander.tell(program.elements, i)
                 expander.play(i)
@@ -170,7 +190,9 @@ class _File:
             roots.append(present)
         cells = [c for r in pipeline.registers for c in r.cells]
         for cell, n, name in zip(cells, program.writes, self._cell_names(), strict=True):
-            if n != cell.read:
+            if n in places and places[n].name == f"s->{name}":
+                roots += places[n].writers
+            elif n != cell.read:
                 roots += self._write(expander, self.state[name], values[n])
         plan = schedule(tape, roots)
         work, local = self._memory(plan.span)
@@ -189,6 +211,46 @@ class _File:
         unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
         head = [f"    (void){n};" for n in unused]
         return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
+
+    def _in_place(self, program: Program) -> dict[int, Buffer]:
+        """The replays that can make a register anew where it lies, with its memory: nobody else reads it."""
+        readers = Counter(a for i in program.instructions for a in i.args)
+        readers.update(n for _, leaves in program.outputs for n in leaves)
+        readers.update(program.writes)
+        cells = (c for r in self.pipeline.registers for c in r.cells)
+        made = {i.out: i.args[0] for i in program.instructions if i.op == "replay"}
+        return {
+            n: replace(self._place(f"s->{name}", "work", cell), writers=[])
+            for cell, n, name in zip(cells, program.writes, self._cell_names(), strict=True)
+            if made.get(n) == cell.read and readers[cell.read] == 1 and program.writes.count(n) == 1
+        }
+
+    def turn(self, name: str, case: Case, sizes: tuple[int, int]) -> str:
+        """The function of one case of a replay: what comes of the history before and of a row."""
+        before, row = (Spec((n,), "real") for n in sizes)
+        specs = {0: before, 1: row, **{n: Spec(a.shape, kind_of(a)) for n, a in case.constants.items()}}
+        specs |= {t.out: t.spec for t in case.turns}
+        steps = tuple(Instruction(t.op, t.args, t.attrs, t.out, t.spec, t.line) for t in case.turns)
+        program = self.tidy(Program(case.constants, steps, ((None, ()),), (case.result,), specs, (0,)))
+        tape, values = Tape(), {}
+        for n, text, spec in ((0, "before", before), (1, "row", row)):
+            values[n] = _whole(Buffer(text, "real", spec.shape[0], "input"), spec.shape)
+        for n, array in program.constants.items():
+            values[n] = self._known(np.asarray(array), program.specs[n].dtype)
+        expander = Expander(tape, values)
+        for i in program.instructions:
+            expander.tell(program.elements, i)
+            expander.play(i)
+        after = Buffer("after", "real", sizes[0], "output")
+        plan = schedule(tape, self._write(expander, after, values[program.writes[0]]))
+        work, local = self._memory(plan.span, "turn_")
+        body = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
+        unused = [n for n in ("s", "before", "row") if not _names_it("\n".join(body), n)]
+        real, state = self.real, f"{self.names.module}_state"
+        head = (
+            f"static FG_APART void {name}({state} *s, const {real} *before, const {real} *row, {real} *after)"
+        )
+        return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
 
     def signature(self, key: int | None) -> str:
         return f"static uint64_t {reaction_name(key)}({self._typed(key)})"
@@ -291,19 +353,26 @@ class _File:
         used: set[str] = self.__dict__.setdefault("_used", set())
         return used
 
-    def _memory(self, spans: dict[Buffer, tuple[int, int]]) -> tuple[dict[Buffer, str], list[str]]:
-        """Names of the work buffers: small ones on the stack, large ones in the state, which are reused."""
+    def _memory(
+        self, spans: dict[Buffer, tuple[int, int]], whose: str = ""
+    ) -> tuple[dict[Buffer, str], list[str]]:
+        """Names of the work buffers: small ones on the stack, large ones in the state, which are reused by
+        all reactions, or by all that `whose` says."""
         names: dict[Buffer, str] = {}
         local: list[str] = []
         ends: dict[str, list[int]] = {}
         pool: dict[str, list[int]] = {}
         for buffer, (first, last) in sorted(spans.items(), key=lambda item: item[1][0]):
+            if buffer.name:
+                names[buffer] = buffer.name
+                continue
             size = _BYTES.get(buffer.dtype, 8 if self.real == "double" else 4) * buffer.size
             if size <= _LOCAL_BYTES:
                 names[buffer] = f"w{len(local)}"
                 local.append(f"    {ctype(buffer.dtype, self.real)} w{len(local)}[{max(buffer.size, 1)}];")
                 continue
-            slots, busy = pool.setdefault(buffer.dtype, []), ends.setdefault(buffer.dtype, [])
+            kind = whose + buffer.dtype
+            slots, busy = pool.setdefault(kind, []), ends.setdefault(kind, [])
             free = [k for k in range(len(slots)) if busy[k] < first]
             fits = [k for k in free if slots[k] >= buffer.size] or free
             k = min(fits, key=lambda j: abs(slots[j] - buffer.size), default=len(slots))
@@ -311,9 +380,9 @@ class _File:
                 slots.append(0)
                 busy.append(0)
             slots[k], busy[k] = max(slots[k], buffer.size), last
-            names[buffer] = f"s->fg_work_{buffer.dtype}_{k}"
-        for dtype, slots in pool.items():
-            mine = self.pool.setdefault(dtype, [])
+            names[buffer] = f"s->fg_work_{kind}_{k}"
+        for kind, slots in pool.items():
+            mine = self.pool.setdefault(kind, [])
             mine += [0] * (len(slots) - len(mine))
             for k, size in enumerate(slots):
                 mine[k] = max(mine[k], size)
@@ -363,31 +432,3 @@ def _whole(buffer: Buffer, shape: tuple[int, ...]) -> Value:
 
 
 _HOST = {"real": np.float64, "bool": np.bool_}
-
-_REFUSED = """/* NaN and infinity mean something here, and sums are made in this order */
-#if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || defined(_M_FP_FAST) \\
-    || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
-#error "a filter needs IEEE arithmetic: compile without -ffast-math, -Ofast and what they stand for"
-#endif
-"""
-
-_MACROS = """#ifdef __cplusplus
-#define restrict __restrict
-#define FG_ZERO {}
-#else
-#define FG_ZERO {0}
-#endif
-#if defined(__GNUC__)
-#define FG_INLINE inline __attribute__((always_inline))
-#define FG_APART __attribute__((noinline))
-#else
-#define FG_INLINE inline
-#define FG_APART
-#endif
-/* with FLOWGRAPH_SIMD (and -fopenmp-simd) loops say that their turns may be done together */
-#ifdef FLOWGRAPH_SIMD
-#define FG_SIMD(text) _Pragma(#text)
-#else
-#define FG_SIMD(text)
-#endif
-"""

@@ -16,6 +16,7 @@ from threading import Lock, get_ident
 from time import perf_counter
 from typing import Any, TypeVar, cast
 
+from flowgraph.data.arrival import stamp_events
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
@@ -127,7 +128,8 @@ class Run:
         """One tick at `time` (int ns) in which the named sources have these values.
 
         Whole periods without an event of a periodic source are packets that were lost, which `lost` counts.
-        An event that is refused leaves no trace; the next may be pushed.
+        An event that is refused leaves no trace; the next may be pushed. Where the graph asks when the values
+        of a source NAME were true, `**{"NAME.stamp": ns}` says it; left out, it is `time`.
 
         Raises:
             DataError, ClockError, TypeMismatchError: for an event that is refused.
@@ -142,6 +144,7 @@ class Run:
                 got="push",
                 fix="start it as Run(graph)",
             )
+        stamp_events(self.graph.sources, time, values)
         admitted = self._entrance.admit(time, values, self.time)
         self._react(admitted)
         self._entrance.done(admitted)

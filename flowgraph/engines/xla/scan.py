@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.engines.xla.namespace import JaxNamespace
 from flowgraph.errors import MissingDependencyError
 from flowgraph.pipeline.optimise import ARRAYS, optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
-from flowgraph.recorder import ranges
 from flowgraph.recorder.ops import OPS, bound_attrs
 
 _MOST_PATTERNS = 8
@@ -51,70 +51,6 @@ def import_jax() -> Any:
 def chosen_device() -> str:
     """What `jax.default_device` names now, as a key: a scan is compiled for one device."""
     return str(import_jax().config.jax_default_device)
-
-
-class _JaxLinearAlgebra:
-    """`jax.numpy.linalg`, where a singular matrix gives NaN throughout, as in the other engines."""
-
-    def __init__(self, jax: Any) -> None:
-        self._jax = jax
-
-    def cholesky(self, x: Any) -> Any:
-        jnp = self._jax.numpy
-        lower = jnp.linalg.cholesky(x)
-        last = lower[..., -1:, -1:]  # NaN where a pivot was not positive
-        return jnp.where(jnp.isnan(last), last, lower)
-
-    def solve(self, a: Any, b: Any) -> Any:
-        jnp = self._jax.numpy
-        x = jnp.linalg.solve(a, b)
-        axes = -1 if b.ndim == 1 else (-2, -1)
-        fits = jnp.isfinite(a).all(axis=(-2, -1)) & jnp.isfinite(b).all(axis=axes)
-        singular = fits & ~jnp.isfinite(x).all(axis=axes)
-        return jnp.where(singular[..., None] if b.ndim == 1 else singular[..., None, None], jnp.nan, x)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._jax.numpy.linalg, name)
-
-
-class _JaxNamespace:
-    """`jax.numpy` with the operations that pipelines add to it or define further, and a faster `take`."""
-
-    def __init__(self, jax: Any) -> None:
-        self._jax = jax
-        self.linalg = _JaxLinearAlgebra(jax)
-
-    def float32_bits(self, x: Any) -> Any:
-        jnp = self._jax.numpy
-        return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
-
-    def floor_divide(self, a: Any, b: Any) -> Any:
-        return ranges.floor_divide(self._jax.numpy, a, b)
-
-    def remainder(self, a: Any, b: Any) -> Any:
-        return ranges.remainder(self._jax.numpy, a, b)
-
-    def materialise(self, x: Any) -> Any:
-        return self._jax.lax.optimization_barrier(x)
-
-    def take(self, x: Any, indices: Any, *, axis: int = 0, mode: str = "clip") -> Any:
-        """`jnp.take`, along the last axis from a flat array.
-
-        For a gather of columns XLA lays the whole array out column by column, and as a scan carries it, every
-        tick that does not gather then pays for the change to and fro.
-        """
-        jnp = self._jax.numpy
-        x = jnp.asarray(x)
-        if x.ndim == 1 or axis % x.ndim != x.ndim - 1 or not x.size:
-            return jnp.take(x, indices, axis=axis, mode=mode)
-        n = x.shape[-1]
-        starts = np.arange(0, x.size, n, dtype=np.int32 if x.size < 2**31 else np.int64)
-        column = jnp.clip(jnp.asarray(indices), 0, n - 1).astype(starts.dtype)
-        at = starts.reshape(*x.shape[:-1], *(1,) * column.ndim) + column
-        return jnp.take(x.reshape(-1), at, axis=0, mode=mode)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._jax.numpy, name)
 
 
 @dataclass(frozen=True)
@@ -203,7 +139,7 @@ class Scan:
         return env
 
     def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
-        jnp, xp = self.jax.numpy, _JaxNamespace(self.jax)
+        jnp, xp = self.jax.numpy, JaxNamespace(self.jax)
         for i in program.instructions:
             env[i.out] = OPS[i.op].run(
                 xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)

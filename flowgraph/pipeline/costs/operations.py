@@ -12,7 +12,9 @@ from collections import Counter
 from collections.abc import Mapping
 
 from flowgraph.pipeline.optimise.elements import MOVES
+from flowgraph.pipeline.pipeline import kind_of
 from flowgraph.recorder.ops import ELEMENTWISE, FUNCTIONS, Spec
+from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
 
 KINDS = (
@@ -53,6 +55,8 @@ def operations(i: Instruction, specs: Mapping[int, Spec]) -> Counter[str]:
     found: Counter[str] = Counter()
     if i.op in _FREE or not size:
         return found
+    if i.op == "replay":
+        return Counter({kind: first.shape[0] * n for kind, n in _longest_turn(i, specs)[0].items()})
     real = first.dtype == "real" or i.spec.dtype == "real"
     if i.op == "hypot":
         found.update(multiply=2 * size, add=size, root=size)
@@ -75,6 +79,26 @@ def operations(i: Instruction, specs: Mapping[int, Spec]) -> Counter[str]:
     else:
         found.update(_over_axis(i.op, math.prod(first.shape), size, specs[i.args[-1]]))
     return found if real else Counter({_INTEGER.get(k, k): n for k, n in found.items()})
+
+
+def _longest_turn(i: Instruction, specs: Mapping[int, Spec]) -> tuple[Counter[str], int]:
+    """The operations of a turn of a replay, in the case that has most, and the longest chain of any."""
+    most: Counter[str] = Counter()
+    longest = 0
+    for case in body_of(i.attrs["body"]).cases:
+        row, known = (Spec(specs[a].shape[1:], "real") for a in i.args[:2]), dict[int, Spec]()
+        known.update(enumerate(row))
+        known |= {n: Spec(a.shape, kind_of(a)) for n, a in case.constants.items()}
+        found: Counter[str] = Counter()
+        ends: dict[int, int] = {}
+        for t in case.turns:
+            one = Instruction(t.op, t.args, t.attrs, t.out, t.spec, t.line)
+            found += operations(one, known)
+            ends[t.out] = depth(one, known) + max((ends.get(a, 0) for a in t.args), default=0)
+            known[t.out] = t.spec
+        most = max(most, found, key=lambda counts: counts.total())
+        longest = max(longest, ends.get(case.result, 0))
+    return most, longest
 
 
 _INTEGER = {"multiply": "integer multiply", "add": "integer add", "divide": "divide"}
@@ -105,6 +129,8 @@ def depth(i: Instruction, specs: Mapping[int, Spec]) -> int:
     if i.op in _FREE:
         return 0
     first = specs[i.args[0]].shape if i.args else ()
+    if i.op == "replay":
+        return first[0] * _longest_turn(i, specs)[1]
     if i.op in ELEMENTWISE:
         return {"hypot": 3}.get(i.op, 1)
     if i.op in ("matmul", "vecdot"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,9 +160,31 @@ def test_wrong_settings_are_refused(tmp_path):
     refused(tmp_path / "b", "no topic is called '/gyro'", kind=UnknownNameError, topics="imu:/gyro")
     refused(tmp_path / "b", "no list of topics", kind=DeclarationError, topics="/imu")
     refused(tmp_path / "b", "named twice", kind=DeclarationError, topics="a:/imu,a:/imu2")
-    refused(tmp_path / "b", "bag, header", kind=UnknownNameError, stamp="mine")
+    refused(tmp_path / "b", "bag, both, header", kind=UnknownNameError, stamp="mine")
 
 
 def test_without_the_library_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     refused(tmp_path, "bags need the rosbags library", "flowgraph-filters[ros]", kind=MissingDependencyError)
+
+
+def test_a_bag_tells_when_a_message_was_true_and_when_it_arrived(tmp_path):
+    path = tmp_path / "late"
+    with Pen(path) as pen:
+        for k in range(20):
+            t = 10**9 + k * 10 * MS
+            pen.imu("/imu", t, [0, 0, 0], [0, 0, 9.8])
+            pen.pose("/vicon", t, [k, 0, 0], late=(7 if k % 3 else 30) * MS)
+    flight = load_flight(f"rosbag:{path}", settings={"stamp": "both"})
+    vicon = flight.streams["vicon"]
+    assert sorted(vicon.stamp.tolist()) == [10**9 + k * 10 * MS for k in range(20)]
+    late = np.where(vicon["position"][:, 0] % 3 == 0, 30, 7) * MS
+    np.testing.assert_array_equal(vicon.time - vicon.stamp, np.maximum(late, vicon.time - vicon.stamp))
+    assert (np.abs(vicon.time - vicon.stamp - late) < 100).all()
+    assert (np.diff(vicon.time) > 0).all()
+    assert any(n.startswith("info: vicon: arrived 0.01") for n in flight.notes)
+    plain = load_flight(f"rosbag:{path}", settings={"bad_time": "sort"}).streams["vicon"]
+    assert not plain.is_late
+    assert (plain.time == np.sort(vicon.stamp)).all()
+    moved: Any = {"vicon.time_offset": "0.02", "stamp": "both"}
+    refused(path, "arrived before it was true", "vicon.time_offset", **moved)

@@ -71,7 +71,7 @@ def inputs(pushed: np.ndarray) -> dict[str, Series]:
 @pytest.mark.parametrize("motion", [SILENT, FALL])
 @pytest.mark.parametrize("method", [extended(), square_root(), unscented()])
 def test_after_a_gap_a_velocity_is_off_by_the_spread_times_the_gap(motion, method):
-    """Pushes come until 0.5 s. At an age T beyond `after`, the variance has grown by spread^2 (T^2 - after^2)."""
+    """Pushes end at 0.5 s. At an age T beyond `after` the variance has grown by spread^2 (T^2 - after^2)."""
     held = Ageing(after=0.1, spread=0.7)
     built = line.build(motion=motion, method=method, held=held)
     found = simulate(built, inputs(OFTEN[:11]))["output"]

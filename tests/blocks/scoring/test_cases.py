@@ -37,7 +37,8 @@ from flowgraph.blocks.scoring.cases import (
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import unbiased_factors
 from flowgraph.blocks.signals import Imu
-from flowgraph.data.registry import graph_names, parsed_settings, setting_names
+from flowgraph.data.registry import graph_names
+from flowgraph.data.settings import parsed_settings, setting_names
 from flowgraph.language.declare import GraphFunction
 
 UNIT = ImuNoise(0.01, 0.1, 0.0, 0.0)
@@ -114,7 +115,7 @@ def test_a_setting_that_is_not_there_is_refused_in_code_and_in_words():
         registered().case(a_flight(), gian=1.0)
     prepare = registered().prepare
     assert prepare is not None
-    assert setting_names(prepare) == ["gain", "settle", "gyro_range", "specific_force_range"]
+    assert setting_names(prepare) == ["gain", "settle", "gyro_range", "specific_force_range", "rewind"]
     with pytest.raises(UnknownNameError, match="did you mean 'gain'"):
         parsed_settings(prepare, {"gian": "1"}, also=(), path="doubled")
     with pytest.raises(DeclarationError, match="finite float"):

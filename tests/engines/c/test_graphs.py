@@ -19,6 +19,7 @@ SINGLE = {
     "ins_ukf_pose": 5e-3,
     "ins_ukf_velocity": 5e-3,
     "outdoor_eskf": 5e-3,
+    "gnss_ins": 5e-3,
     "complementary": 1e-3,
     "augmented_complementary": 1e-3,
     "orientation_complementary": 1e-3,

@@ -43,6 +43,7 @@ export class Space {
   private coloured: [{ color: Color }, string][] = [];
   private reading = html("p", { class: "words" });
   private waiting = false;
+  private here?: Points;
 
   constructor(readonly run: Run, readonly way: Way, beside?: Way) {
     this.times = unpack(way.t);
@@ -80,7 +81,10 @@ export class Space {
     box.computeBoundingSphere();
     const radius = Math.max(box.boundingSphere?.radius ?? 1, 1e-3), centre = box.boundingSphere?.center ?? new Vector3();
     this.body.scale.setScalar(radius * 0.3);
+    this.body.visible = this.attitude !== undefined;
     scene.add(this.body);
+    this.here = dots(this.path.subarray(0, 3), "wrong", 7);
+    this.here.visible = this.attitude === undefined;
     const step = 10 ** Math.floor(Math.log10(radius)), cells = Math.max(2, 2 * Math.ceil((1.3 * radius) / step));
     const grid = new GridHelper(cells * step, cells);
     box.computeBoundingBox();
@@ -99,6 +103,7 @@ export class Space {
     camera.far = radius * 60;
     this.controls = new OrbitControls(camera, renderer.domElement);
     this.controls.target.copy(centre);
+    this.controls.update();
     this.controls.addEventListener("change", () => this.ask());
     frame.addEventListener("keydown", (event) => this.turn(event, centre));
     new ResizeObserver(() => {
@@ -132,6 +137,7 @@ export class Space {
     const row = Math.max(before(this.times, t + 1e-6), 0);
     const place = this.path.subarray(3 * row, 3 * row + 3);
     this.body.position.fromArray(upright(place));
+    this.here?.position.fromArray(upright(place.map((x, k) => x - this.path[k])));
     if (this.attitude) {
       const [w, x, y, z] = this.attitude.subarray(4 * row, 4 * row + 4);
       // body to world, and from there into the scene, which is the world turned by -90 degrees about x

@@ -14,6 +14,18 @@ function partLine(part: Part, values: Float32Array): string {
   return `  ${part.name}: ${numbers.join(", ")}${unit}`;
 }
 
+/** All parts of a value, a line each. */
+export function lines(parts: Part[], values: Float32Array): string[] {
+  let place = 0;
+  return parts.map((part) => partLine(part, values.subarray(place, (place += part.size))));
+}
+
+/** The first numbers of a value, for a wire. */
+export function shortOf(parts: Part[], values: Float32Array): string {
+  const first = parts[0], some = Array.from(values.subarray(0, Math.min(first?.size ?? 0, 3)), (x) => short(x, 3));
+  return some.join(first?.way === "range" ? "…" : " ");
+}
+
 export class Watched {
   readonly times: Float32Array;
   private wires = new Map<string, Wire>();
@@ -40,16 +52,8 @@ export class Watched {
     if (!Number.isFinite(at)) return { short: "none yet", lines: ["nothing came yet"], fresh: false };
     const now = this.times[this.row];
     const values = wire.values.subarray(this.row * wire.size, (this.row + 1) * wire.size);
-    const lines: string[] = [];
-    let place = 0;
-    for (const part of wire.parts) {
-      lines.push(partLine(part, values.subarray(place, place + part.size)));
-      place += part.size;
-    }
     const age = now - at, fresh = age < 1e-5;
     const when = fresh ? `at ${now.toFixed(3)} s:` : `at ${now.toFixed(3)} s, from ${(1e3 * age).toPrecision(3)} ms before:`;
-    const first = wire.parts[0];
-    const some = Array.from(values.subarray(0, Math.min(first?.size ?? 0, 3)), (x) => short(x, 3)).join(" ");
-    return { short: first?.way === "range" ? some.replace(" ", "…") : some, lines: [when, ...lines], fresh };
+    return { short: shortOf(wire.parts, values), lines: [when, ...lines(wire.parts, values)], fresh };
   };
 }

@@ -1,0 +1,260 @@
+"""When a value arrives and when it was true, which are two times wherever there is a wire between.
+
+A `Series` has both: `time`, at which its values arrive and make ticks, and `stamp`, when they were true. Here
+is what makes the one of the other. A graph that asks for the stamps of a source (`stamp_of`) has a second
+source beside it, `NAME.stamp`, which is filled from the series; nobody else pays for it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.notes import note
+from flowgraph.data.series import Flight, Series
+from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.language.clock import nanoseconds
+from flowgraph.language.graph import NEVER
+from flowgraph.language.stamps import STAMP
+
+__all__ = [
+    "LATENCY",
+    "Reordered",
+    "batched",
+    "delayed",
+    "delayed_flight",
+    "reorder",
+    "replayed",
+    "stamp_events",
+    "timeouts",
+    "with_stamps",
+]
+
+LATENCY = ".latency"
+"""How the setting of a flight ends that delays a stream: `leica.latency=0.135`."""
+
+
+def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = None) -> Series:
+    """The values of a series as they arrive later; each keeps the stamp at which it was true.
+
+    Values that overtake others come in the order of their arrival. Two that would arrive together arrive
+    1 ns apart, as two events of one source cannot have one time.
+
+    Args:
+        series: what is delayed; one that is delayed already is delayed further.
+        latency: a duration such as "135ms"; a pair of them, between which each value's own is drawn; or (n,)
+            integer nanoseconds.
+        seed: of what is drawn.
+        name: of the new series; as before if left out.
+
+    Raises:
+        DeclarationError: for a latency below 0, or a pair in the wrong order.
+    """
+    called = name or series.name
+    if isinstance(latency, tuple) and len(latency) == 2:
+        low, high = (nanoseconds(part, what="latency") for part in latency)
+        key = np.random.SeedSequence([seed, zlib.crc32(f"{called}{LATENCY}".encode())])
+        share = np.random.Generator(np.random.Philox(key)).uniform(size=len(series))
+        by = low + np.rint(share * (high - low)).astype(np.int64)
+    elif isinstance(latency, np.ndarray):
+        by, low, high = latency.astype(np.int64), int(latency.min(initial=0)), int(latency.max(initial=0))
+    else:
+        low = high = nanoseconds(latency, what="latency")
+        by = np.full(len(series), low, np.int64)
+    if not 0 <= low <= high or by.shape != series.time.shape:
+        raise DeclarationError(
+            "this is no latency",
+            path=called,
+            expected='0 ns or more: "135ms", a pair ("0ms", "500ms"), or one a value',
+            got=repr(latency)[:80],
+            fix='write delayed(series, "135ms")',
+        )
+    arrival = series.time + by
+    order = np.argsort(arrival, kind="stable")
+    moved, stamp = series[order], series.stamp[order]
+    time = moved.time + by[order]
+    if len(time):  # each after the one before: t_k >= t_j + (k - j)
+        count = np.arange(len(time))
+        time = np.maximum.accumulate(time - count) + count
+    return Series(time, moved.values, type=series.type, name=called, gaps=series.gaps, stamp=stamp)
+
+
+def delayed_flight(flight: Flight, settings: Mapping[str, Any], *, seed: int = 0) -> Flight:
+    """A flight whose streams arrive as settings say: `STREAM.latency`, seconds, or LOW:HIGH for random ones.
+
+    Raises:
+        DeclarationError: for a text that is no latency. UnknownNameError: for a stream that is not there.
+    """
+    streams, said = dict(flight.streams), []
+    for key, given in settings.items():
+        name = key.removesuffix(LATENCY)
+        if name not in streams:
+            raise UnknownNameError("stream", name, streams, path=f"{flight.name}.{key}")
+        bounds = _seconds(key, given)
+        streams[name] = delayed(streams[name], bounds if len(bounds) == 2 else bounds[0], seed=seed)
+        text = " to ".join(f"{b * 1e-9:g}" for b in bounds)
+        said.append(note("info", f"{name}: each value arrives {text} s after it was true"))
+    return replace(flight, streams=streams, notes=(*flight.notes, *said))
+
+
+def _seconds(key: str, given: Any) -> tuple[int, ...]:
+    """Nanoseconds, one or two, of "0.135" or "0:0.5"."""
+    try:
+        found = tuple(round(float(part) * 1e9) for part in str(given).split(":"))
+        if len(found) > 2 or "_" in str(given) or not 0 <= found[0] <= found[-1] < 10**15:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise DeclarationError(
+            f"setting {key!r} is not usable",
+            path=key,
+            expected="seconds, 0 or more; or LOW:HIGH, between which each value's own is drawn",
+            got=repr(given),
+            fix=f"for example {key}=0.135",
+        ) from None
+    return found
+
+
+class Reordered(dict[str, Series]):
+    """Streams in order of their stamps; `late` says how many of each came too late, and are left out."""
+
+    late: dict[str, int]
+
+
+def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
+    """Streams held back until they are in order: each value makes its tick `max_lag` after it was true.
+
+    Ticks are as far apart as the stamps, so `dt` is right; what a graph then knows is `max_lag` old. A value
+    that arrives later than that is left out and counted. Of two values of one stream with one stamp the
+    first that arrived is kept, and the other counted.
+
+    Args:
+        inputs: series, or (times, values), by name; those that are not late are held back as well.
+        max_lag: a duration such as "0.2s".
+
+    Raises:
+        DeclarationError: for one below 0.
+    """
+    lag = nanoseconds(max_lag, what="max_lag")
+    if lag < 0:
+        raise DeclarationError(
+            "nothing can be held back for less than no time",
+            path="reorder",
+            expected="0 ns or more",
+            got=repr(max_lag),
+            fix='write reorder(inputs, "0.2s")',
+        )
+    made = Reordered()
+    made.late = {}
+    for name, given in inputs.items():
+        series = given if isinstance(given, Series) else Series(*given, name=name)
+        kept = series[series.time - series.stamp <= lag]
+        kept = kept[np.argsort(kept.stamp, kind="stable")]
+        kept = kept[np.concatenate([[True], np.diff(kept.stamp) > 0])[: len(kept)]]
+        made[name] = Series(
+            kept.stamp + lag,
+            kept.values,
+            type=series.type,
+            name=series.name,
+            gaps=series.gaps,
+            stamp=kept.stamp,
+        )
+        made.late[name] = len(series) - len(kept)
+    return made
+
+
+def timeouts(series: Series, after: Any, *, until: int | None = None, name: str = "timeouts") -> Series:
+    """A source of the times at which a stream had not come for `after`: true, once in each silence.
+
+    Args:
+        series: the stream.
+        after: a duration such as "0.5s".
+        until: int64 ns, the last time at which it is looked; that of the last value, if left out.
+    """
+    span = nanoseconds(after, what="after")
+    end = int(series.time[-1]) if until is None and len(series) else until
+    nexts = np.append(series.time[1:], np.int64(2**63 - 1))
+    due = series.time + span
+    silent = due[(due < nexts) & (due <= (NEVER if end is None else end))]
+    return Series(silent, np.ones(len(silent), bool), name=name)
+
+
+def batched(series: Series, function: Callable[[Any], Any], *, name: str | None = None) -> Series:
+    """What a function makes of a whole recording at once: a value for each of its values, at their times.
+
+    Args:
+        series: the recording.
+        function: of all values, with the time axis in front, to as many.
+    """
+    return Series(series.time, function(series.values), name=name or series.name, gaps=series.gaps)
+
+
+def replayed(series: Series, *, start: int, name: str | None = None) -> Series:
+    """A recording as it is played again: its first value arrives at `start`, int64 ns, all else as far apart.
+
+    What a run gave, or what `batched` made of it, so becomes a source of another run, or later of the same.
+    """
+    by = int(start) - int(series.time[0]) if len(series) else 0
+    stamp = series.stamp + by if series.is_late else None
+    return Series(
+        series.time + by,
+        series.values,
+        type=series.type,
+        name=name or series.name,
+        gaps=series.gaps,
+        stamp=stamp,
+    )
+
+
+def with_stamps(sources: Iterable[str], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was given, and the stamps of those sources of which a graph asks for them.
+
+    Raises:
+        DataError: for a source whose events are read as they go, since their stamps have to be given too.
+    """
+    found = dict(given)
+    for name in sources:
+        base = name.removesuffix(STAMP)
+        if name == base or name in found or base not in found:
+            continue
+        value = found[base]
+        if isinstance(value, tuple) and len(value) == 2:
+            found[base] = value = Series(value[0], value[1], name=base)
+        if not isinstance(value, Series):
+            raise DataError(
+                f"this graph asks when the values of {base!r} were true",
+                path=name,
+                expected="a Series, which has stamps, or a source of stamps beside the values",
+                got=type(value).__name__,
+                fix=f"write Series(time, values, stamp=...), or give {name!r} too",
+            )
+        found[name] = Series(value.time, value.stamp, name=name)
+    return found
+
+
+def stamp_events(sources: Iterable[str], time: int, values: dict[str, Any]) -> None:
+    """Add to the events of one live tick the stamps that were left out: what arrives is true now.
+
+    Raises:
+        DataError: for a stamp without its value, or after the tick.
+    """
+    for name in sources:
+        base = name.removesuffix(STAMP)
+        if name == base:
+            continue
+        if base in values:
+            values.setdefault(name, time)
+        stamp = values.get(name, time)
+        if (name in values and base not in values) or not stamp <= time:
+            raise DataError(
+                "a stamp comes without its value"
+                if base not in values
+                else "a value was true after it arrived",
+                path=name,
+                expected=f"with a value of {base!r}, a time up to that of the tick, {time} ns",
+                got=f"{stamp} ns",
+                fix="push both in one call",
+            )

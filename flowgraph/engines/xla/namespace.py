@@ -1,0 +1,104 @@
+"""The array API of `jax.numpy` as pipelines need it: their own operations, and what they define further."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flowgraph.recorder import ranges
+from flowgraph.recorder.ops import OPS, bound_attrs
+from flowgraph.recorder.replay import Case, body_of
+
+
+class JaxLinearAlgebra:
+    """`jax.numpy.linalg`, where a singular matrix gives NaN throughout, as in the other engines."""
+
+    def __init__(self, jax: Any) -> None:
+        self._jax = jax
+
+    def cholesky(self, x: Any) -> Any:
+        jnp = self._jax.numpy
+        lower = jnp.linalg.cholesky(x)
+        last = lower[..., -1:, -1:]  # NaN where a pivot was not positive
+        return jnp.where(jnp.isnan(last), last, lower)
+
+    def solve(self, a: Any, b: Any) -> Any:
+        jnp = self._jax.numpy
+        x = jnp.linalg.solve(a, b)
+        axes = -1 if b.ndim == 1 else (-2, -1)
+        fits = jnp.isfinite(a).all(axis=(-2, -1)) & jnp.isfinite(b).all(axis=axes)
+        singular = fits & ~jnp.isfinite(x).all(axis=axes)
+        return jnp.where(singular[..., None] if b.ndim == 1 else singular[..., None, None], jnp.nan, x)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jax.numpy.linalg, name)
+
+
+class JaxNamespace:
+    """`jax.numpy` with the operations that pipelines add to it or define further, and a faster `take`."""
+
+    def __init__(self, jax: Any) -> None:
+        self._jax = jax
+        self.linalg = JaxLinearAlgebra(jax)
+
+    def float32_bits(self, x: Any) -> Any:
+        jnp = self._jax.numpy
+        return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
+
+    def floor_divide(self, a: Any, b: Any) -> Any:
+        return ranges.floor_divide(self._jax.numpy, a, b)
+
+    def remainder(self, a: Any, b: Any) -> Any:
+        return ranges.remainder(self._jax.numpy, a, b)
+
+    def materialise(self, x: Any) -> Any:
+        return self._jax.lax.optimization_barrier(x)
+
+    def take(self, x: Any, indices: Any, *, axis: int = 0, mode: str = "clip") -> Any:
+        """`jnp.take`, along the last axis from a flat array.
+
+        For a gather of columns XLA lays the whole array out column by column, and as a scan carries it, every
+        tick that does not gather then pays for the change to and fro.
+        """
+        jnp = self._jax.numpy
+        x = jnp.asarray(x)
+        if x.ndim == 1 or axis % x.ndim != x.ndim - 1 or not x.size:
+            return jnp.take(x, indices, axis=axis, mode=mode)
+        n = x.shape[-1]
+        starts = np.arange(0, x.size, n, dtype=np.int32 if x.size < 2**31 else np.int64)
+        column = jnp.clip(jnp.asarray(indices), 0, n - 1).astype(starts.dtype)
+        at = starts.reshape(*x.shape[:-1], *(1,) * column.ndim) + column
+        return jnp.take(x.reshape(-1), at, axis=0, mode=mode)
+
+    def replay(self, history: Any, rows: Any, first: Any, count: Any, *, body: Any) -> Any:
+        """The history (N, k) after `count` turns from place `first` of the ring on."""
+        lax, jnp = self._jax.lax, self._jax.numpy
+        places, cases = history.shape[0], [partial(self._turn, case) for case in body_of(body).cases]
+        first, count = jnp.mod(first, places), jnp.clip(count, 0, places)
+
+        def turn(k: Any, now: Any) -> Any:
+            at = jnp.mod(first + k, places)
+            before, row = now[jnp.mod(at - 1, places)], rows[at]
+            if len(cases) == 1:
+                after = cases[0](before, row)
+            else:
+                which = jnp.clip(row[0].astype(jnp.int32), 0, len(cases) - 1)
+                after = lax.switch(which, cases, before, row)
+            return lax.dynamic_update_index_in_dim(now, after, at, 0)
+
+        return lax.fori_loop(jnp.int32(0), count.astype(jnp.int32), turn, history)
+
+    def _turn(self, case: Case, before: Any, row: Any) -> Any:
+        jnp, real = self._jax.numpy, before.dtype
+        values: dict[int, Any] = {0: before, 1: row}
+        for n, array in case.constants.items():
+            values[n] = jnp.asarray(array.astype(real) if array.dtype.kind == "f" else array)
+        for t in case.turns:
+            args = (values[a] for a in t.args)
+            values[t.out] = OPS[t.op].run(self, *args, **bound_attrs(t.op, t.attrs, real))
+        return values[case.result]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jax.numpy, name)

@@ -1,0 +1,178 @@
+"""Calibration: when a sensor was read, where it sits and how it is turned, by the likelihood of a filter.
+
+A time offset moves events past each other, so a likelihood has steps in it, as fine as the periods of the
+sensors. It is therefore begun where two streams see the same motion (`guess`), or at the best of a grid, and
+then read off a parabola over points that no period divides; how far the points lie from it is part of its
+deviation. Levers, mounts and noises are smooth, and are found as by `tune`. Both are done in turn, until the
+offsets stay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.notes import note
+from flowgraph.errors import UnknownNameError
+from flowgraph.study.coordinates import Coordinates, Fit, Parameter
+from flowgraph.study.guess import Guess, guess_offset
+from flowgraph.study.search import Search
+from flowgraph.study.spec import Value
+from flowgraph.study.trials import Recording, Trials
+from flowgraph.study.tune import MEASURES, check_fits, placed, start_of_fit
+
+__all__ = ["Calibrated", "calibrate"]
+
+OFFSET = "time_offset"
+_POINTS, _WIDTHS = 13, (0.03, 0.02)
+"""Of a parabola, and how far it reaches to both sides, s: first and then."""
+
+_GRID = 11
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What was found.
+
+    Args:
+        graph: its name.
+        parameters, deviations: by name.
+        evaluations: how many points were tried.
+        guesses: of the offsets, where two streams told of the same motion.
+        notes: what should be known of it.
+    """
+
+    graph: str
+    parameters: dict[str, Parameter]
+    deviations: dict[str, Any]
+    evaluations: int
+    guesses: dict[str, Guess]
+    notes: tuple[str, ...]
+
+
+def calibrate(
+    graph: str,
+    fits: Sequence[Fit],
+    recordings: Sequence[Recording],
+    *,
+    measure: str = "likelihood",
+    metric: str | None = None,
+    settings: Mapping[str, Value] | None = None,
+    engine: str = "reference",
+    most: int = 200,
+    watch: Callable[[int, Mapping[str, Parameter], float], None] | None = None,
+) -> Calibrated:
+    """Find offsets, levers, mounts and whatever else `tune` can find by likelihood.
+
+    Args:
+        graph: its name.
+        fits: what to find; STREAM.time_offset (s), STREAM.lever (m), STREAM.mount (rotation vector, degrees)
+            between bounds, each component; or a noise.
+        recordings: to fit to.
+        measure: "likelihood", or "error" against the truth, whose clock an offset is then of.
+        metric, settings, engine, most, watch: as of `tune`.
+
+    Raises:
+        UnknownNameError, DeclarationError: for what cannot be asked.
+        DataError: where the graph collects no innovations, or a loader refuses.
+    """
+    settings = dict(settings or {})
+    fits = [replace(f, scale="linear") if placed(f.name) else f for f in fits]
+    if measure not in MEASURES:
+        raise UnknownNameError("measure", measure, MEASURES, path="calibrate")
+    check_fits(graph, fits, recordings, (), settings)
+    problem = Trials(graph, recordings, settings, measure, metric, engine)
+    offsets = [f for f in fits if f.name.rpartition(".")[2] == OFFSET]
+    others = [f for f in fits if f not in offsets]
+    found: dict[str, Parameter] = {f.name: start_of_fit(graph, f) for f in fits}
+    tried = _Tried(problem, watch)
+    notes: list[str] = []
+    guesses: dict[str, Guess] = {}
+    for f in offsets:
+        stream = f.name.rpartition(".")[0]
+        told = [guess_offset(flight, stream, f.low, f.high) for flight in problem.flights]
+        known = [g for g in told if g is not None and g.sure]
+        if known:
+            guesses[f.name] = known[0]
+            found[f.name] = float(np.mean([g.offset for g in known]))
+            said = f"{f.name}: begun at {found[f.name]:.4g} s, by {known[0].by}"
+            notes.append(note("info", f"{said}, whose correlation is {known[0].correlation:.3f} there"))
+        else:
+            grid = np.linspace(f.low, f.high, _GRID)
+            found[f.name] = float(grid[int(tried.along(f.name, grid, found).argmin())])
+    deviations: dict[str, Any] = {}
+    widths = _WIDTHS if offsets else (0.0,)
+    for width in widths:
+        for f in offsets:
+            value, deviations[f.name], inside = _vertex(f, width, found, tried)
+            found[f.name] = value
+            if not inside and width == widths[-1]:
+                notes.append(
+                    note("warning", f"{f.name}: the {measure} has no peak near {value:.4g} s: it is a guess")
+                )
+        if others:
+            fixed = {f.name: found[f.name] for f in offsets}
+            held = problem.at(fixed)
+            search = Search(
+                held, Coordinates(others, {f.name: found[f.name] for f in others}),
+                range(len(recordings)), forward=True,
+            )  # fmt: skip
+            ended = search.run("L-BFGS-B", most, watch)
+            found |= ended.parameters
+            deviations |= ended.deviations or dict.fromkeys(ended.parameters)
+            tried.count += ended.evaluations
+            if width == widths[-1]:
+                ends = ended.at_bound.items()
+                notes += [note("warning", f"{n} ended at its {side} bound: widen it") for n, side in ends]
+    return Calibrated(graph, found, deviations, tried.count, guesses, tuple(dict.fromkeys(notes)))
+
+
+class _Tried:
+    """The measure over all recordings, counted."""
+
+    def __init__(self, problem: Trials, watch: Any) -> None:
+        self.problem, self.count, self._watch = problem, 0, watch
+        self._places = range(len(problem.recordings))
+
+    def along(self, name: str, values: np.ndarray, rest: Mapping[str, Parameter]) -> np.ndarray:
+        """The mean measure (n,) at values of one parameter, the others as they are."""
+        found = []
+        for value in values:
+            point = {**rest, name: float(value)}
+            found.append(float(self.problem.measured([point], self._places).mean()))
+            self.count += 1
+            if self._watch is not None:
+                self._watch(self.count, point, found[-1])
+        return np.array(found)
+
+    def counted(self, point: Mapping[str, Parameter]) -> float:
+        """How many numbers were measured."""
+        return sum(self.problem.values_at(place, point) for place in self._places)
+
+
+def _vertex(
+    f: Fit, width: float, found: Mapping[str, Parameter], tried: _Tried
+) -> tuple[float, float | None, bool]:
+    """Where a parabola through the measure has its least, its deviation, and whether it has one there."""
+    middle = float(found[f.name])  # type: ignore[arg-type]
+    width = min(width, 0.5 * (f.high - f.low))
+    middle = min(max(middle, f.low + width), f.high - width)
+    steps = np.linspace(-1.0, 1.0, _POINTS) * width
+    values = tried.along(f.name, middle + steps, found)
+    best = float(middle + steps[int(values.argmin())])
+    try:
+        p, spread = np.polyfit(steps, values, 2, cov=True)
+    except (np.linalg.LinAlgError, ValueError):
+        return best, None, False
+    if not p[0] > 0.0 or not abs(p[1] / (2.0 * p[0])) <= width:
+        return best, None, False
+    vertex = -p[1] / (2.0 * p[0])
+    J = np.array([p[1] / (2.0 * p[0] ** 2), -1.0 / (2.0 * p[0])])
+    rough = float(J @ spread[:2, :2] @ J)
+    if tried.problem.measure == "likelihood":  # of an error the curve tells no probability
+        rough += 1.0 / (2.0 * p[0] * max(tried.counted({**found, f.name: middle + vertex}), 1.0))
+    return float(middle + vertex), math.sqrt(rough), True

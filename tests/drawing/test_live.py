@@ -1,0 +1,191 @@
+"""The server of a live run: whom it lets in, what it sends, and that it waits for nobody."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import OutputError
+from flowgraph.drawing import live
+from flowgraph.drawing.live import LiveServer, Sender, frame, live_page
+from flowgraph.engines.watched import simulate_watched
+from tests.drawing.test_page import _Reader
+from tests.engines.test_watched import INPUTS, built
+
+
+@pytest.fixture
+def server() -> Iterator[LiveServer]:
+    with LiveServer(lambda host: f"<p>{host}</p>") as made:
+        yield made
+
+
+def asked(server: LiveServer, path: str = "/", **headers: str) -> tuple[int, str]:
+    """Status and body of an answer."""
+    with connection(server, path, **headers) as connected:
+        answer = b""
+        while part := connected.recv(65_536):
+            answer += part
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]), body.decode()
+
+
+def connection(server: LiveServer, path: str, **headers: str) -> socket.socket:
+    lines = {
+        "Host": server.hosts[0],
+        "Connection": "close",
+        **{k.replace("_", "-"): v for k, v in headers.items()},
+    }
+    made = socket.create_connection(("127.0.0.1", server.port), timeout=10)
+    text = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    made.sendall(f"GET {path} HTTP/1.1\r\n{text}\r\n".encode())
+    return made
+
+
+class Viewer:
+    """A browser's end of a WebSocket."""
+
+    def __init__(self, server: LiveServer, **headers: str) -> None:
+        key = base64.b64encode(os.urandom(16)).decode()
+        given = {
+            "Origin": server.url[:-1], "Upgrade": "websocket", "Connection": "Upgrade",
+            "Sec_WebSocket_Key": key, "Sec_WebSocket_Version": "13", **headers,
+        }  # fmt: skip
+        self.file = connection(server, "/live", **given).makefile("rwb")
+        self.status = int(self.file.readline().split()[1])
+        self.headers = {}
+        while line := self.file.readline().strip():
+            name, _, value = line.decode().partition(": ")
+            self.headers[name] = value
+
+    def next(self) -> tuple[int, bytes]:
+        head = self.file.read(2)
+        size = head[1]
+        if size == 126:
+            (size,) = struct.unpack(">H", self.file.read(2))
+        elif size == 127:
+            (size,) = struct.unpack(">Q", self.file.read(8))
+        return head[0] & 0x0F, self.file.read(size)
+
+    def message(self) -> Any:
+        kind, text = self.next()
+        assert kind == 1
+        return json.loads(text)
+
+    def send(self, kind: int, payload: bytes = b"") -> None:
+        mask = b"abcd"
+        masked = bytes(b ^ mask[k % 4] for k, b in enumerate(payload))
+        self.file.write(bytes([0x80 | kind, 0x80 | len(payload)]) + mask + masked)
+        self.file.flush()
+
+
+def test_the_page_is_for_this_machine_only(server: LiveServer) -> None:
+    assert asked(server) == (200, f"<p>127.0.0.1:{server.port}</p>")
+    assert asked(server, Host=f"localhost:{server.port}")[0] == 200
+    assert asked(server, "/other")[0] == 404
+    assert server._server.server_address[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "[::1]:{port}"]
+)
+@pytest.mark.parametrize("path", ["/", "/live"])
+def test_other_hosts_are_refused(host: str, path: str, server: LiveServer) -> None:
+    status, body = asked(server, path, Host=host.format(port=server.port), Origin=server.url[:-1])
+    assert (status, body) == (403, "this server is for the machine it runs on\n")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "https://127.0.0.1:{port}", "null", "http://127.0.0.1:1"]
+)
+def test_other_origins_are_refused(origin: str, server: LiveServer) -> None:
+    given = origin.format(port=server.port)
+    assert asked(server, Origin=given)[0] == 403
+    assert Viewer(server, Origin=given).status == 403
+    assert server.wait(True, 0.05) is False  # nobody was let in
+
+
+def test_a_socket_must_be_one_and_say_where_it_comes_from(server: LiveServer) -> None:
+    assert asked(server, "/live")[0] == 403
+    assert asked(server, "/live", Origin=server.url[:-1])[0] == 400
+
+
+def test_the_handshake_is_that_of_the_standard(server: LiveServer) -> None:
+    viewer = Viewer(server, Sec_WebSocket_Key="dGhlIHNhbXBsZSBub25jZQ==")
+    assert viewer.status == 101
+    assert viewer.headers["Sec-WebSocket-Accept"] == "s3pPLMBiTxaQ9kYGzzhZRbK+xOo="  # RFC 6455, sec. 1.3
+
+
+def test_messages_of_every_length_arrive_and_the_late_get_the_last(server: LiveServer) -> None:
+    server.send("before")
+    viewer = Viewer(server)
+    assert viewer.message() == "before"
+    for size in (0, 125, 126, 65_535, 70_000):
+        server.send("x" * size)
+        assert viewer.message() == "x" * size
+    viewer.send(9, b"still there?")
+    assert viewer.next() == (10, b"still there?")
+    assert server.wait(True, 1.0)
+    viewer.send(8)
+    assert server.wait(False, 5.0)
+    assert frame(b"abc") == b"\x81\x03abc"
+
+
+def test_a_viewer_that_does_not_read_does_not_hold_up_the_run(server: LiveServer) -> None:
+    silent = Viewer(server)
+    assert silent.status == 101
+    assert server.wait(True, 5.0)
+    start = time.monotonic()
+    for _ in range(3000):
+        server.send("x" * 2000)
+    assert time.monotonic() - start < 5.0
+
+
+def test_the_end_says_goodbye() -> None:
+    with LiveServer(lambda host: "") as server:
+        viewer = Viewer(server)
+        assert server.wait(True, 5.0)
+    assert viewer.next() == (8, struct.pack(">H", 1001))
+
+
+def test_a_port_that_is_taken(server: LiveServer) -> None:
+    with pytest.raises(OutputError):
+        LiveServer(lambda host: "", server.port)
+
+
+def test_a_run_is_sent_as_it_is(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "EVERY", 0.0)
+    viewer = Viewer(server)
+    one = built()
+    result = simulate_watched(one, INPUTS, Sender(server, one, INPUTS, speed=0))
+    index = [node.path for node in one.nodes].index("total")
+    got = [viewer.message() for _ in range(result.ticks)]
+    assert [m["ticks"] for m in got] == list(range(1, result.ticks + 1))
+    sums = [m["wires"][f"{index}.0"] for m in got]
+    assert [at for at, _ in sums] == [m["t"] for m in got]
+    both = np.array([value[0] for _, value in sums])
+    before = np.array([10.0, *both[:-1]])
+    np.testing.assert_allclose(both + before, result["both"]["value"])
+    assert viewer.message()["ended"] is True
+
+
+def test_a_run_keeps_to_the_time(server: LiveServer) -> None:
+    start = time.monotonic()
+    simulate_watched(built(), INPUTS, Sender(server, built(), INPUTS, speed=0.1))
+    assert 0.25 <= time.monotonic() - start < 5.0  # 25 ms of events
+
+
+def test_the_page_may_connect_to_its_server_alone() -> None:
+    reader = _Reader(live_page(built(), INPUTS, "a title")("127.0.0.1:4321"))
+    policy = next(a["content"] for tag, a in reader.tags if tag == "meta" and "http-equiv" in a)
+    assert policy is not None
+    assert policy.endswith("connect-src ws://127.0.0.1:4321")
+    assert "total" in [node["path"] for node in reader.data("graph")["nodes"] if node]
