@@ -44,7 +44,9 @@ if _TYPE_CHECKING:
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight, Series
+    from flowgraph.engines.live import Live
     from flowgraph.engines.many import simulate_many
+    from flowgraph.engines.options import Checkpoint
     from flowgraph.engines.python.run import Run
     from flowgraph.engines.simulate import simulate
     from flowgraph.engines.state import load_state, save_state
@@ -75,6 +77,8 @@ _LATER = {
     "Flight": "flowgraph.data.series",
     "Series": "flowgraph.data.series",
     "simulate_many": "flowgraph.engines.many",
+    "Live": "flowgraph.engines.live",
+    "Checkpoint": "flowgraph.engines.options",
     "Run": "flowgraph.engines.python.run",
     "simulate": "flowgraph.engines.simulate",
     "load_state": "flowgraph.engines.state",
@@ -121,6 +125,7 @@ __all__ = [
     "Batch",
     "Block",
     "Case",
+    "Checkpoint",
     "ClockError",
     "CycleError",
     "DataError",
@@ -131,6 +136,7 @@ __all__ = [
     "FlowgraphError",
     "Graph",
     "Held",
+    "Live",
     "LoweringError",
     "MissingDependencyError",
     "OutputError",

@@ -30,6 +30,7 @@ from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import correct as correct_jointly
 from flowgraph.blocks.kalman.filters import moved, where_any
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.roots import correct_root
 from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, GaussianRoot, KalmanInnovation
@@ -91,6 +92,7 @@ class Extended(GaussianMethod):
     """The extended Kalman filter; see `extended`."""
 
     iterations: int = 1
+    robust: Robust | None = None
 
     def predicted(self, kept: Gaussian, control: Any, motion: Motion, dt: Any, xp: Any) -> Gaussian:
         mean, F, Q = motion.linearised(kept.mean, control, dt, xp)
@@ -113,11 +115,15 @@ class Extended(GaussianMethod):
             present = ~xp.isnan(apart)
             residual = xp.where(present, apart, 0.0)
             if k == 0:
-                found = correct_jointly(P, residual, H, R, present=present, gate=gate, space=space, xp=xp)
+                found = correct_jointly(
+                    P, residual, H, R, present=present, gate=gate, space=space, robust=self.robust, xp=xp
+                )
                 innovation = found.innovation
             else:
                 residual = residual + xp.where(present, (H @ d[..., None])[..., 0], 0.0)
-                found = correct_jointly(P, residual, H, R, present=present, space=space, xp=xp)
+                found = correct_jointly(
+                    P, residual, H, R, present=present, space=space, robust=self.robust, xp=xp
+                )
             d = found.shift
         covariance = found.covariance
         if self.iterations > 1:  # what was refused at first is refused

@@ -23,6 +23,7 @@ from flowgraph.blocks.filtering.gaussian import (
     Unscented,
 )
 from flowgraph.blocks.kalman.lost import find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import CrossCovariance, Gaussian, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, SigmaPoints
@@ -237,14 +238,15 @@ def linear() -> Method:
     return GaussianFilter(Linear())
 
 
-def extended(*, iterations: int = 1) -> Method:
+def extended(*, iterations: int = 1, robust: Robust | None = None) -> Method:
     """The extended Kalman filter: the model linearised where the belief is, by its own derivatives.
 
     Args:
         iterations: how often a measurement is linearised: once, at the prediction; or again at the state
             that came of it, which helps where a measurement is sharp and curved.
+        robust: `huber()` or `student_t()`: a measurement counts for less that is far off.
     """
-    return GaussianFilter(Extended(_at_least_one(iterations)))
+    return GaussianFilter(Extended(_at_least_one(iterations), robust))
 
 
 def square_root() -> Method:

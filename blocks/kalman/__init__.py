@@ -3,9 +3,10 @@
 `linear` is motion in continuous time and its exact steps over any dt. `filters` predicts and corrects with
 it, in Joseph form, with gates and with missing entries; its extended form takes any function of the state and
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
-for controls that do not come and gates that do not open. `smoothing` goes back over a run and adds to each
-state what later measurements say of it; `backward` is that as a graph, and `learning` finds the linear model
-that explains a recording. What moves and what is measured is not said here: see `models`.
+for controls that do not come and gates that do not open, `robust` for outliers, and `learned` for a noise
+that nobody knows. `smoothing` goes back over a run and adds to each state what later measurements say of it;
+`backward` is that as a graph, and `learning` finds the linear model that explains a recording. What moves and
+what is measured is not said here: see `models`.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from flowgraph.blocks.kalman.filters import (
     update_extended,
     update_linear,
 )
+from flowgraph.blocks.kalman.learned import learned_noise, update_learned
 from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import (
@@ -44,6 +46,7 @@ from flowgraph.blocks.kalman.lost import (
     stay,
 )
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
+from flowgraph.blocks.kalman.robust import Robust, huber, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import (
     Steps,
@@ -60,6 +63,11 @@ from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semid
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "Robust",
+    "huber",
+    "student_t",
+    "learned_noise",
+    "update_learned",
     "Crossing",
     "gone_back",
     "noise_matrix",

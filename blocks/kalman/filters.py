@@ -24,6 +24,7 @@ from flowgraph import Array, block, real, when
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
+from flowgraph.blocks.kalman.robust import Robust, reweighted
 from flowgraph.blocks.metrics.chi_square import gate_table
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
@@ -84,6 +85,7 @@ def update_linear(
     space: StateSpace | None = None,
     measured_space: StateSpace | None = None,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with z = H x + noise, where there is a measurement; without one the prior passes through.
@@ -106,6 +108,7 @@ def update_linear(
             with which an honest one passes, such as 0.999; from 1 on the largest nis of a whole measurement,
             as `chi_square_gate` gives it, and where entries are missing one of the same probability
             (`gate_table`).
+        robust: when given, `huber()` or `student_t()`, a measurement counts for less that is far off.
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -121,7 +124,7 @@ def update_linear(
     m, n = measured.shape[-1], prior.mean.shape[-1]
     H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
 
 
 @block
@@ -134,6 +137,7 @@ def update_extended(
     space: StateSpace | None = None,
     measured_space: StateSpace | None = None,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """`update_linear` with a measurement that is any function of the state: z = h(x) + noise.
@@ -143,14 +147,14 @@ def update_extended(
             tangent vectors of `space` and `measured_space`, at x.
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z, of any parts.
-        prior, measured, gate: as in `update_linear`.
+        prior, measured, gate, robust: as in `update_linear`.
 
     Source: Bar-Shalom et al. sec. 10.3.3; on manifolds Hertzberg et al. 2013, sec. 4.
     """
     if measured is None:
         return prior, None
     predicted, H = observe(prior.mean, xp)
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
 
 
 def correct(
@@ -162,6 +166,7 @@ def correct(
     present: Array | None = None,
     gate: float | None = None,
     space: Resets | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> Correction:
     """The correction that every Kalman filter shares, linear or extended, in Joseph form.
@@ -172,7 +177,7 @@ def correct(
         H: Jacobian (..., m, t).
         R: covariance of the noise (..., m, m).
         present: (..., m) which entries there are; None: all.
-        gate: as in `update_linear`.
+        gate, robust: as in `update_linear`. The innovation is that of the noise as it was told.
         space: of the state, or what else says how the error turns when the state is corrected.
     """
     if present is None:
@@ -185,6 +190,10 @@ def correct(
     solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
+    parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
+    if robust is not None:
+        R = reweighted(robust, HP @ H.mT, residual, R, parts, xp)
+        solved = xp.linalg.solve(HP @ H.mT + R, xp.concat([HP, column], axis=-1))
     K = solved[..., :-1].mT
     if gate is not None:
         K = K * xp.astype(accepted, P.dtype)[..., None, None]
@@ -199,7 +208,7 @@ def correct(
         residual=residual,
         covariance=S,
         nis=nis,
-        parts=xp.sum(xp.astype(present, P.dtype), axis=-1),
+        parts=parts,
         accepted=accepted,
     )
     return Correction(shift, _symmetric(rest @ P @ rest.mT + K @ R @ K.mT), innovation)
@@ -207,11 +216,14 @@ def correct(
 
 def _update(
     prior: Gaussian, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
-    space: StateSpace | None, measured_space: StateSpace | None, gate: float | None, xp: Any,
+    space: StateSpace | None, measured_space: StateSpace | None, gate: float | None,
+    robust: Robust | None, xp: Any,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
     residual, present = innovate(measured, predicted, measured_space, xp)
     noise = noise_matrix(R, residual.shape[-1], "R", kind=prior.mean.dtype, xp=xp)
-    found = correct(prior.covariance, residual, H, noise, present=present, gate=gate, space=space, xp=xp)
+    found = correct(
+        prior.covariance, residual, H, noise, present=present, gate=gate, space=space, robust=robust, xp=xp
+    )
     mean = moved(prior.mean, found.shift, space, xp)
     return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
 

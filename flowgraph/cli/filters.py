@@ -15,11 +15,11 @@ import typer
 
 from flowgraph.cli.app import app
 from flowgraph.cli.options import (
+    SEED_HELP,
     AsJson,
-    Data,
     DataOrNone,
-    Engine,
     Name,
+    NameOrNone,
     Seed,
     Settings,
     SettingsFile,
@@ -30,6 +30,7 @@ from flowgraph.cli.options import (
     with_file,
 )
 from flowgraph.cli.pages import runs_before, watcher_of, write_page
+from flowgraph.cli.resume import kept_in, resumed
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -51,6 +52,8 @@ from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
+from flowgraph.engines.options import Checkpoint
+from flowgraph.engines.registry import engine_names
 from flowgraph.engines.simulate import simulate
 from flowgraph.engines.watched import Watcher, simulate_watched
 from flowgraph.errors import DataError, FlowgraphError, plain, writes
@@ -104,12 +107,12 @@ def show(
 @app.command()
 @reports_errors
 def run(
-    graph: Name,
-    data: Data,
+    graph: NameOrNone = None,
+    data: DataOrNone = None,
     truth: Truth = None,
-    engine: Engine = "python",
-    dtype: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
-    seed: Seed = 0,
+    engine: Annotated[str | None, typer.Option(help=", ".join(engine_names()), show_default="python")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float64 or float32", show_default="float64")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
     settings_file: SettingsFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
@@ -122,9 +125,25 @@ def run(
     diverged: Annotated[
         str, typer.Option(help="Numbers that are no longer finite: raise or count.")
     ] = "raise",
+    checkpoint: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep the run in this file now and then.")
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Of flight time, from one to the next: 60.")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Go on from a checkpoint; what is left out is as it was."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
+    settings = with_file(settings, settings_file) or None
+    command = resumed(resume, graph=graph, data=data, truth=truth, engine=engine, dtype=dtype, seed=seed,
+                      settings=settings)  # fmt: skip
+    graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
+    truth, settings = command.truth, command.settings
+    kept = kept_in(checkpoint, every, resume, command)
     if out is not None:
         make_ready(out)
     others = runs_before(html, beside)
@@ -136,11 +155,11 @@ def run(
                 err_console.print(f"note: {words}", markup=False)
             notes[words] = None
 
-    spec, settings = one_flight(data) or "", with_file(settings, settings_file)
+    spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
-    watcher = watcher_of(case, engine) if html is not None else None
+    watcher = watcher_of(case, engine) if html is not None and kept is None else None
     result, row = _measure(
-        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher
+        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept
     )
     say(case.remarks(result))
     if html is not None and watcher is None:
@@ -198,6 +217,7 @@ def _measure(
     quiet: bool,
     diverged: str = "raise",
     watcher: Watcher | None = None,
+    kept: Checkpoint | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -208,7 +228,7 @@ def _measure(
     ):
         options: dict[str, Any] = {"dtype": dtype, "seed": seed, "progress": meter, "diverged": diverged}
         if watcher is None:
-            result = simulate(case.graph, case.inputs, engine=engine, **options)
+            result = simulate(case.graph, case.inputs, engine=engine, checkpoint=kept, **options)
         else:
             result = simulate_watched(case.graph, case.inputs, watcher, **options)
     total = perf_counter() - start

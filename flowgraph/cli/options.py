@@ -22,6 +22,12 @@ from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.graph import Graph
 
 Name = Annotated[str, typer.Argument(metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.")]
+NameOrNone = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="GRAPH", help="A graph from `flowgraph list`, or FILE.py:NAME.", show_default=False
+    ),
+]
 Data = Annotated[
     list[str],
     typer.Option(
@@ -51,12 +57,11 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="A setting of the graph or the flight; repeatable."),
 ]
+SEED_HELP = "Of a simulated flight, and of the graph's draws."
+Seed = Annotated[int, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP)]
 SettingsFile = Annotated[
     Path | None,
     typer.Option("--settings", metavar="FILE", help="What tune or calibrate found; --set goes before it."),
-]
-Seed = Annotated[
-    int, typer.Option(min=0, max=2**64 - 1, help="Of a simulated flight, and of the graph's draws.")
 ]
 Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]

@@ -47,9 +47,14 @@ class Tape:
 
     def first(self, ticks: int) -> Tape:
         """The tape of the first ticks alone."""
-        key = self.key[:ticks]
-        series = tuple(s[: int((key >> k & 1).sum())] for k, s in enumerate(self.series))
-        return Tape(self.time[:ticks], key, series)
+        return self.part(0, ticks)
+
+    def part(self, first: int, last: int) -> Tape:
+        """The tape of the ticks from `first` on, before `last`."""
+        before, key = self.key[:first], self.key[first:last]
+        rows = [(int((before >> k & 1).sum()), int((key >> k & 1).sum())) for k in range(len(self.series))]
+        series = tuple(s[n : n + count] for s, (n, count) in zip(self.series, rows, strict=True))
+        return Tape(self.time[first:last], key, series)
 
     @property
     def patterns(self) -> tuple[int, ...]:

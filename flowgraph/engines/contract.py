@@ -26,8 +26,9 @@ from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape
+from flowgraph.engines.entrance import Admitted
 from flowgraph.engines.options import DTYPES, Meter, RunOptions
-from flowgraph.errors import DeclarationError
+from flowgraph.errors import DeclarationError, FifoOverflowError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -121,8 +122,37 @@ class Engine(abc.ABC):
             )
 
 
+class Stepper(abc.ABC):
+    """A run that takes one tick after the other.
+
+    Attributes:
+        ticks: how many were made.
+        time: of the last, in ns.
+    """
+
+    ticks: int
+    time: int
+
+    @abc.abstractmethod
+    def step(self, admitted: Admitted) -> list[tuple[Any, ...] | None]:
+        """Make a tick; gives for each collected output its leaves, copies, or None where it is absent."""
+
+    @abc.abstractmethod
+    def overflows(self) -> list[FifoOverflowError]:
+        """The errors of queues that were full for the first time since the last call; the run goes on."""
+
+    @property
+    @abc.abstractmethod
+    def state(self) -> dict[str, Any]:
+        """The registers after the last tick, as `run.state`."""
+
+
 class BlockEngine(Engine):
     """An engine that runs the blocks of a graph themselves."""
+
+    def stepper(self, graph: Graph, options: RunOptions) -> Stepper | None:
+        """A run that takes one tick after the other; None where the engine has none."""
+        return None
 
     @abc.abstractmethod
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
@@ -142,6 +172,24 @@ class Player(abc.ABC):
             seed: (2,) uint32.
             progress: told now and then how many ticks are done, and the time of the last.
         """
+
+
+class CellStepper(abc.ABC):
+    """A pipeline made ready by an engine for single ticks; it holds the register cells."""
+
+    @abc.abstractmethod
+    def react(
+        self, time: int, key: int, leaves: Sequence[tuple[int, Sequence[Any]]]
+    ) -> list[tuple[Any, ...] | None]:
+        """Make a tick of these inputs, by place; gives for each output its leaves, or None."""
+
+    @abc.abstractmethod
+    def cells(self) -> list[Any]:
+        """Copies of the register cells, in order."""
+
+    @abc.abstractmethod
+    def full(self) -> Sequence[int]:
+        """The places of the pipeline's faults that have occurred."""
 
 
 class PipelineEngine(Engine):
@@ -168,6 +216,12 @@ class PipelineEngine(Engine):
             dtype: what `real` is.
             passes: of the optimiser, in order.
         """
+
+    def stepper(
+        self, pipeline: Pipeline, cells: list[Any], seed: int, dtype: str, passes: tuple[str, ...]
+    ) -> CellStepper | None:
+        """What makes single ticks of a pipeline; None where the engine has none."""
+        return None
 
     def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
         """Play many runs in one call; only asked of an engine that `takes_many`."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol
 
-from flowgraph.errors import UnknownNameError
+from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.pipeline.optimise import check_passes
 from flowgraph.recorder.random import seed_words
 
@@ -24,6 +25,36 @@ class Meter(Protocol):
         """`ticks` done so far, and the time of the last in ns."""
 
 
+@dataclass(frozen=True)
+class Checkpoint:
+    """How a run over recorded events is kept, so that another process can go on with it.
+
+    Args:
+        file: replaced now and then by one that holds the run so far; None: nothing is written.
+        every: seconds of the flight between two of them.
+        resume: the file of a run that was broken off, from which this one goes on.
+        about: plain values to keep in the file, such as the command.
+
+    Raises:
+        DeclarationError: for an `every` that is no positive number.
+    """
+
+    file: str | Path | None = None
+    every: float = 60.0
+    resume: str | Path | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 1e-9 <= self.every <= 9e9:
+            raise DeclarationError(
+                "checkpoints are some time of the flight apart",
+                path="every",
+                expected="seconds, more than 0",
+                got=str(self.every),
+                fix="write --every 10",
+            )
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """What is asked of a run. The engine is a name; `registry.find_engine` knows what it stands for.
@@ -39,6 +70,7 @@ class RunOptions:
         keep: of many runs, what to keep of the outputs; None: everything.
         runs_at_once: of many runs, how many go in one call where the engine does them in chunks.
         diverged: what an output or register that is no longer finite does: "raise", or "count" it and go on.
+        checkpoint: how the run is kept, and from where it goes on.
 
     Raises:
         UnknownNameError: for another dtype, pass or way of `diverged`.
@@ -55,6 +87,7 @@ class RunOptions:
     keep: Sequence[str] | None = None
     runs_at_once: int = RUNS_AT_ONCE
     diverged: str = "raise"
+    checkpoint: Checkpoint | None = None
 
     def __post_init__(self) -> None:
         if self.dtype not in DTYPES:

@@ -23,6 +23,7 @@ from flowgraph.engines.python.run import Run
 from flowgraph.engines.registry import find_engine
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.subject import LoweredGraph
+from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import NEVER, Graph
 from flowgraph.pipeline.cut import cut
 from flowgraph.pipeline.lowering import lower
@@ -37,6 +38,14 @@ def run_graph(graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
         return engine.run(graph, inputs, options)
     check_start(options.init, options.state, path=graph.name)
     if lower(graph).host:
+        if options.checkpoint is not None:
+            raise DeclarationError(
+                "a run that is cut at the blocks of the host has no checkpoints",
+                path=graph.name,
+                expected='engine="python", which runs all blocks itself',
+                got=f"engine={options.engine!r}",
+                fix='use engine="python", or leave the checkpoint out',
+            )
         return _play_parts(graph, inputs, options)
     return play(LoweredGraph(graph), inputs, options)
 

@@ -11,8 +11,9 @@ from flowgraph.data.inputs import Inputs
 from flowgraph.data.result import COUNTED, Result
 from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape
+from flowgraph.engines.checkpoint import Keeper, identity, pipeline_digest
 from flowgraph.engines.contract import Outcome, PipelineEngine
-from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.options import Checkpoint, Meter, RunOptions
 from flowgraph.engines.registry import find_pipeline_engine
 from flowgraph.engines.subject import LoadedPipeline, Start, Subject
 from flowgraph.engines.trouble import Playback, cells_of, gaps_of, overflow, settled
@@ -40,11 +41,30 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     player = engine.prepare(pipeline, events.patterns, len(events.time), options.dtype, passes)
     words = seed_words(start.seed)
 
-    def played(tape: Tape, progress: Meter | None = None) -> Result:
+    def played(tape: Tape, progress: Meter | None = None, start: Start = start) -> Result:
         outcome = player.play(tape, start.cells, words, progress)
         return _result(subject, outcome, tape, start, options.engine)
 
-    result = played(events, options.progress)
+    def kept(asked: Checkpoint) -> Result:
+        begun = (start.cells, start.last)
+        which = identity(
+            pipeline.name, pipeline_digest(pipeline), events, begun, start.seed, options, passes=passes
+        )
+        types = dict(zip((p.name for p in pipeline.outputs), subject.types, strict=True))
+        keeper, now = Keeper(asked, which, events, types), start
+        if keeper.start is not None:
+            now = subject.start(options.but(init=None, state=keeper.start.state))
+
+        def stretch(first: int, last: int) -> Result:
+            nonlocal now
+            part = played(events.part(first, last), keeper.meter(options.progress), now)
+            last_times = {n: int(t) for n, t in part.state["sources"].items()}
+            now = Start(cells_of(pipeline, part.state), last_times, start.seed)
+            return part
+
+        return keeper.play(stretch)
+
+    result = played(events, options.progress) if options.checkpoint is None else kept(options.checkpoint)
     run = Playback(
         pipeline,
         start.cells,
@@ -68,7 +88,7 @@ def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engi
         name: int(s.time[-1]) if len(s) else before
         for (name, before), s in zip(start.last.items(), events.series, strict=True)
     }
-    state = _state(pipeline, outcome.cells, last, start.seed)
+    state = state_of(pipeline, outcome.cells, last, start.seed)
     calls = {f.register: f.path for f in pipeline.faults}
     stats = {
         f"{calls.get(r.path, r.path.removesuffix('.state'))}.{name}": int(count)
@@ -85,7 +105,8 @@ def chosen_passes(engine: PipelineEngine, options: RunOptions) -> tuple[str, ...
     return check_passes(engine.passes if options.passes is None else options.passes)
 
 
-def _state(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
+def state_of(pipeline: Pipeline, cells: list[Any], last: Mapping[str, int], seed: int) -> dict[str, Any]:
+    """The state tree of these register cells."""
     values = iter(cells)
     registers: dict[str, Any] = {}
     for register in pipeline.registers:

@@ -10,7 +10,7 @@ from flowgraph.data.batch import Batch
 from flowgraph.data.inputs import Inputs, need_inputs
 from flowgraph.data.result import Result
 from flowgraph.engines.many import run_many
-from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.options import Checkpoint, Meter, RunOptions
 from flowgraph.engines.parts import run_graph
 from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import Graph
@@ -30,6 +30,7 @@ def simulate(
     progress: Meter | None = ...,
     passes: Collection[str] | None = ...,
     diverged: str = ...,
+    checkpoint: Checkpoint | None = ...,
 ) -> Result: ...
 @typing.overload
 def simulate(
@@ -45,6 +46,7 @@ def simulate(
     progress: Meter | None = ...,
     passes: Collection[str] | None = ...,
     diverged: str = ...,
+    checkpoint: Checkpoint | None = ...,
 ) -> Batch: ...
 def simulate(
     graph: Graph,
@@ -59,6 +61,7 @@ def simulate(
     progress: Meter | None = None,
     passes: Collection[str] | None = None,
     diverged: str = "raise",
+    checkpoint: Checkpoint | None = None,
 ) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
@@ -79,6 +82,8 @@ def simulate(
             that suit the engine. The Python engine has no list to optimise.
         diverged: where an operation makes an output or a register that is not finite, "raise", or "count"
             it in the result's `stats` and `notes` and go on.
+        checkpoint: `Checkpoint(file, every=10.0)` keeps the run in a file now and then;
+            `Checkpoint(resume=file)` goes on from one, to the same bits. Of one run alone.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
@@ -88,16 +93,16 @@ def simulate(
     """
     options = RunOptions(
         engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes,
-        diverged=diverged,
+        diverged=diverged, checkpoint=checkpoint,
     )  # fmt: skip
     if seeds is None:
         need_inputs(graph, inputs)
         return run_graph(graph, inputs, options)
-    if state is not None:
+    if state is not None or checkpoint is not None:
         raise DeclarationError(
             "many runs start anew",
             path="simulate",
-            expected="seeds, or a state to go on from",
+            expected="seeds, or a state or checkpoint to go on from",
             got="both",
             fix="leave one of them out",
         )

@@ -178,6 +178,17 @@ def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
         OutputError: where the file cannot be written; DataError: where the tree is no state, which could not
             be read again. What the file held before is then there still.
     """
+    flat = flat_state(tree)
+    with whole(file) as out:
+        np.savez(out, **flat)  # type: ignore[arg-type]
+
+
+def flat_state(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays of a state tree by a name each, as they are written.
+
+    Raises:
+        DataError: where the tree is no state.
+    """
     _check_members(tree, ("registers", "sources", "seed"), "save_state", "this is no state", "graph")
     flat: dict[str, np.ndarray] = {}
     for group, members in tree.items():
@@ -187,8 +198,7 @@ def save_state(tree: Mapping[str, Any], file: str | Path) -> None:
         for path, part in members.items():
             leaves = part.items() if isinstance(part, Mapping) else [("", part)]
             flat.update({f"{group}\n{path}\n{leaf}": _numbers(a, f"{group}, {path}") for leaf, a in leaves})
-    with whole(file) as out:
-        np.savez(out, **flat)  # type: ignore[arg-type]
+    return flat
 
 
 def _numbers(value: Any, where: str) -> np.ndarray:
@@ -216,18 +226,7 @@ def load_state(file: str | Path) -> dict[str, Any]:
         DataError: where the file is missing or is no such file.
     """
     try:
-        flat = arrays_of(file)
-        tree: dict[str, Any] = {"registers": {}, "sources": {}}
-        for name, array in flat.items():
-            if name == "seed":
-                tree[name] = array
-                continue
-            group, path, leaf = name.split("\n")
-            if leaf:
-                tree[group].setdefault(path, {})[leaf] = array
-            else:
-                tree[group][path] = array
-        return tree
+        return nested_state(arrays_of(file))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             "this is no saved state",
@@ -236,3 +235,22 @@ def load_state(file: str | Path) -> dict[str, Any]:
             got=f"{type(error).__name__}: {error}"[:300],
             fix="write one with save_state(run.state, file)",
         ) from None
+
+
+def nested_state(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The state tree whose arrays have these names.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: for names that are none of a state.
+    """
+    tree: dict[str, Any] = {"registers": {}, "sources": {}}
+    for name, array in flat.items():
+        if name == "seed":
+            tree[name] = array
+            continue
+        group, path, leaf = name.split("\n")
+        if leaf:
+            tree[group].setdefault(path, {})[leaf] = array
+        else:
+            tree[group][path] = array
+    return tree

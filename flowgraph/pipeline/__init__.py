@@ -6,7 +6,8 @@ one after the other, and makes plain what the graph left to clocks: a truth valu
 fires, and a register keeps its old value where it does not (`lowering`, which writes into a `stage_list`).
 Blocks that must stay on the host are cut off before and after (`cut`). What comes out is data: numbered
 values assigned once, of fixed shape (`pipeline`). It is written to a file and checked line by line when it
-is read (`description`, with its schema), and printed for a person (`listing`). What an instruction computes
+is read (`description`, with its schema), printed for a person (`listing`), and known again by its digest
+(`digests`). What an instruction computes
 is defined in one place (`evaluate`).
 
 A pipeline copes with every tick. For the ticks that come, say of the IMU alone, it is specialised

@@ -19,6 +19,7 @@ from flowgraph.data.settings import text
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DeclarationError
+from flowgraph.pipeline import digests
 from flowgraph.pipeline.lowering import lower
 from flowgraph.study import keys
 from flowgraph.study.executors import Executor, Finished, InProcess, ProcessPool
@@ -90,7 +91,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
     programs: list[str] = []
     for graph in study.graphs:
         prepare = find_graph(graph).prepare
-        code = keys.code_digest(prepare) if prepare is not None else ""
+        code = digests.code_digest(prepare) if prepare is not None else ""
         for data in study.data:
             for parameters in study.combinations(graph):
                 identity, seeded, described, program = flights.described(graph, data, parameters)
@@ -127,11 +128,11 @@ class _Flights:
             return identity, seeded, keys.failure_digest(error), ""
         try:
             pipeline = lower(case.graph)
-            described, program = keys.graph_digest(pipeline), keys.structure_digest(pipeline)
+            described, program = digests.graph_digest(pipeline), digests.structure_digest(pipeline)
         except Exception as error:  # the Python engine may run it all the same
             described, program = keys.failure_digest(error), ""
-        beside = keys.python_digest(case.graph, every=not program)
-        return identity, seeded, keys.digest((described, beside)) if beside else described, program
+        beside = digests.python_digest(case.graph, every=not program)
+        return identity, seeded, digests.digest((described, beside)) if beside else described, program
 
     def _flight(self, data: str, parameters: Mapping[str, Value]) -> tuple[Flight | Exception, str, bool]:
         settings = {n: text(v) for n, v in flight_part(data, parameters).items()}
@@ -140,13 +141,13 @@ class _Flights:
             self._known.clear()  # the flights come one after the other
             try:
                 flight = load_flight(data, settings=settings)
-                identity = keys.digest((data, settings, flight))
-                seeded = not self._many or keys.digest(flight) != keys.digest(
+                identity = digests.digest((data, settings, flight))
+                seeded = not self._many or digests.digest(flight) != digests.digest(
                     load_flight(data, seed=1, settings=settings)
                 )
                 self._known[which] = flight, identity, seeded
             except Exception as error:
-                self._known[which] = error, keys.digest((data, settings, keys.failure_digest(error))), True
+                self._known[which] = error, digests.digest((data, settings, keys.failure_digest(error))), True
         return self._known[which]
 
 

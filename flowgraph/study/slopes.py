@@ -32,10 +32,10 @@ from flowgraph.engines.playback import play
 from flowgraph.engines.registry import find_engine
 from flowgraph.engines.subject import LoadedPipeline
 from flowgraph.language.graph import Graph, join_states
+from flowgraph.pipeline.digests import structure
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline, type_of_leaves
 from flowgraph.pipeline.sensitivity import CHANGE, sensitivity
-from flowgraph.study.keys import structure
 from flowgraph.study.lifting import CONSTANTS, lifted, real_constants
 from flowgraph.types import flatten, leaves_of, unflatten
 

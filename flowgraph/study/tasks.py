@@ -30,7 +30,7 @@ from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError, FlowgraphError
 from flowgraph.language.graph import Graph
 from flowgraph.language.recording import remembering
-from flowgraph.study.keys import structure
+from flowgraph.pipeline.digests import structure
 from flowgraph.study.lifting import Lowered, lifted, start_of
 from flowgraph.study.spec import Value
 from flowgraph.study.store import pack_trajectory

@@ -32,8 +32,8 @@ from flowgraph.engines.parts import run_graph
 from flowgraph.engines.registry import find_engine
 from flowgraph.errors import DataError
 from flowgraph.language.recording import remembering
+from flowgraph.pipeline.digests import digest
 from flowgraph.study.coordinates import Parameter
-from flowgraph.study.keys import digest
 from flowgraph.study.slopes import Slopes
 from flowgraph.study.spec import Value
 from flowgraph.study.tasks import flight_part, grouped, loaded, prepared, simulate_together

@@ -12,7 +12,7 @@ import pytest
 from flowgraph import aperiodic, periodic, simulate
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-FILES = sorted(EXAMPLES.glob("*.py"))
+FILES = sorted(f for f in EXAMPLES.glob("*.py") if f.stem != "udp_live")  # it has a test of its own
 
 
 def run(name: str) -> dict[str, Any]:
@@ -133,3 +133,20 @@ def test_live_run_shows_each_distance(capsys: pytest.CaptureFixture[str]) -> Non
     ]
     # 2 m/s over 1 s, 3 m/s over 1 s, a mark at 5.25, a mark at 7, 1 m/s over 1 s
     assert shown == ["0.00", "2.00", "5.00", "5.25", "7.00", "8.00"]
+
+
+@pytest.mark.slow
+def test_packets_over_udp_are_filtered_as_they_come(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each that came is in a tick or in a count; the recorded run of what arrived is the same to the bit."""
+    found = run("udp_live")["FOUND"]
+    assert found["same"]
+    live, came, sent = found["live"], found["came"], found["sent"]
+    assert sent == {"imu": 1500, "position": 15}
+    assert 1300 < came["imu"] < 1500  # some are lost on purpose
+    for name, n in came.items():
+        none = sum(
+            live.counts[f"{name}.{kind}"] for kind in ("late", "twice", "dropped", "unclocked", "absent")
+        )
+        assert n == none + len(live.arrived[name]) + live.counts[f"{name}.refused"]
+    assert found["result"].ticks > 1300
+    assert "the same to the bit" in capsys.readouterr().out

@@ -26,7 +26,8 @@ from flowgraph import (
 )
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.data import registry
-from flowgraph.study import Study, execution, keys, run_study
+from flowgraph.pipeline import digests
+from flowgraph.study import Study, execution, run_study
 
 pytest.importorskip("pyarrow")
 
@@ -159,18 +160,18 @@ def test_a_study_of_a_graph_with_host_blocks(engine, installed, tmp_path):
 
 def test_a_changed_host_block_is_another_key(installed, monkeypatch):
     """The pipeline does not know it; its setting and its module's code are in the key all the same."""
-    described = keys.python_digest(case(0).graph)
-    assert described == keys.python_digest(case(1).graph) != ""
-    assert described != keys.python_digest(case(0, grain=0.5).graph)
-    assert described == keys.python_digest(case(0, gain=0.5).graph)  # that is in the pipeline
-    assert keys.python_digest(case(0).graph, every=True) != keys.python_digest(
+    described = digests.python_digest(case(0).graph)
+    assert described == digests.python_digest(case(1).graph) != ""
+    assert described != digests.python_digest(case(0, grain=0.5).graph)
+    assert described == digests.python_digest(case(0, gain=0.5).graph)  # that is in the pipeline
+    assert digests.python_digest(case(0).graph, every=True) != digests.python_digest(
         case(0, gain=0.5).graph, every=True
     )
     first = {r.key for r in execution.plan(study("reference")).runs}
     assert {r.key for r in execution.plan(study("reference")).runs} == first
-    code = keys.code_digest
+    code = digests.code_digest
     monkeypatch.setattr(
-        keys,
+        digests,
         "code_digest",
         lambda f: "changed" if getattr(f, "__name__", "") == "told" else code(f),
     )
@@ -192,9 +193,9 @@ def test_a_setting_that_holds_itself_counts_by_its_kind():
     def shown(x: Stream[Scalar], *, on: Any):
         return {"x": show(x, on=on)}
 
-    described = keys.python_digest(shown.build(on=Figure()))
-    assert described == keys.python_digest(shown.build(on=Figure()))
-    assert described != keys.python_digest(shown.build(on=object))
+    described = digests.python_digest(shown.build(on=Figure()))
+    assert described == digests.python_digest(shown.build(on=Figure()))
+    assert described != digests.python_digest(shown.build(on=object))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

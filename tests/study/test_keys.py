@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from flowgraph.study.keys import digest
+from flowgraph.pipeline.digests import digest
 
 
 def scaled(factor: float):
@@ -36,7 +36,7 @@ def test_functions_that_hold_other_values_differ():
 
 
 def test_a_set_reads_alike_in_every_process():
-    code = "from flowgraph.study.keys import digest; print(digest({'a', 'b', 'c', 'd'}))"
+    code = "from flowgraph.pipeline.digests import digest; print(digest({'a', 'b', 'c', 'd'}))"
     found = set()
     for seed in ("1", "2"):
         env = {"PYTHONHASHSEED": seed}

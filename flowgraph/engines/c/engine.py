@@ -15,11 +15,21 @@ from flowgraph.engines.c.batch import threaded
 from flowgraph.engines.c.compile import compiler
 from flowgraph.engines.c.harness import write_c, write_events
 from flowgraph.engines.c.library import Compiled, compiled
-from flowgraph.engines.contract import ManyOutcome, ManyRuns, Outcome, PipelineEngine, Player, real_leaves
+from flowgraph.engines.c.step import SingleTicks
+from flowgraph.engines.contract import (
+    CellStepper,
+    ManyOutcome,
+    ManyRuns,
+    Outcome,
+    PipelineEngine,
+    Player,
+    real_leaves,
+)
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.stretches import joined
 from flowgraph.pipeline.optimise import COMPILED
 from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.recorder.random import seed_words
 
 
 class _Loaded(Player):
@@ -59,6 +69,12 @@ class CEngine(PipelineEngine):
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
         return _Loaded(compiled(pipeline, np.dtype(dtype), patterns, passes))
+
+    def stepper(
+        self, pipeline: Pipeline, cells: list[Any], seed: int, dtype: str, passes: tuple[str, ...]
+    ) -> CellStepper:
+        every = range(1, 2 ** min(len(pipeline.inputs), 8))  # beyond some patterns, presence is data
+        return SingleTicks(compiled(pipeline, np.dtype(dtype), every, passes), cells, seed_words(seed))
 
     def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
         return threaded(runs, passes, options)

@@ -49,7 +49,8 @@ class State:
         start = -self._memory.ctypes.data % 64
         self.address = self._memory.ctypes.data + start
         self._struct = library.cells
-        self._held = [c for r in library.pipeline.registers for c in r.cells]
+        self._registers = library.pipeline.registers
+        self._held = [c for r in self._registers for c in r.cells]
         self._seen = self._memory[start : start + self._struct.itemsize].view(self._struct)
         for name, cell, value in zip(self._struct.names or (), self._held, cells, strict=False):
             if math.prod(cell.shape):
@@ -64,6 +65,16 @@ class State:
             else np.zeros(cell.shape, self._seen.dtype[name].base)
             for name, cell in zip(self._struct.names or (), self._held, strict=False)
         ]
+
+    def seen_cells(self, places: Sequence[tuple[str, str]]) -> list[np.ndarray]:
+        """Views of register cells as they are, by path and name."""
+        named = {
+            (r.path, c.name): n
+            for (r, c), n in zip(
+                ((r, c) for r in self._registers for c in r.cells), self._struct.names or (), strict=False
+            )
+        }
+        return [self._seen[named[place]] for place in places]
 
 
 class Compiled:
@@ -104,9 +115,9 @@ class Compiled:
             "fg_loop.c": loop_text(pipeline, self.source),
         }
         self._library = load(files, flags)
-        self._play = self._library.fg_play
-        self._play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
-        self._play.restype = None
+        self.play_ticks = self._library.fg_play
+        self.play_ticks.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
+        self.play_ticks.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
         self.size = int(self._library.fg_size())
         names = self.source.names
@@ -149,6 +160,14 @@ class Compiled:
             made.append(rows)
         return made
 
+    def single_rows(self) -> Structs:
+        """Room for one event of each input port."""
+        return [np.zeros(1, struct) for struct in self._inputs]
+
+    def scratch(self) -> Structs:
+        """Room for the struct of each output."""
+        return [np.empty(1, s) for s in self._outputs]
+
     def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
         """For each output in how many ticks of these patterns it can be present, and whether it then is."""
         counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
@@ -184,16 +203,16 @@ class Compiled:
         """
         time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
         made, counts = np.empty(len(time), np.uint64), np.zeros(max(len(rooms), 1), np.int64)
-        scratch = [np.empty(1, s) for s in self._outputs]
+        scratch = self.scratch()
         leaves = [None if leaf is None else leaf.ctypes.data for room in rooms for leaf in room]
-        self._play(
+        self.play_ticks(
             state.address,
             len(time),
             time.ctypes.data,
             key.ctypes.data,
-            _pointers([r.ctypes.data for r in rows]),
-            _pointers([s.ctypes.data for s in scratch]),
-            _pointers(leaves),
+            pointers([r.ctypes.data for r in rows]),
+            pointers([s.ctypes.data for s in scratch]),
+            pointers(leaves),
             made.ctypes.data,
             counts.ctypes.data,
         )
@@ -234,7 +253,8 @@ def shrunk(leaf: np.ndarray, n: int) -> np.ndarray:
     return leaf if len(leaf) == n else leaf[:n].copy()
 
 
-def _pointers(places: Sequence[int | None]) -> Any:
+def pointers(places: Sequence[int | None]) -> Any:
+    """An array of pointers, as C takes it."""
     return (ctypes.c_void_p * max(len(places), 1))(*places)
 
 

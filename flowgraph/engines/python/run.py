@@ -10,21 +10,23 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial, wraps
 from threading import Lock, get_ident
 from time import perf_counter
 from typing import Any, TypeVar, cast
 
 from flowgraph.data.arrival import stamp_events
-from flowgraph.data.inputs import NOT_FINITE, Inputs, check_stamp, check_value, periods_lost, prepare, rule_of
+from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
-from flowgraph.data.tape import batches, merged, need_near, stack
+from flowgraph.data.tape import batches, merged, stack
+from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
-from flowgraph.errors import ClockError, DataError, FifoOverflowError, UnknownNameError
+from flowgraph.errors import DataError, FifoOverflowError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
@@ -71,22 +73,18 @@ class Run:
         self.graph = graph
         self.ticks = 0
         self.wall_s = 0.0
+        self._drained = 0, 0.0
         self._registers = initial_registers(graph, init)
         self._last = dict.fromkeys(graph.sources, NEVER)
         self._key = seed_words(seed)
         self._stopped: int | None = None
         self._busy, self._thread = Lock(), 0
-        self._first: int | None = None
-        self._heard = dict(self._last)  # the last event of each source, be it one that was refused
-        self._lost = dict.fromkeys(graph.sources, 0)
-        self._absent = dict.fromkeys(graph.sources, 0)
-        self._not_finite = rule_of("not_finite", not_finite, NOT_FINITE)
         self._full: dict[int, FifoOverflowError] = {}  # by call
         self._told: set[int] = set()  # the calls whose overflow was raised
         check_start(init, state, path=graph.name)
         if state is not None:
             self.state = state
-            self._heard = dict(self._last)
+        self._entrance = Entrance(graph, self._last, not_finite)
         self._recorded = True
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
@@ -146,60 +144,43 @@ class Run:
                 got="push",
                 fix="start it as Run(graph)",
             )
-        if not values:
-            raise DataError(
-                "a tick needs an event",
-                path=self.graph.name,
-                expected="a value for one source or more: " + ", ".join(self.graph.sources),
-                got="none",
-                fix="call push(time, name=value)",
-            )
         stamp_events(self.graph.sources, time, values)
-        key = 0
-        lost: dict[str, int] = {}
-        absent: list[str] = []
-        checked: list[tuple[deque[Any], Any]] = []
-        for k, (name, node) in enumerate(self.graph.sources.items()):
-            if name in values:
-                time = check_stamp(name, time)
-                value = check_value(name, time, values.pop(name), node.type, self._not_finite)
-                lost[name] = self._periods_lost(name, time)
-                if value is None:
-                    absent.append(name)
-                    continue
-                checked.append((self._pushed[k], value))
-                key |= 1 << k
-        if values:
-            raise UnknownNameError("source", next(iter(values)), self.graph.sources, path=self.graph.name)
-        if time <= self.time:
-            raise DataError(
-                "time goes backwards",
-                path=self.graph.name,
-                expected=f"a time after {self.time} ns",
-                got=f"{time} ns",
-                fix="push all events of one time in one call, in order",
-            )
-        self._first = time if self._first is None else self._first
-        need_near(self._first, time)
-        for queue, value in checked:
-            queue.append(value)
-        try:
-            if checked:
-                self._advance([(time, key)])
-        except BaseException:
-            for queue, _ in checked:
-                queue.clear()
-            self._stopped = None  # this tick did not happen; the next may be pushed
-            raise
-        for name, periods in lost.items():
-            self._lost[name] += periods
-            self._heard[name] = time
-        for name in absent:
-            self._absent[name] += 1
+        admitted = self._entrance.admit(time, values, self.time)
+        self._react(admitted)
+        self._entrance.done(admitted)
         for index, error in self._full.items():
             if index not in self._told:
                 self._told.add(index)
                 raise error
+
+    @_alone
+    def react(self, admitted: Admitted) -> list[list[Any]]:
+        """The tick of events that were checked; what each output has of it, which the run forgets."""
+        self._react(admitted)
+        made = [list(values) for values in self._values]
+        for kept in (*self._times, *self._values):
+            kept.clear()
+        return made
+
+    def overflows(self) -> list[FifoOverflowError]:
+        """The errors of queues that were full for the first time since the last call."""
+        new = [index for index in self._full if index not in self._told]
+        self._told.update(new)
+        return [self._full[index] for index in new]
+
+    def _react(self, admitted: Admitted) -> None:
+        """The tick of these events; where it fails it did not happen, and the next may come."""
+        assert self._pushed is not None
+        for k, value in admitted.values:
+            self._pushed[k].append(value)
+        try:
+            if admitted.key:
+                self._advance([(admitted.time, admitted.key)])
+        except BaseException:
+            for k, _ in admitted.values:
+                self._pushed[k].clear()
+            self._stopped = None
+            raise
 
     @_alone
     def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
@@ -302,15 +283,6 @@ class Run:
             raise error
         self._full[index] = error
 
-    def _periods_lost(self, name: str, time: int) -> int:
-        timing = self.graph.sources[name].clock.timing
-        try:
-            return periods_lost(name, time, timing, self._heard[name])
-        except ClockError:
-            if timing.phase is None and time > self._heard[name]:
-                self._heard[name] = time  # the clock may have jumped, and the next event keeps its period
-            raise
-
     @property
     def state(self) -> dict[str, Any]:
         """All registers by path, and the last time of each source: a tree of arrays."""
@@ -332,12 +304,12 @@ class Run:
     @property
     def lost(self) -> dict[str, int]:
         """By source, how many pushed events of a periodic one did not come: whole periods without any."""
-        return dict(self._lost)
+        return dict(self._entrance.lost)
 
     @property
     def absent(self) -> dict[str, int]:
         """By source, how many pushed events were not finite and so no events (`not_finite="absent"`)."""
-        return dict(self._absent)
+        return dict(self._entrance.absent)
 
     @property
     def stats(self) -> dict[str, int]:
@@ -352,6 +324,15 @@ class Run:
             for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)
         }
         return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
+
+    def drain(self) -> Result:
+        """The collected streams since the last call; the run forgets them, and its memory stays flat."""
+        found = self.result()
+        found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
+        self._drained = self.ticks, self.wall_s
+        for kept in (*self._times, *self._values):
+            kept.clear()
+        return found
 
 
 class _Reactions(dict[int, Callable[[int], None]]):

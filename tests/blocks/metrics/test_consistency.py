@@ -9,7 +9,7 @@ from flowgraph import Array, DataError, Series, Signal, real
 from flowgraph.blocks import metrics as c
 from flowgraph.blocks.geometry import from_rotation_vector, multiply
 from flowgraph.blocks.kalman import update_linear
-from flowgraph.blocks.metrics import gate_table
+from flowgraph.blocks.metrics import gate_table, nis_remarks
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation, NavigationState, PointBelief
 
 RNG = np.random.default_rng(8)
@@ -114,3 +114,50 @@ def test_a_gate_is_as_strict_with_a_part_of_a_measurement(gate):
     for z, passes in (([3.0, np.nan, np.nan], False), ([2.5, np.nan, np.nan], True), ([3.0, 0.0, 0.0], True)):
         _, found = update_linear.step(prior, np.array(z), H=np.eye(3), R=np.eye(3), gate=gate, xp=np)
         assert bool(found.value.accepted if hasattr(found, "value") else found.accepted) is passes
+
+
+# -- remarks ---------------------------------------------------------------------------------------------
+
+
+def judged(nis: np.ndarray, *, parts: float = 3.0, accepted: np.ndarray | None = None) -> Series:
+    n = len(nis)
+    return Series(
+        np.arange(n) * 100_000_000,
+        KalmanInnovation(
+            residual=np.zeros((n, 3)),
+            covariance=np.tile(np.eye(3), (n, 1, 1)),
+            nis=nis,
+            parts=np.full(n, parts),
+            accepted=np.ones(n, dtype=bool) if accepted is None else accepted,
+        ),
+    )
+
+
+def test_an_honest_run_has_no_remark():
+    for seed in range(20):
+        nis = np.random.default_rng(seed).chisquare(3.0, size=400)
+        assert nis_remarks("position", judged(nis)) == ()
+    assert nis_remarks("position", judged(np.zeros(0))) == ()
+
+
+def test_a_nis_far_from_one_is_said_with_its_time():
+    nis = np.random.default_rng(1).chisquare(3.0, size=400)
+    jumped = nis.copy()
+    jumped[200:206] += 60.0
+    (said,) = nis_remarks("position", judged(jumped))
+    assert said.startswith("warning: position: the NIS is far from 1, from 19.")
+    (said,) = nis_remarks("", judged(2.0 * nis))
+    assert said.startswith("warning: the NIS is far from 1: ")
+    assert "told too small" in said
+    (said,) = nis_remarks("leica", judged(0.1 * nis))
+    assert said.startswith("warning: leica: the NIS is far from 1: 0.09")
+    assert "told too large" in said
+    assert nis_remarks("leica", judged(0.1 * nis[:19])) == ()  # too few for a mean
+
+
+def test_what_a_gate_refused_is_not_judged_twice():
+    nis = np.random.default_rng(1).chisquare(3.0, size=100)
+    nis[50:60] = 1e4
+    accepted = nis < 100.0
+    (said,) = nis_remarks("position", judged(nis, accepted=accepted))
+    assert said.startswith("refused: position: 10 measurements in a row")

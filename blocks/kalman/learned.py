@@ -1,0 +1,88 @@
+"""A measurement's noise that is learned as it goes.
+
+Nobody knows the noise of a receiver between houses. The innovations tell it: where they are larger than the
+filter expects, the noise is; and the other way round. The noise is a register, fed back through a delay:
+
+    noise = delay(R0, name="noise")
+    posterior, innovation = update_learned(prior, measured, noise, observe=..., gate=0.999)
+    noise.feed(learned_noise(noise, innovation, memory=50.0))
+
+What the model of the motion does wrong ends in the noise as well: one of the two must be known.
+
+Source: A. Mohamed and K. Schwarz, "Adaptive Kalman filtering for INS/GPS", J. Geodesy 73, 1999.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from flowgraph import Array, block, real
+from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.filters import Vector, correct, innovate, moved, where_any
+from flowgraph.blocks.kalman.robust import Robust
+from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+
+__all__ = ["learned_noise", "update_learned"]
+
+Noise = Annotated[Any, real("m", "m")]
+"""The covariance of a measurement."""
+
+
+@block
+def update_learned(
+    prior: Gaussian,
+    measured: Vector | None,
+    noise: Noise,
+    *,
+    observe: Callable[..., tuple[Array, Array]],
+    space: StateSpace | None = None,
+    measured_space: StateSpace | None = None,
+    gate: float | None = None,
+    robust: Robust | None = None,
+    xp: Any,
+) -> tuple[Gaussian, KalmanInnovation | None]:
+    """`update_extended` with the covariance of the noise as a port.
+
+    Args:
+        prior, measured, observe, space, measured_space, gate, robust: as in `update_extended`.
+        noise: R (m, m).
+    """
+    if measured is None:
+        return prior, None
+    predicted, H = observe(prior.mean, xp)
+    residual, present = innovate(measured, predicted, measured_space, xp)
+    found = correct(
+        prior.covariance, residual, H, noise, present=present, gate=gate, space=space, robust=robust, xp=xp
+    )
+    mean = moved(prior.mean, found.shift, space, xp)
+    return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+
+
+@block
+def learned_noise(noise: Noise, innovation: KalmanInnovation | None, *, memory: float, xp: Any) -> Noise:
+    """The covariance of a measurement's noise, learned from what is left after each correction.
+
+        e = R S^-1 r        R' = R + (e e^T - R S^-1 R) / memory
+
+    It stays positive, and stands still where the innovations are as large as they were expected. What was
+    refused by a gate, and a measurement of which entries are missing, teach nothing. Feed it back through a
+    delay: `noise = delay(R0)`, then `update_learned(prior, measured, noise, ...)`.
+
+    Args:
+        noise: R (m, m), by which the innovation was made.
+        innovation: of this tick; or absent.
+        memory: how many measurements it remembers, about.
+
+    Source: Mohamed and Schwarz 1999, eq. 18, where H P' H^T after the correction is R - R S^-1 R.
+    """
+    if innovation is None:
+        return noise
+    solved = xp.linalg.solve(
+        innovation.covariance, xp.concat([innovation.residual[..., None], noise], axis=-1)
+    )
+    left = noise @ solved[..., :1]
+    change = (left @ left.mT - noise @ solved[..., 1:]) / memory
+    whole = innovation.accepted & (innovation.parts == float(noise.shape[-1]))
+    made = noise + xp.where(whole[..., None, None], change, 0.0)
+    return 0.5 * (made + made.mT)

@@ -1,0 +1,343 @@
+"""A graph that runs while its events come in: from threads, from an event loop, from packets.
+
+Whoever has an event pushes it, from any thread, and goes on; one thread of the run puts what came in order of
+its stamps and makes the ticks. Events wait in bounded queues with a declared policy. Each that came is in one
+of the counts in the end: in a tick, too late, come twice, dropped or refused at a full queue, refused by the
+clock, or no event because it was not finite. What was in ticks is kept as `arrived`; the same engine run over
+it gives the same result to the bit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from threading import RLock, Thread
+from time import perf_counter, perf_counter_ns, sleep
+from types import TracebackType
+from typing import Any
+
+from flowgraph.data.arrival import stamp_events
+from flowgraph.data.columns import Columns
+from flowgraph.data.inputs import Inputs, prepare, rule_of
+from flowgraph.data.notes import note
+from flowgraph.data.percentiles import Durations
+from flowgraph.data.result import Result, statistics
+from flowgraph.data.series import Series
+from flowgraph.data.tape import merged
+from flowgraph.engines.entrance import Entrance
+from flowgraph.engines.mailbox import POLICIES, Event, Mailboxes, Order
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.stepping import stepper
+from flowgraph.errors import ClockError, DataError
+from flowgraph.language.clock import nanoseconds
+from flowgraph.language.graph import Graph
+from flowgraph.types import flatten, unflatten
+
+RECORDED = ("all", "arrived", "nothing")
+"""What is kept of a live run."""
+
+Watcher = Callable[[str, int, Any], object]
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """How long things took, in s: percentiles to 3 %.
+
+    Args:
+        arrival: from the arrival of the newest event of a tick to its end, what is held back for order too.
+        response: from when a tick was complete to its end.
+        work: in the tick itself.
+        deadline_missed: ticks whose response was longer than the deadline.
+    """
+
+    arrival: Mapping[str, float]
+    response: Mapping[str, float]
+    work: Mapping[str, float]
+    deadline_missed: int
+
+
+class Live:
+    """A live run of a graph.
+
+    Args:
+        graph: what to run. Sources that lose packets are declared `aperiodic`, or periodic with a jitter.
+        engine: "python" or "c".
+        dtype, init, state, seed: as of `simulate`.
+        queue: events of one source that wait at most.
+        full: what a full queue does: "block", "drop_oldest" or "refuse".
+        lateness: by how much an event may come after a newer one, such as "20ms"; 0: whatever is older than
+            what came is too late.
+        deadline: for the end of a tick once it is complete, such as "1ms"; longer ones are counted.
+        not_finite: what an event with a NaN or an infinity is: an error ("raise"), no event ("absent",
+            counted), or data ("keep").
+        record: what is kept of the run: what arrived and the outputs ("all"), the one ("arrived"), or
+            neither ("nothing"), so that memory stays flat.
+        on_output: called in the thread of the run with name, time and value of each output as it is made.
+
+    Raises:
+        DeclarationError: for an engine that makes no single ticks; UnknownNameError: for another policy.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        *,
+        engine: str = "python",
+        dtype: str = "float64",
+        init: Mapping[str, Any] | None = None,
+        state: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        queue: int = 1024,
+        full: str = "block",
+        lateness: str | int = 0,
+        deadline: str | int | None = None,
+        not_finite: str = "raise",
+        record: str = "all",
+        on_output: Watcher | None = None,
+    ) -> None:
+        self.graph, self._engine = graph, engine
+        rule_of("full", full, POLICIES)
+        rule_of("record", record, RECORDED)
+        if queue < 1:
+            raise DataError(
+                "a queue holds one event or more",
+                path="queue",
+                expected="1 or more",
+                got=str(queue),
+                fix="leave it out for 1024",
+            )
+        options = RunOptions(engine=engine, dtype=dtype, init=init, state=state, seed=seed)
+        self._steps = stepper(graph, options)
+        self._names = list(graph.sources)
+        self._types = [node.type for node in graph.sources.values()]
+        self._outputs = [(c.name, graph.port(c.wire).type) for c in graph.collected]
+        last = {n: int(t) for n, t in self._steps.state["sources"].items()}
+        self._entrance = Entrance(graph, last, not_finite)
+        self._boxes = Mailboxes(len(self._names), queue, full)
+        held = 0 if lateness == 0 else nanoseconds(lateness, what="lateness")
+        self._order = Order(len(self._names), held, queue * len(self._names), self._steps.time)
+        self._patience = held * 1e-9 if held else None
+        self._deadline = None if deadline is None else nanoseconds(deadline, what="deadline")
+        self._missed, self._unclocked = 0, dict.fromkeys(self._names, 0)
+        self._times = [Durations(), Durations(), Durations()]
+        gaps = not_finite == "keep"
+        self._arrived, self._made = (
+            [Columns(t, n, gaps=gaps) for n, t in zip(self._names, self._types, strict=True)],
+            [Columns(t, n, gaps=True) for n, t in self._outputs],
+        )
+        self._record, self._watch = record, on_output
+        self._error: BaseException | None = None
+        self._notes: dict[str, str] = {}
+        self._wall, self._alone = 0.0, RLock()
+        self._thread = Thread(target=self._run, name=f"live {graph.name}", daemon=True)
+        self._thread.start()
+
+    # -- what comes in -----------------------------------------------------------------------------------
+
+    def push(self, time: int, /, *, timeout: float | None = None, **values: Any) -> bool:
+        """Hand over events that were true at `time` (int ns), by source name; from any thread.
+
+        Returns:
+            Whether all were taken in; what was not is counted.
+
+        Raises:
+            DataError, TypeMismatchError, UnknownNameError: for an event that is refused and leaves no trace.
+            FlowgraphError: what ended the run, where it has ended.
+        """
+        arrived = perf_counter_ns()
+        checked = [(name, *self._entrance.value(name, time, value)) for name, value in values.items()]
+        return self._put(checked, arrived, timeout)
+
+    async def push_async(self, time: int, /, **values: Any) -> bool:
+        """As `push`, from an event loop, which goes on while a full queue blocks."""
+        arrived = perf_counter_ns()
+        checked = [(name, *self._entrance.value(name, time, value)) for name, value in values.items()]
+        if self._boxes.have_room([self._names.index(name) for name, _, _ in checked]):
+            return self._put(checked, arrived, None)
+        return await asyncio.to_thread(self._put, checked, arrived, None)
+
+    def play(self, inputs: Inputs, *, speed: float = 1.0) -> int:
+        """Push a recording at the pace of its stamps, or `speed` times as fast.
+
+        Returns:
+            How many ticks were handed over later than the deadline (1 ms, if none was set) allows.
+        """
+        given = prepare(self.graph, inputs)
+        ticks, feeds = merged(given)
+        begun, first, behind = perf_counter(), None, 0
+        allowed = (self._deadline or 1_000_000) * 1e-9
+        for time, key in ticks:
+            first = time if first is None else first
+            ahead = begun + (time - first) * 1e-9 / speed - perf_counter()
+            if ahead > 0:
+                sleep(ahead)
+            behind += -ahead > allowed
+            self.push(time, **{n: feeds[k]() for k, n in enumerate(self._names) if key >> k & 1})
+        return behind
+
+    def _put(self, checked: list[tuple[str, int, Any]], arrived: int, timeout: float | None) -> bool:
+        self._refuse_if_ended()
+        taken = True
+        for name, stamp, value in checked:
+            taken &= self._boxes.put(self._names.index(name), stamp, value, arrived, timeout)
+        return taken
+
+    def _refuse_if_ended(self) -> None:
+        if self._error is not None:
+            raise self._error
+        if not self._thread.is_alive():
+            raise DataError(
+                "this live run has ended",
+                path=self.graph.name,
+                expected="events before close()",
+                got="push after it",
+                fix="start a new one: Live(graph, state=live.state)",
+            )
+
+    # -- the thread of the run ---------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while (events := self._boxes.take(self._patience if self._order.waiting else None)) is not None:
+                for event in events:
+                    if self._order.put(event):
+                        self._ticks(self._order.ready(), event.arrived)
+                if not events:  # nothing has come for as long as anything may be late
+                    self._ticks(self._order.ready(everything=True), perf_counter_ns())
+            self._ticks(self._order.ready(everything=True), perf_counter_ns())
+        except BaseException as error:
+            self._error = error
+            self._boxes.close()
+
+    def _ticks(self, ticks: Any, complete: int) -> None:
+        for stamp, events in ticks:
+            with self._alone:
+                self._tick(stamp, events, complete)
+
+    def _tick(self, stamp: int, events: list[Event], complete: int) -> None:
+        begun = perf_counter_ns()
+        values = {self._names[e.source]: e.value for e in events}
+        try:
+            stamp_events(self.graph.sources, stamp, values)
+            admitted = self._entrance.admit(stamp, values, self._steps.time, checked=True)
+        except (ClockError, DataError) as error:
+            for name in values:
+                self._unclocked[name] += 1
+                sentence = f"{error.path}: {error.message}; first: {error.got}"
+                self._notes.setdefault(name, note("refused", sentence))
+            return
+        if not admitted.key:
+            self._entrance.done(admitted)
+            return
+        made = self._steps.step(admitted)
+        for full in self._steps.overflows():
+            sentence = f"{full.path}: {full.message}; its oldest values give way"
+            self._notes[str(full.path)] = note("counted", sentence)
+        self._entrance.done(admitted)
+        if self._record != "nothing":
+            for k, value in admitted.values:
+                self._arrived[k].add(stamp, flatten(value, self._types[k]))
+        for columns, (name, type_), leaves in zip(self._made, self._outputs, made, strict=False):
+            if leaves is not None:
+                if self._record == "all":
+                    columns.add(stamp, leaves)
+                if self._watch is not None:
+                    self._watch(name, stamp, unflatten(type_, iter(leaves)))
+        ended = perf_counter_ns()
+        self._wall += (ended - begun) * 1e-9
+        for kept, since in zip(self._times, (max(e.arrived for e in events), complete, begun), strict=True):
+            kept.add(ended - since)
+        self._missed += self._deadline is not None and ended - complete > self._deadline
+
+    # -- what comes out ----------------------------------------------------------------------------------
+
+    def close(self) -> Result:
+        """Take nothing in any more, make the ticks of all that waits, and end.
+
+        Raises:
+            FlowgraphError: what ended the run before.
+        """
+        self._boxes.close()
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self.result()
+
+    def result(self) -> Result:
+        """The run so far; whole after `close`."""
+        with self._alone:
+            return self._result()
+
+    def _result(self) -> Result:
+        state = self._steps.state
+        series = {name: c.series() for c, (name, _) in zip(self._made, self._outputs, strict=True)}
+        stats = {**statistics(self.graph, state), **{kind: n for kind, n in self.counts.items() if n}}
+        notes = (*self._notes.values(), *self._count_notes())
+        return Result(
+            self.graph.name, self._engine, series, state, stats, self._steps.ticks, self._wall, notes
+        )
+
+    @property
+    def arrived(self) -> dict[str, Series]:
+        """What was in ticks, by source: run over it, the same engine gives the same result."""
+        with self._alone:
+            return {name: c.series() for c, name in zip(self._arrived, self._names, strict=True)}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The registers after the last tick, from which another run may go on."""
+        with self._alone:
+            return self._steps.state
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """By source and kind, such as "imu.late": nothing that came is in none of them.
+
+        `taken` into the queue; of these `late`, `twice` (one stamp came again), `dropped` (gave way),
+        `unclocked` (not as the clock was declared) and `absent` (not finite) made no tick. `refused` at a
+        full or closed queue; `lost` are whole periods of a periodic source without an event.
+        """
+        kinds = {
+            "taken": self._boxes.taken_in, "late": self._order.late, "twice": self._order.twice,
+            "dropped": self._boxes.dropped, "refused": self._boxes.refused,
+            "unclocked": list(self._unclocked.values()), "absent": list(self._entrance.absent.values()),
+            "lost": list(self._entrance.lost.values()),
+        }  # fmt: skip
+        return {f"{n}.{kind}": counts[k] for k, n in enumerate(self._names) for kind, counts in kinds.items()}
+
+    @property
+    def latencies(self) -> Latencies:
+        """How long the ticks took so far."""
+        shown = [
+            {f"p{p:g}": d.percentile(p) for p in (50.0, 90.0, 99.0, 99.9)} | {"max": d.longest * 1e-9}
+            for d in self._times
+        ]
+        return Latencies(shown[0], shown[1], shown[2], self._missed)
+
+    def _count_notes(self) -> list[str]:
+        found = []
+        for name in self._names:
+            said = [
+                f"{n} {kind}"
+                for kind in ("late", "twice", "dropped", "refused", "unclocked", "absent", "lost")
+                if (n := self.counts[f"{name}.{kind}"])
+            ]
+            if said:
+                found.append(note("counted", f"{name}: {', '.join(said)}"))
+        if self._missed:
+            found.append(
+                note("counted", f"{self._missed} of {self._times[1].count} ticks missed the deadline")
+            )
+        return found
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._boxes.close()
+        self._thread.join()
+        if kind is None and self._error is not None:
+            raise self._error

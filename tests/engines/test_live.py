@@ -1,0 +1,316 @@
+"""Live runs: from several threads and event loops, late and in disorder, nothing is lost uncounted."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flowgraph import (
+    DataError,
+    DeclarationError,
+    Live,
+    Scalar,
+    Stream,
+    TypeMismatchError,
+    UnknownNameError,
+    aperiodic,
+    block,
+    delay,
+    graph,
+    match,
+    merge,
+    periodic,
+    simulate,
+    sink,
+)
+from flowgraph.engines.mailbox import Event, Mailboxes, Order
+from tests.support import MS, scalars
+
+ENGINES = ("python", "c")
+
+
+@block
+def plus(total: Scalar, x: Scalar, *, dt: float) -> Scalar:
+    return total + x + 0.0 * dt
+
+
+@graph
+def summed(a: Stream[Scalar], b: Stream[Scalar]):
+    """The sum of all that came, of both where both did."""
+    total = delay(0.0, name="total")
+    now = plus(total, merge(a, b, tie="left"))
+    total.feed(now)
+    return {"now": now}
+
+
+@graph
+def paired(a: Stream[Scalar], b: Stream[Scalar]):
+    return match(a, b, tolerance=0, size=2)
+
+
+SUMMED = summed.build()
+
+
+def same_streams(a: Any, b: Any) -> None:
+    for name, series in a.series.items():
+        np.testing.assert_array_equal(series.time, b[name].time)
+        for leaf, values in series.leaves.items():
+            np.testing.assert_array_equal(values, b[name].leaves[leaf])
+
+
+def known(live: Live, name: str) -> int:
+    """Events of a source that are in a count or in a tick."""
+    kinds = ("late", "twice", "dropped", "refused", "unclocked", "absent")
+    return sum(live.counts[f"{name}.{kind}"] for kind in kinds) + len(live.arrived[name])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_threads_that_push_without_a_lock_lose_nothing(engine):
+    live, each = Live(SUMMED, engine=engine, queue=16, lateness="10s"), 400
+
+    def pushes(source: str, first: int) -> None:
+        for k in range(first, first + each):
+            live.push(2 * k + (source == "b"), **{source: 1.0})
+
+    threads = [threading.Thread(target=pushes, args=(s, n * each)) for n in range(3) for s in "ab"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    result = live.close()
+    assert [known(live, s) for s in "ab"] == [3 * each] * 2
+    made = len(live.arrived["a"]) + len(live.arrived["b"])
+    assert float(result.state["registers"]["total"]) == result.ticks == made
+    same_streams(result, simulate(SUMMED, live.arrived, engine=engine))
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data(), lateness=st.integers(0, 8))
+def test_disorder_within_the_lateness_is_put_right(data, lateness):
+    """The ticks are those of the sorted events, as long as none comes later than was declared."""
+    second = 10**9  # so long nothing is taken for complete because nothing comes
+    stamps = data.draw(st.lists(st.integers(0, 40), unique=True, min_size=1, max_size=25))
+    late = {t: data.draw(st.integers(0, lateness)) for t in stamps}
+    which = {t: data.draw(st.sampled_from(("a", "b"))) for t in stamps}
+    with Live(SUMMED, lateness=lateness * second, queue=64) as live:
+        for t in sorted(stamps, key=lambda t: (t + late[t], t)):
+            live.push(t * second, **{which[t]: float(t)})
+    result = live.result()
+    times = {s: np.array(sorted(t for t in stamps if which[t] == s), np.int64) for s in "ab"}
+    assert result.ticks == len(stamps)
+    same_streams(
+        result, simulate(SUMMED, {s: scalars(t * second, t.astype(float)) for s, t in times.items()})
+    )
+
+
+def test_what_is_too_late_or_comes_twice_is_counted():
+    order = Order(2, 10, 100)
+    given_ = [(0, 0), (1, 5), (0, 20), (0, 9), (1, 9), (0, 12), (0, 12), (0, 40)]
+    taken, made = [], []
+    for n, (source, stamp) in enumerate(given_):
+        taken.append(order.put(Event(n, stamp, source, None, 0)))
+        made += [(t, [e.source for e in events]) for t, events in order.ready()]
+    assert taken == [True, True, True, True, False, True, False, True]
+    assert (order.late, order.twice) == ([0, 1], [1, 0])
+    assert made == [(0, [0]), (5, [1]), (9, [0]), (12, [0]), (20, [0])]
+    assert [t for t, _ in order.ready(everything=True)] == [40]
+    assert not order.waiting
+
+
+def test_events_of_one_stamp_are_one_tick_and_no_more_are_held_than_said():
+    order = Order(2, 10**9, 2)
+    order.put(Event(0, 7, 1, None, 0))
+    order.put(Event(1, 7, 0, None, 0))
+    assert order.ready() == []
+    order.put(Event(2, 8, 0, None, 0))
+    ((stamp, events),) = order.ready()
+    assert (stamp, [e.source for e in events]) == (7, [0, 1])
+
+
+def test_policies_of_a_full_queue():
+    for full, kept, dropped, refused in (("refuse", [0, 1], 0, 1), ("drop_oldest", [1, 2], 1, 0)):
+        boxes = Mailboxes(2, 2, full)
+        taken = [boxes.put(0, k, None, 0) for k in range(3)]
+        assert taken == [True, True, not refused]
+        assert boxes.put(1, 9, None, 0)  # the other queue has room
+        assert (boxes.dropped, boxes.refused) == ([dropped, 0], [refused, 0])
+        found = boxes.take(0.0)
+        assert found is not None
+        assert [e.stamp for e in found] == [*kept, 9]
+    boxes = Mailboxes(1, 1, "block")
+    boxes.put(0, 0, None, 0)
+    assert not boxes.put(0, 1, None, 0, timeout=0.01)
+    assert boxes.refused == [1]
+    later = threading.Thread(target=lambda: boxes.put(0, 2, None, 0))
+    later.start()
+    assert len(boxes.take(1.0) or ()) == 1
+    later.join(5.0)
+    assert boxes.taken_in == [2]
+    boxes.close()
+    assert not boxes.put(0, 3, None, 0)
+    assert [e.stamp for e in boxes.take(None) or ()] == [2]
+    assert boxes.take(None) is None
+
+
+@pytest.mark.parametrize("full", ["block", "drop_oldest", "refuse"])
+def test_a_slow_run_says_what_it_lost(full):
+    gone = threading.Event()
+
+    def slow(name: str, stamp: int, value: Any) -> None:
+        gone.wait(5.0)
+
+    live = Live(SUMMED, queue=4, full=full, on_output=slow)
+    for k in range(4):
+        assert live.push(k, a=1.0)
+    if full != "block":
+        time.sleep(0.05)
+        for k in range(4, 20):
+            live.push(k, a=1.0)
+    gone.set()
+    result = live.close()
+    assert known(live, "a") == (4 if full == "block" else 20)
+    lost = live.counts["a.dropped"] + live.counts["a.refused"]
+    assert (lost == 0) == (full == "block")
+    assert any(note.startswith("counted: a: ") for note in result.notes) == (full != "block")
+
+
+def test_an_event_loop_pushes():
+    live = Live(SUMMED, queue=2, lateness="60s")
+
+    async def pushes(source: str, offset: int) -> None:
+        for k in range(30):
+            assert await live.push_async(k * 1000 + offset, **{source: 1.0})
+            await asyncio.sleep(0)
+
+    async def both() -> None:
+        await asyncio.gather(pushes("a", 0), pushes("b", 1))
+
+    asyncio.run(both())
+    result = live.close()
+    assert [known(live, s) for s in "ab"] == [30, 30]  # of so few that are held some come too late
+    assert float(result.state["registers"]["total"]) == result.ticks > 0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_clock_is_kept_and_the_run_goes_on(engine):
+    @graph
+    def echo(a: Stream[Scalar]):
+        return a.map(lambda x: 2.0 * x)
+
+    built = echo.build(a=periodic("10ms", jitter="1ms"))
+    with Live(built, engine=engine, not_finite="absent") as live:
+        for t in (0, 10, 40, 43, 53, 63):  # two lost, one too early, which may have been a jump of the clock
+            live.push(t * MS, a=np.nan if t == 63 else float(t))
+    result = live.result()
+    assert result.output.time.tolist() == [0, 10 * MS, 40 * MS, 53 * MS]
+    assert {k: n for k, n in live.counts.items() if n} == {
+        "a.taken": 6, "a.lost": 2, "a.unclocked": 1, "a.absent": 1,
+    }  # fmt: skip
+    assert any(note.startswith("refused: a, event 1: ") for note in result.notes)
+    assert "counted: a: 1 unclocked, 1 absent, 2 lost" in result.notes
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_full_match_gives_up_its_oldest_and_says_so(engine):
+    built = paired.build(a=aperiodic(), b=aperiodic())
+    with Live(built, engine=engine, lateness="1s") as live:
+        for t in range(5):
+            live.push(t, a=float(t))
+        live.push(4, b=0.5)
+    result = live.result()
+    assert result.output.time.tolist() == [4]
+    assert result.stats["match.expired_a"] == 3 + 1
+    assert [n for n in result.notes if n.startswith("counted: match")] == [
+        "counted: match: the queue is full; its oldest values give way"
+    ]
+
+
+def test_an_event_that_is_refused_is_refused_to_who_pushed_it():
+    with Live(SUMMED) as live:
+        with pytest.raises(UnknownNameError, match="no source is called 'c'"):
+            live.push(0, c=1.0)
+        with pytest.raises(DataError, match="a value is not finite"):
+            live.push(0, a=np.nan)
+        with pytest.raises(DataError, match="times must be integer nanoseconds"):
+            live.push(0.5, a=1.0)  # type: ignore[arg-type]
+        with pytest.raises(TypeMismatchError):
+            live.push(0, a=np.zeros(3))
+        live.push(1, a=2.0)
+    assert live.result().ticks == 1
+    with pytest.raises(DataError, match="this live run has ended"):
+        live.push(2, a=1.0)
+
+
+def test_what_ends_the_run_is_raised():
+    @graph
+    def breaks(a: Stream[Scalar]):
+        sink(a, lambda x: 1 / 0)
+        return a.map(lambda x: x + 1.0)
+
+    live = Live(breaks.build())
+    live.push(0, a=1.0)
+    with pytest.raises(ZeroDivisionError):
+        live.close()
+    with pytest.raises(ZeroDivisionError):
+        live.push(1, a=1.0)
+    with pytest.raises(ZeroDivisionError), Live(breaks.build()) as other:
+        other.push(0, a=1.0)
+
+
+def test_what_cannot_be_live_is_refused():
+    with pytest.raises(DeclarationError, match="the reference engine makes no single ticks"):
+        Live(SUMMED, engine="reference")
+    with pytest.raises(UnknownNameError, match="rule for full"):
+        Live(SUMMED, full="wait")
+    with pytest.raises(UnknownNameError, match="rule for record"):
+        Live(SUMMED, record="some")
+    with pytest.raises(DataError, match="a queue holds one event or more"):
+        Live(SUMMED, queue=0)
+
+    @graph
+    def shown(a: Stream[Scalar]):
+        doubled = a.map(lambda x: 2.0 * x)
+        sink(doubled, lambda x: None)
+        return doubled
+
+    with pytest.raises(DeclarationError, match="blocks of the host run in the Python engine"):
+        Live(shown.build(), engine="c")
+
+
+def test_deadlines_and_latencies():
+    def slow(name: str, stamp: int, value: Any) -> None:
+        time.sleep(0.003)
+
+    with Live(SUMMED, deadline="2ms", on_output=slow, record="nothing") as live:
+        for k in range(5):
+            live.push(k, a=1.0)
+    took = live.latencies
+    assert took.deadline_missed == 5
+    assert 0.003 <= took.work["p50"] <= took.work["max"]
+    assert took.arrival["max"] >= took.response["max"] >= 0.003
+    assert "counted: 5 of 5 ticks missed the deadline" in live.result().notes
+    assert len(live.arrived["a"]) == len(live.result().now) == 0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_recording_is_played_at_its_pace_and_gone_on_with(engine):
+    inputs: Mapping[str, Any] = {"a": scalars(np.arange(6) * 10 * MS), "b": scalars([15 * MS, 35 * MS])}
+    whole = simulate(SUMMED, inputs, engine=engine)
+    begun = time.perf_counter()
+    with Live(SUMMED, engine=engine, deadline="10s") as live:
+        assert live.play(inputs, speed=0.5) == 0
+    assert time.perf_counter() - begun >= 0.1
+    same_streams(live.result(), whole)
+    with Live(SUMMED, engine=engine, state=live.state) as more:
+        more.push(60 * MS, b=1.0)
+        more.push(50 * MS, b=1.0)
+    assert more.counts["b.late"] == 1
+    assert float(more.result().now["value"][0]) == float(whole.now["value"][-1]) + 1.0
