@@ -61,7 +61,7 @@ from flowgraph.blocks.filtering.proposals import (
 )
 from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
 from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
-from flowgraph.blocks.filtering.towards import find_cloud_back
+from flowgraph.blocks.filtering.towards import Moved, deviations, find_cloud_back, moved_towards
 from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
 from flowgraph.blocks.kalman import LinearModel, smooth
@@ -76,6 +76,9 @@ from flowgraph.blocks.statespace import (
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
+    "moved_towards",
+    "deviations",
+    "Moved",
     "crossed",
     "loss_of",
     "Recording",

@@ -34,6 +34,7 @@ from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, le
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import (
     FARTHEST,
+    GROWN,
     PATIENCE,
     UNKNOWN_TURN,
     Held,
@@ -46,7 +47,7 @@ from flowgraph.blocks.kalman.lost import (
     stay,
 )
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
-from flowgraph.blocks.kalman.robust import Robust, huber, student_t
+from flowgraph.blocks.kalman.robust import Robust, huber, reweighted, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import (
     Steps,
@@ -63,6 +64,8 @@ from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semid
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "reweighted",
+    "GROWN",
     "Robust",
     "huber",
     "student_t",

@@ -25,12 +25,17 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.cloud import (
+    MOVED,
+    POSITION,
+    TURN,
+    VELOCITY,
     as_cloud,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
+    turned,
 )
 from flowgraph.blocks.outdoor.corrections import (
     correct_distance,
@@ -48,6 +53,11 @@ from flowgraph.blocks.outdoor.flight import (
 )
 
 __all__ = [
+    "turned",
+    "VELOCITY",
+    "TURN",
+    "POSITION",
+    "MOVED",
     "clone_crossing",
     "outdoor_steps",
     "picture_cross",
