@@ -165,8 +165,8 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
         DeclarationError, UnknownNameError: for a setting that is out of range.
     """
     inputs, world, name = filter.inputs(on)
-    antenna, known = filter.antenna(on, name)
-    estimated = filter.estimated(on, inputs, known)
+    antenna, measured = filter.antenna(on, name)
+    estimated = filter.estimated(on, inputs, measured)
     start, inputs, invariant = filter.started(on, inputs, world, estimated, antenna)
     simulated = "noise" in on.flight.info or "still" in on.flight.info
     known: dict[str, Any] = {

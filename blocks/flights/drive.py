@@ -268,8 +268,9 @@ def _sensed(
     noise = values.get(f"{name}.noise", 0.0)
     if name == "gps":
         spread = noise * np.array([1.0, 1.0, 2.0])
-        place = from_enu(p + draw("gps", n, 3) * spread, ORIGIN)
-        return GnssFix(*place.T, covariance=np.tile(np.diag(spread**2), (n, 1, 1)))
+        latitude, longitude, height = from_enu(p + draw("gps", n, 3) * spread, ORIGIN).T
+        covariance = np.tile(np.diag(spread**2), (n, 1, 1))
+        return GnssFix(latitude=latitude, longitude=longitude, height=height, covariance=covariance)
     if name == "gps_velocity":
         seen = v + draw(name, n, 3) * noise
         return GnssVelocity(velocity=seen, covariance=np.tile(np.eye(3) * noise**2, (n, 1, 1)))

@@ -146,10 +146,10 @@ def navigation_recording(
 def _belief(x: Array, covariance: Array, xp: Any) -> Any:
     """A state (size) with names."""
     ends = (0, 3, 6, 10, 13, 16)
-    parts = [x[..., a:b] for a, b in pairwise(ends)]
+    parts: tuple[Any, ...] = (*(x[..., a:b] for a, b in pairwise(ends)),)
     if x.shape[-1] == 16:
-        return Belief(*parts, covariance)
-    return NavigationBelief(*parts, x[..., 16:], covariance)
+        return Belief(*(*parts, covariance))
+    return NavigationBelief(*(*parts, x[..., 16:], covariance))
 
 
 def _stacked(series: Series, space: StateSpace) -> Series:

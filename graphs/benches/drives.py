@@ -116,7 +116,7 @@ def _run(
     return found, np.sqrt(traces)
 
 
-def _exact(inputs: dict[str, Series], truth: Series) -> dict[str, Series]:
+def _exact(inputs: Any, truth: Series) -> dict[str, Series]:
     """The fixes without noise; readings are as they are, since what the bound hangs on is the motion."""
     at = lambda s: np.searchsorted(truth.time, s.time)
     gnss, speed = inputs["gnss"], inputs["gnss_velocity"]

@@ -16,7 +16,8 @@ import numpy as np
 
 from flowgraph import Case, Flight, Report, Result, UnknownNameError, find_graph, load_flight, simulate
 from flowgraph.blocks.metrics.chi_square import chi_square_band
-from flowgraph.data.registry import flight_settings, parsed_settings
+from flowgraph.data.registry import flight_settings
+from flowgraph.data.settings import parsed_settings
 from flowgraph.errors import FlowgraphError
 from flowgraph.graphs.benches.fault_kinds import Fault, faults_of
 from flowgraph.types import flatten, leaves_of, unflatten

@@ -142,6 +142,8 @@ def _rows(
         rtk = rtk[held]
         flight = replace(flight, streams={**flight.streams, "rtk": rtk})
     case = gnss_ins.case(flight, smooth="rts", settle=SETTLE)
+    assert isinstance(case.inputs, Mapping)
+    assert flight.truth is not None
     fixes = case.inputs["gnss"]
     judged = judging(flight.truth, rtk, fixes, span)
     for method, found in _found(case, fixes, judged.time, engine).items():

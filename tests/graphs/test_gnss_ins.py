@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +25,13 @@ from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.inertial.test_outdoors import moved
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 from tests.recordings import recordings
+
+
+def streams_of(flight: Flight) -> Mapping[str, Any]:
+    """The streams that the graph has of a flight."""
+    found = gnss_ins.case(flight).inputs
+    assert isinstance(found, Mapping)
+    return found
 
 
 @functools.cache
@@ -88,6 +96,7 @@ def test_an_aid_that_goes_wrong_is_refused_and_found_again():
     """For 2 s all positions are 80 m off: with a gate they change little, and after it they count again."""
     flight = drive(20.0, "gps,gps_velocity,wheels", imu__rate="25", gps__rate="5")
     case = gnss_ins.case(flight, gate=0.999)
+    assert isinstance(case.inputs, Mapping)
     gnss = case.inputs["gnss"]
     off = gnss.values.position.copy()
     wrong = (gnss.time >= 8 * 10**9) & (gnss.time < 10 * 10**9 - 10**8)
@@ -142,9 +151,7 @@ def test_positions_may_be_geodetic_or_in_metres_with_covariances_or_without():
         "geodetic": Series(
             gps.time, GeodeticPosition(gps["latitude"], gps["longitude"], gps["height"]), name="gps"
         ),
-        "metres": Series(
-            gps.time, Position(position=gnss_ins.case(flight).inputs["gnss"]["position"]), name="rtk"
-        ),
+        "metres": Series(gps.time, Position(position=streams_of(flight)["gnss"]["position"]), name="rtk"),
     }
     for kind, series in kinds.items():
         made = replace(flight, streams={"imu": flight.streams["imu"], series.name: series})
@@ -200,7 +207,7 @@ def test_a_unit_of_navigation_grade_goes_on_alone_on_a_turning_earth():
     streams = {n: s if n == "imu" else cut(s) for n, s in flight.streams.items()}
     assert scored(replace(flight, streams=streams), settle=60.0)["position_rmse_m"] < 25.0
     flat = {n: s for n, s in streams.items() if n == "imu"} | {
-        "gnss": gnss_ins.case(flight).inputs["gnss"], "gnss_velocity": streams["gps_velocity"]
+        "gnss": streams_of(flight)["gnss"], "gnss_velocity": streams["gps_velocity"]
     }  # fmt: skip
     flat["gnss"] = cut(flat["gnss"])
     assert scored(replace(flight, streams=flat), settle=60.0)["position_rmse_m"] > 50.0

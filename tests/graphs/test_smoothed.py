@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -69,7 +71,8 @@ def test_a_loss_is_a_setting_of_a_batch():
 def test_the_smoother_of_a_pose_filter_is_a_pipeline_too():
     case = made("ukf", 1.5, smooth="rts")
     result = simulate(case.graph, case.inputs)
-    prior, posterior, cross, space, _ = case.score.steps(result)
+    score: Any = case.score
+    prior, posterior, cross, space, _ = score.steps(result)
     host = rauch_tung_striebel(prior, posterior, cross, space=space)
     graph = smoother.build(space=space, sizes=sizes_of(space))
     for engine in ("python", "reference", "c"):

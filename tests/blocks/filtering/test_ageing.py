@@ -22,7 +22,8 @@ from flowgraph.blocks.filtering import (
     square_root,
     unscented,
 )
-from tests.blocks.filtering.test_filtered import CAR, GPS, START, Fix, Steering, driven
+from flowgraph.blocks.signals import Steering
+from tests.blocks.filtering.test_filtered import CAR, GPS, START, Fix, driven
 from tests.support import all_engines, both_quick
 
 MS = 1_000_000

@@ -61,7 +61,7 @@ def somewhere(seed: int, estimated: tuple[str, ...] = ALL) -> Any:
     """A belief about a moving, turned body, with everything estimated."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
-    b = start_belief(rng.normal(size=3), q / np.linalg.norm(q), velocity=5.0 * rng.normal(size=3))
+    b: Any = start_belief(rng.normal(size=3), q / np.linalg.norm(q), velocity=5.0 * rng.normal(size=3))
     b = b.replace(gyro_bias=0.1 * rng.normal(size=3), accelerometer_bias=rng.normal(size=3))
     b = extended(b, estimated)
     if estimated:

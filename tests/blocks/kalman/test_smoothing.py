@@ -89,7 +89,10 @@ def test_it_is_the_smoother_of_pykalman_with_its_lag_one_covariances():
 
 def test_all_covariances_are_those_of_the_whole_track_at_once():
     """The posterior of the stacked states of twelve ticks, by one solution of all of it."""
-    prior, posterior, _ = (s[:12] for s in filtered())
+    before, after, _ = filtered()
+    prior, posterior = before[:12], after[:12]
+    assert isinstance(prior, Series)
+    assert isinstance(posterior, Series)
     F = MODEL.transitions(prior.time)
     Q = [MODEL.discrete(dt, np, float)[2] for dt in np.diff(prior.time) * 1e-9]
     n, information = 12, np.zeros((24, 24))
