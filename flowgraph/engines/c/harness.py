@@ -55,7 +55,8 @@ def write_c(
 
 
 FLAGS = (
-    "-O3 -fno-math-errno -fno-trapping-math -ffp-contract=fast -fopenmp-simd -DFLOWGRAPH_SIMD -Wall -Wextra"
+    "-O3 -fno-tree-slp-vectorize -fno-math-errno -fno-trapping-math -ffp-contract=fast -fopenmp-simd "
+    "-DFLOWGRAPH_SIMD -Wall -Wextra"
 )
 """What gcc and clang understand alike, for any processor; none changes what NaN or infinity mean."""
 
