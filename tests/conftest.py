@@ -1,4 +1,5 @@
-"""What holds for all tests: without a C compiler, those that need one are skipped, and say so.
+"""What holds for all tests: without a C compiler, those that need one are skipped, and say so; those that
+`tests/slow.txt` names are slow.
 
 And what several of them need: a package of somebody else's, installed for one test.
 """
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 from flowgraph import MissingDependencyError
+from tests import times
 from tests.support import Install
 
 COMPILER = shutil.which(os.environ.get("CC") or "cc")
@@ -28,6 +30,24 @@ def pytest_runtest_call() -> Generator[None, Any, Any]:
         if COMPILER is None and "C compiler" in str(error):
             pytest.skip("needs a C compiler")
         raise
+
+
+@pytest.hookimpl(tryfirst=True)  # before those that are slow are left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    slow = times.listed()
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
+    before = times.cpu()
+    done = yield
+    folder = os.environ.get("FLOWGRAPH_TEST_TIMES")
+    if folder:
+        times.note(folder, item.nodeid, times.cpu() - before)
+    return done
 
 
 @pytest.fixture
