@@ -247,7 +247,7 @@ def test_the_stamps_of_one_stream_can_be_those_of_the_recording(tmp_path):
     flight = rosbag.load(str(tmp_path / "b"), settings=given)
     assert flight.streams["imu"].time.tolist() == [t + 7 for t in TIMES]
     assert flight.streams["vicon"].time[0] == TIMES[0] + 5
-    refused(tmp_path / "b", "bag, header", kind=UnknownNameError, **{"imu.stamp": "mine"})
+    refused(tmp_path / "b", "bag", kind=UnknownNameError, **{"imu.stamp": "mine"})
     refused(tmp_path / "b", "imu.time_offset", kind=DeclarationError, **{"imu.time_offset": "soon"})
     for setting in ("body", "frame", "stamp", "time_offset"):
         refused(tmp_path / "b", "'vicn'", "vicon", kind=UnknownNameError, **{f"vicn.{setting}": "1"})
