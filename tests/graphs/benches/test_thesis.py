@@ -38,7 +38,7 @@ def test_the_flight_is_that_of_a_world_without_gravity():
 @pytest.mark.slow
 def test_our_filters_are_below_the_figures_of_the_thesis_and_reach_the_bound():
     """Over 40 flights; and particles come near the error-state filter."""
-    rows = thesis(flights=40).rows
+    rows = thesis(flights=40, smoothed="").rows
     assert {row["setting"] for row in rows} == set(SETTINGS)
     reference = {row["setting"]: row["position_rmse_m"] for row in rows if row["filter"] == "eskf"}
     for row in rows:
