@@ -3,6 +3,7 @@
     flowgraph run examples/own_tracker.py:tracker --data examples/own_tracker.py:drive --out out/car
     flowgraph tune examples/own_tracker.py:tracker --data examples/own_tracker.py:drive --seeds 2 \
         --fit fix_noise=0.3:30 --fit turn_noise=0.001:1
+    flowgraph run examples/own_tracker.py:tracker --data examples/own_tracker.py:drive --set smooth=rts
     flowgraph lower examples/own_tracker.py:tracker --data examples/own_tracker.py:drive --target c -o out/c
     flowgraph batch examples/own_tracker_study.toml
 
@@ -87,11 +88,13 @@ def tracker(
     turn_noise: float = 0.02,
     push_noise: float = 0.2,
     method: str = "extended",
+    smoothing: bool = False,
 ):
     """A car, by what its driver does and where it is seen."""
     gps = MeasurementModel(CAR, seen, noise=fix_noise**2 * np.eye(2))
     motion = car(turn_noise, push_noise)
-    return filtered(motion, {gps: fix}, control=steering, start=START, method=METHODS[method]())
+    chosen = METHODS[method]()
+    return filtered(motion, {gps: fix}, control=steering, start=START, method=chosen, smoothing=smoothing)
 
 
 def drive(
@@ -128,9 +131,9 @@ def main() -> None:
         write_table(drive(seed=1), table)
         print(table.read_text().splitlines()[0])
         flight = load_flight(f"table:{table}")
-    case = find_graph(f"{__file__}:tracker").case(flight)
+    case = find_graph(f"{__file__}:tracker").case(flight, smooth="rts")
     for name, value in case.score(simulate(case.graph, case.inputs)).items():
-        print(f"{name:<24}{value:.4g}")
+        print(f"{name:<28}{value:.4g}")
 
 
 if __name__ == "__main__":

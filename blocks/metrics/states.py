@@ -136,6 +136,11 @@ class StateErrors:
             found.update(nees_summary(whole, P[:, rows[:, None], rows[None, :]]))
         return found | {"compared_ticks": float(len(chosen))}
 
+    @staticmethod
+    def telling(key: str) -> bool:
+        """Whether a figure of a smoothed run is worth a line beside that of the filter."""
+        return key not in ("compared_ticks", "nees_low", "nees_high")
+
     def apart(self, estimate: Series, truth: Series) -> dict[str, np.ndarray]:
         """Of each part that the truth has, the moves (n, tangent) that take the estimates to the truth."""
         right = self.true_parts(estimate, truth)

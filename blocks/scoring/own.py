@@ -5,7 +5,8 @@
 Each source of the graph takes the stream of its name; fields go by theirs. The graph's own keyword-only
 parameters are its settings, where a word on the command line can mean their values: numbers, texts, truth
 values, and arrays as numbers with commas between them. What is scored is the belief that the graph collects,
-over the `StateSpace` of its model, against the truth's fields that are called as its parts.
+over the `StateSpace` of its model, against the truth's fields that are called as its parts. A graph with a
+parameter `smoothing`, which it hands on to `filtered`, has the settings `smooth=rts` and `lag` too.
 
 A graph that needs more (a start from the first message, streams made of others, errors of another kind) says
 so with `on_flight`, and this is then not asked.
@@ -16,16 +17,18 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from flowgraph import Case, Flight, Series, clocks_of
 from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.kalman.smoothing import steps_of
 from flowgraph.blocks.metrics.states import ALIGNMENTS, StateErrors
 from flowgraph.blocks.scoring.cases import Scored
 from flowgraph.blocks.scoring.scorer import Scorer
-from flowgraph.blocks.scoring.settings import NotNegative, one_of
+from flowgraph.blocks.scoring.settings import NotNegative, Positive, one_of
 from flowgraph.data.notes import note
 from flowgraph.data.settings import keyword_types
 from flowgraph.errors import DataError, DeclarationError
@@ -65,6 +68,9 @@ def by_names(graph: GraphFunction) -> Callable[..., Case]:
         "settle": (NotNegative, Scored.settle),
         "align": (typing.Annotated[str, one_of(*ALIGNMENTS)], ALIGNMENTS[0]),
     }
+    if "smoothing" in known:
+        judging["smooth"] = (typing.Annotated[str, one_of("none", "rts")], "none")
+        judging["lag"] = (typing.Annotated[float | None, Positive.__metadata__[0]], None)
     judging = {n: found for n, found in judging.items() if n not in known}
     more = [
         inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d, annotation=t)
@@ -74,11 +80,13 @@ def by_names(graph: GraphFunction) -> Callable[..., Case]:
     def prepare(flight: Flight, **given: Any) -> Case:
         scored = {n: given.pop(n, default) for n, (_, default) in judging.items()}
         for n, value in scored.items():
-            for check in typing.get_args(judging[n][0])[1:]:
+            for check in typing.get_args(judging[n][0])[1:] if value is not None else ():
                 check(graph.name, n, value)
         inputs = _inputs(graph, flight)
         chosen = {n: d for n, d in graph.parameters[1].items() if d is not REQUIRED and d is not _EMPTY}
         chosen |= {n: Numbers(v) if known.get(n) is Numbers else v for n, v in given.items()}
+        if scored.get("smooth", "none") != "none" or scored.get("lag") is not None:
+            chosen["smoothing"] = True
         _need_settings(graph, chosen)
         built = graph.build(**clocks_of(inputs), **chosen)
         return Case(built, inputs, *_score(built, flight, scored), notes=_left_over(graph, flight))
@@ -216,7 +224,9 @@ def _score(graph: Graph, flight: Flight, scored: Mapping[str, Any]) -> tuple[Any
     if space is None or not space.names or estimate is None:
         return Scorer(flight.truth, _nothing, next(iter(types), ""), settle), next(iter(types), "")
     errors = StateErrors(space, scored.get("align", ALIGNMENTS[0]))
-    return Scorer(flight.truth, errors, estimate, settle), estimate
+    steps = partial(steps_of, space=space)
+    smooth, lag = scored.get("smooth", "none"), scored.get("lag")
+    return Scorer(flight.truth, errors, estimate, settle, steps=steps, smooth=smooth, lag=lag), estimate
 
 
 def _nothing(*_: Any, **__: Any) -> dict[str, float]:

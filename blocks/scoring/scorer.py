@@ -100,7 +100,8 @@ class Scorer:
                 smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
             for front, series in smoothed.items():
                 better = self._compared(named(series))
-                found.update({f"{front}_{key}": better[key] for key in SMOOTHED if key in better})
+                telling = getattr(self.errors, "telling", SMOOTHED.__contains__)
+                found.update({f"{front}_{key}": value for key, value in better.items() if telling(key)})
         return found
 
     def remarks(self, result: Result) -> tuple[str, ...]:

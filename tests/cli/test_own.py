@@ -40,6 +40,16 @@ def test_a_graph_of_a_file_runs_is_scored_and_drawn(here: Path):
     }  # fmt: skip
 
 
+def test_a_graph_of_a_file_that_collects_it_is_smoothed_by_a_setting(here: Path):
+    done = invoke("run", *CAR[:3], "--set", "smooth=rts", "--set", "lag=2", "--json")
+    assert done.exit_code == 0, done.output
+    figures = json.loads(done.stdout)
+    for part in ("position_rmse_m", "heading_rmse_deg", "speed_rmse_mps"):
+        assert figures[f"smoothed_{part}"] < figures[f"lagged_{part}"] < figures[part]
+    assert figures["smoothed_nees_mean"] < 6.0  # of 4 numbers, whose errors last for seconds
+    assert "lag" in invoke("run", *CAR, "--set", "lag=-1").stderr
+
+
 def test_a_graph_of_a_file_is_shown_and_lowered_to_c(here: Path):
     assert "steering" in invoke("show", *CAR).stdout
     assert invoke("lower", *CAR, "--target", "c", "-o", "made").exit_code == 0
