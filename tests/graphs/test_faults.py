@@ -138,7 +138,7 @@ UNSEEN = {
 
 UNGATED = {
     "ins_eskf", "ins_ekf_pose", "ins_ukf_pose", "ins_particle", "rbpf_outdoor", "outdoor_eskf", "marg",
-    "quaternion_ukf", "kalman", "async_kalman", "augmented_complementary",
+    "quaternion_ukf", "kalman", "async_kalman", "augmented_complementary", "gnss_ins",
 }  # fmt: skip
 """Filters in which a spike that neither a range nor a gate refuses lasts: it throws them off by 30 m/s and
 3 rad, and a filter that believes each measurement takes it for a bias, or one of the aids for a liar."""

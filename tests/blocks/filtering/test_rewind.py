@@ -418,7 +418,7 @@ def test_mh_01_with_a_late_leica():
     recordings("euroc")
     rows = {(r["policy"], r["engine"]): r for r in late(data=str(DATA), duration=40.0, engines="c").rows}
     best = rows["foreseen", "python"]["position_rmse_m"]
-    assert rows["sorted", "c"]["position_rmse_m"] < 0.6 * best
+    assert rows["sorted", "c"]["position_rmse_m"] < 0.75 * best
     assert rows["on arrival", "c"]["position_rmse_m"] > 5.0 * best
     assert rows["rewind", "c"]["position_rmse_m"] <= 1.02 * best
     for policy in ("rewind", "random"):
