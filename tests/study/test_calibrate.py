@@ -62,7 +62,7 @@ def test_what_cannot_be_calibrated_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_a_lever_and_a_mount_are_found_within_their_own_deviations(seed):
     assert np.abs(off(seed, 10.0)).max() < 3.5
 
