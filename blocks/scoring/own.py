@@ -28,7 +28,7 @@ from flowgraph.blocks.kalman.smoothing import steps_of
 from flowgraph.blocks.metrics.states import ALIGNMENTS, StateErrors
 from flowgraph.blocks.scoring.cases import Scored
 from flowgraph.blocks.scoring.scorer import Scorer
-from flowgraph.blocks.scoring.settings import NotNegative, Positive, one_of
+from flowgraph.blocks.scoring.settings import NotNegative, one_of, positive
 from flowgraph.data.notes import note
 from flowgraph.data.settings import keyword_types
 from flowgraph.errors import DataError, DeclarationError
@@ -70,7 +70,7 @@ def by_names(graph: GraphFunction) -> Callable[..., Case]:
     }
     if "smoothing" in known:
         judging["smooth"] = (typing.Annotated[str, one_of("none", "rts")], "none")
-        judging["lag"] = (typing.Annotated[float | None, Positive.__metadata__[0]], None)
+        judging["lag"] = (typing.Annotated[float | None, positive], None)
     judging = {n: found for n, found in judging.items() if n not in known}
     more = [
         inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d, annotation=t)
