@@ -73,6 +73,16 @@ from flowgraph.blocks.signals.particles import (
     StateKernels,
     Weights,
 )
+from flowgraph.blocks.signals.scores import (
+    Bounds,
+    Extremes,
+    NisFigures,
+    NisSums,
+    PoseFigures,
+    PoseSums,
+    Settling,
+    Tally,
+)
 from flowgraph.blocks.signals.sensors import (
     BodyRate,
     CoordinateAcceleration,
@@ -95,6 +105,14 @@ from flowgraph.blocks.signals.vision import (
 )
 
 __all__ = [
+    "Bounds",
+    "Extremes",
+    "NisFigures",
+    "NisSums",
+    "PoseFigures",
+    "PoseSums",
+    "Settling",
+    "Tally",
     "GRAVITY",
     "Position",
     "Velocity",
