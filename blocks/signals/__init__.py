@@ -35,6 +35,7 @@ from flowgraph.blocks.signals.calibration import (
     Rest,
     Window,
 )
+from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
     Attitude,
@@ -105,6 +106,9 @@ from flowgraph.blocks.signals.vision import (
 )
 
 __all__ = [
+    "BodyMotion",
+    "FigureShape",
+    "Vector",
     "Bounds",
     "Extremes",
     "NisFigures",
