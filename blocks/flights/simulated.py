@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights import drive, plane, worlds
+from flowgraph.blocks.flights import drive, figure, plane, worlds
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
@@ -57,7 +57,8 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
 
     Args:
         argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`);
-            plane for a point in the plane (see `plane`); drive for a car (see `drive`).
+            plane for a point in the plane (see `plane`); drive for a car (see `drive`); figure for the figure
+            made by a graph (see `figure`).
         seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
             change of one setting does not change the draws of another.
         settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
@@ -77,11 +78,12 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         return plane.load_plane(seed=seed, settings=settings)
     if argument == "drive":
         return drive.load_drive(seed=seed, settings=settings)
-    if argument not in ("", "quadrotor"):
-        raise UnknownNameError(
-            "simulated flight", argument, ["quadrotor", "plane", "drive", *worlds.WORLDS], path="sim"
-        )
+    if argument not in ("", "quadrotor", "figure"):
+        kinds = ["quadrotor", "figure", "plane", "drive", *worlds.WORLDS]
+        raise UnknownNameError("simulated flight", argument, kinds, path="sim")
     s = _settings(settings or {})
+    if argument == "figure":
+        return figure.load_figure(seed=seed, settings=s)
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
     end = round(s["duration"] * 1e9)
     time = np.arange(0, end + 1, imu_period, dtype=np.int64)

@@ -274,6 +274,7 @@ def nis_figures(sums: NisSums, *, xp: Any) -> NisFigures:
         nis_mean=sums.nis / xp.maximum(sums.parts, 1.0),
         nis_inside=sums.inside / xp.maximum(sums.count, 1.0),
         nis_count=sums.count,
+        nis_parts=sums.parts,
         nis_rejected=sums.rejected,
     )
 

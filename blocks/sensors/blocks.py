@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, block, when
+from flowgraph import block, when
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, rotate
 from flowgraph.blocks.signals import (
     GRAVITY,
@@ -54,7 +54,9 @@ def bias_at_start(*, deviation: float, draw: Any) -> Vector:
 
 
 @block
-def drift(walked: Vector, start: Vector, *, walk: float, dt: float, draw: Any, xp: Any) -> tuple[Vector, Vector]:
+def drift(
+    walked: Vector, start: Vector, *, walk: float, dt: float, draw: Any, xp: Any
+) -> tuple[Vector, Vector]:
     """A bias (3) that walks from `start`, by walk sqrt(dt) a step; it has not moved where it fires first.
 
     State: how far it has walked, from 0. Output: `start` and that."""
@@ -100,7 +102,12 @@ def read_pose(
 
 @block
 def read_position(
-    motion: BodyMotion, *, noise: float, lever: tuple[float, float, float] = (0.0, 0.0, 0.0), draw: Any, xp: Any
+    motion: BodyMotion,
+    *,
+    noise: float,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    draw: Any,
+    xp: Any,
 ) -> Position:
     """Where a point of the body is, p + R lever + error, m: of a prism or an antenna."""
     arm = rotate(motion.attitude, xp.asarray(lever, dtype=motion.position.dtype), xp=xp)

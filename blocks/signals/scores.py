@@ -51,11 +51,13 @@ class PoseFigures(Signal):
 
 
 class NisFigures(Signal):
-    """The figures of `nis_summary` but for its band, which follows from their count."""
+    """The figures of `nis_summary` but for its band, which follows from `nis_parts`, how many numbers there
+    were."""
 
     nis_mean: Array = real()
     nis_inside: Array = real()
     nis_count: Array = real()
+    nis_parts: Array = real()
     nis_rejected: Array = real()
 
 
