@@ -35,7 +35,8 @@ def figure(
 ):  # fmt: skip
     """A body on a smooth figure, with an inertial unit at `rate` Hz and a motion capture.
 
-    `start` ticks once, at 0: there the figure and the constant biases are drawn.
+    `start` ticks once, at 0: there the figure and the constant biases are drawn. There is a truth at every
+    reading of either.
     """
     shape = latest(figure_shape(at=start), init=_NO_SHAPE, name="shape")
     motion = figure_motion(shape, at=imu | vicon)
@@ -54,12 +55,14 @@ def figure(
     pose = read_pose(
         motion, at=vicon, position_noise=position_noise, attitude_noise=attitude_noise, draws="vicon"
     )
-    truth = true_state(motion, biases["gyro"], biases["accelerometer"], at=imu)
+    now = {n: latest(b, init=Vector(vector=np.zeros(3)), name=f"{n}_now") for n, b in biases.items()}
+    truth = true_state(motion, now["gyro"], now["accelerometer"])
     return {"imu": reading, "vicon": pose, "truth": truth}
 
 
 _NO_SHAPE = FigureShape(
-    sizes=np.zeros((3, 3)), frequencies=np.zeros((3, 3)), phases=np.zeros((3, 3)), yaw_phases=np.zeros(2)
+    **{n: np.zeros((3, 3)) for n in ("sizes", "frequencies", "phases", "origin")},
+    **{n: np.zeros(2) for n in ("yaw_phases", "yaw_origin")},
 )
 
 

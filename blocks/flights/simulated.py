@@ -142,7 +142,7 @@ def trajectory(seconds: np.ndarray, *, seed: int = 0) -> dict[str, np.ndarray]:
         m/s^2), both in the body.
     """
     random = generator(seed, "figure")
-    shape = shaped(lambda name, low, high, size: random.uniform(low, high, size))
+    shape = shaped(lambda name, low, high, size: random.uniform(low, high, size), xp=np)
     motion = smooth_motion(np.asarray(seconds, dtype=float), shape, xp=np)
     attitude = _quaternion(np.stack(motion["axes"], axis=-1))
     return {

@@ -140,11 +140,10 @@ def pose_sums(
     place, speed = p - truth.position, v - truth.velocity
     back = conjugate(q, xp=xp)
     turn = to_rotation_vector(multiply(back, truth.attitude, xp=xp), xp=xp)
-    away = multiply(q, conjugate(truth.attitude, xp=xp), xp=xp)
-    tilt, heading = parted(away, xp=xp)
+    tilt, heading = parted(multiply(q, conjugate(truth.attitude, xp=xp), xp=xp), xp=xp)
     R = to_matrix(q, xp=xp)
     variances = xp.concat([_diagonal(P[:3, :3], xp), xp.sum((R @ P[6:9, 6:9]) * R, axis=-1)])
-    offs = xp.concat([place, to_rotation_vector(away, xp=xp)])
+    offs = xp.concat([place, (R @ turn[:, None])[:, 0]])
     held = xp.astype(offs * offs <= 9.0 * variances, p.dtype)
     error = xp.concat([-place, -speed, turn])
     white = _forward(xp.linalg.cholesky(P), error, xp)

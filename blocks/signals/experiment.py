@@ -24,13 +24,16 @@ class BodyMotion(Signal):
 class FigureShape(Signal):
     """A smooth figure: three waves an axis, and two of the yaw.
 
-    sizes: m. frequencies: rad/s. phases, yaw_phases: rad, at the start.
+    sizes: m. frequencies: rad/s. phases, yaw_phases: rad, at the start. origin, yaw_origin: the value of each
+    wave there (m, rad), from which it counts.
     """
 
     sizes: Array = real(3, 3, unit="m")
     frequencies: Array = real(3, 3, unit="rad/s")
     phases: Array = real(3, 3, unit="rad")
     yaw_phases: Array = real(2, unit="rad")
+    origin: Array = real(3, 3, unit="m")
+    yaw_origin: Array = real(2, unit="rad")
 
 
 class Vector(Signal):

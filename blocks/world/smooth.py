@@ -26,20 +26,25 @@ _SIZES = np.array([[1.6], [1.6], [0.6]]) * np.array([1.0, 0.5, 0.25])
 _YAW = np.array([0.9, 0.3]), np.array([0.35, 0.9])  # rad, rad/s
 
 
-def shaped(uniform: Any) -> FigureShape:
+def shaped(uniform: Any, *, xp: Any) -> FigureShape:
     """The figure of random numbers: `uniform(name, low, high, shape)` draws those of a name."""
+    frequencies = _FREQUENCIES * uniform("frequencies", 0.85, 1.15, (3, 3))
+    sizes = _SIZES * uniform("sizes", 0.7, 1.3, (3, 3))
+    phases, yaw = uniform("phases", 0.0, 2.0 * np.pi, (3, 3)), uniform("yaw", 0.0, 2.0 * np.pi, (2,))
     return FigureShape(
-        frequencies=_FREQUENCIES * uniform("frequencies", 0.85, 1.15, (3, 3)),
-        sizes=_SIZES * uniform("sizes", 0.7, 1.3, (3, 3)),
-        phases=uniform("phases", 0.0, 2.0 * np.pi, (3, 3)),
-        yaw_phases=uniform("yaw", 0.0, 2.0 * np.pi, (2,)),
+        sizes=sizes,
+        frequencies=frequencies,
+        phases=phases,
+        yaw_phases=yaw,
+        origin=sizes * xp.sin(phases),
+        yaw_origin=_YAW[0] * xp.sin(yaw),
     )
 
 
 @block
-def figure_shape(*, draw: Any) -> FigureShape:
+def figure_shape(*, draw: Any, xp: Any) -> FigureShape:
     """Draw the figure of a flight. Give it a clock that ticks once: `figure_shape(at=start)`."""
-    return shaped(lambda name, low, high, shape: low + (high - low) * draw.uniform(name, shape))
+    return shaped(lambda name, low, high, shape: low + (high - low) * draw.uniform(name, shape), xp=xp)
 
 
 @block
@@ -64,10 +69,10 @@ def smooth_motion(t: Array, shape: FigureShape, *, xp: Any) -> dict[str, Any]:
         in the world; rate (rad/s) and force (specific force, m/s^2), both (..., 3) in the body.
     """
     clock = _phase(t, xp)
-    waves = _waves(clock[0], shape.sizes, shape.frequencies, shape.phases, xp)
-    found = [xp.stack([f[k] for k in range(3)], axis=-1) for f in _through(waves, clock)]
+    waves = _waves(clock[0], shape.sizes, shape.frequencies, shape.phases, shape.origin, xp)
+    found = [xp.stack([f[k] for k in range(3)], axis=-1) for f in _through(waves, clock, xp)]
     position, velocity, acceleration, jerk = found
-    yaw, yaw_rate = _through(_waves(clock[0], *_YAW, shape.yaw_phases, xp), clock)[:2]
+    yaw, yaw_rate = _through(_waves(clock[0], *_YAW, shape.yaw_phases, shape.yaw_origin, xp), clock, xp)[:2]
 
     thrust = acceleration - xp.asarray(np.array(GRAVITY), dtype=acceleration.dtype)
     strength = xp.sqrt(_dot(thrust, thrust, xp))
@@ -107,14 +112,17 @@ def _phase(t: Array, xp: Any) -> tuple[Array, ...]:
     """A time that stands still for `AT_REST`, then speeds up to 1 over `_RAMP`; with three derivatives."""
     u = xp.clip((t - AT_REST) / _RAMP, 0.0, 1.0)
     after = xp.maximum(t - AT_REST - _RAMP, 0.0)
-    value = _RAMP * (2.5 * u**4 - 3.0 * u**5 + u**6) + after
-    first = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
-    second = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / _RAMP
-    third = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / _RAMP**2
+    u2, u3, u4, u5, u6 = u * u, *(xp.pow(u, float(k)) for k in range(3, 7))
+    value = _RAMP * (2.5 * u4 - 3.0 * u5 + u6) + after
+    first = 10.0 * u3 - 15.0 * u4 + 6.0 * u5
+    second = (30.0 * u2 - 60.0 * u3 + 30.0 * u4) / _RAMP
+    third = (60.0 * u - 180.0 * u2 + 120.0 * u3) / _RAMP**2
     return value, first, second, third
 
 
-def _waves(phase: Array, sizes: Array, frequencies: Array, phases: Array, xp: Any) -> tuple[Array, ...]:
+def _waves(
+    phase: Array, sizes: Array, frequencies: Array, phases: Array, origin: Array, xp: Any
+) -> tuple[Array, ...]:
     """Sums of sinusoids (..., waves) that start at 0, and three derivatives with respect to `phase` (n...);
     each is (..., n...)."""
     behind = (..., *(None,) * phase.ndim)  # the times last, for speed
@@ -123,20 +131,20 @@ def _waves(phase: Array, sizes: Array, frequencies: Array, phases: Array, xp: An
     angle = w * phase + start
     sine, cosine = sizes * xp.sin(angle), sizes * xp.cos(angle)
     return (
-        xp.sum(sine - sizes * xp.sin(start), axis=along),
+        xp.sum(sine - origin[behind], axis=along),
         xp.sum(cosine * w, axis=along),
-        xp.sum(-sine * w**2, axis=along),
-        xp.sum(-cosine * w**3, axis=along),
+        xp.sum(-sine * (w * w), axis=along),
+        xp.sum(-cosine * xp.pow(w, 3.0), axis=along),
     )
 
 
-def _through(f: tuple[Array, ...], s: tuple[Array, ...]) -> tuple[Array, ...]:
+def _through(f: tuple[Array, ...], s: tuple[Array, ...], xp: Any) -> tuple[Array, ...]:
     """The chain rule: f and its derivatives in time, given those of f in s and of s in time."""
     return (
         f[0],
         f[1] * s[1],
-        f[2] * s[1] ** 2 + f[1] * s[2],
-        f[3] * s[1] ** 3 + 3.0 * f[2] * s[1] * s[2] + f[1] * s[3],
+        f[2] * (s[1] * s[1]) + f[1] * s[2],
+        f[3] * xp.pow(s[1], 3.0) + 3.0 * f[2] * s[1] * s[2] + f[1] * s[3],
     )
 
 

@@ -128,12 +128,18 @@ def structure(pipeline: Pipeline) -> tuple[Any, ...]:
     )
 
 
-def is_table(array: np.ndarray) -> bool:
-    """Whether a constant is a matrix of whole numbers, as that of a product of quaternions is.
+_PLAIN = (0.0, 0.5, 1.0, 2.0)
 
-    Such a one belongs to the maths, not to the settings, and most of it is 0 and 1: a program that knows it
-    is several times as fast as one that reads it.
+
+def is_table(array: np.ndarray) -> bool:
+    """Whether a constant is a matrix of whole numbers, as that of a product of quaternions is, or one of 0,
+    1/2, 1 and 2 but for the sign.
+
+    Such a one belongs to the maths more often than to the settings, and a program that knows it leaves out
+    what it multiplies by 0 and 1: that is several times as fast as one that reads it.
     """
+    if array.ndim == 0:
+        return abs(float(array)) in _PLAIN
     return array.ndim >= 2 and bool((array == np.round(array)).all())
 
 
