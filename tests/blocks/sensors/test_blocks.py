@@ -91,10 +91,8 @@ def test_biases_and_noise_are_as_large_as_told() -> None:
     assert bias[:, 0].std() == pytest.approx(0.02, rel=0.35)
     walked = bias[:, -1] - bias[:, 0]
     assert walked.std() == pytest.approx(0.01 * math.sqrt(4.0), rel=0.35)
-    noisy = load_flight(
-        "sim:figure", seed=1, settings={"duration": "4", "gyro.noise": "0.01", "gyro.bias": "0"}
-    )
-    quiet = load_flight("sim:figure", seed=1, settings={"duration": "4", "gyro.noise": "0", "gyro.bias": "0"})
+    own = {"duration": "4", "gyro.bias": "0.02", "gyro.walk": "0.01", "gyro.noise": "0.01"}
+    quiet, noisy = flights[1], load_flight("sim:figure", seed=1, settings=own)
     white = noisy.streams["imu"]["gyro"] - quiet.streams["imu"]["gyro"]
     assert white.std() == pytest.approx(0.01 * math.sqrt(200.0), rel=0.1)
     np.testing.assert_array_equal(noisy.truth["gyro_bias"], quiet.truth["gyro_bias"])
