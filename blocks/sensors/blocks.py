@@ -72,20 +72,19 @@ def _(start: Any, *, walk: float) -> Vector:
 
 @block
 def read_imu(
-    motion: BodyMotion, gyro_bias: Vector, accelerometer_bias: Vector, *, gyro: float, accelerometer: float,
-    gravity: tuple[float, float, float] = GRAVITY, draw: Any, xp: Any,
+    motion: BodyMotion, gyro_bias: Vector | None = None, accelerometer_bias: Vector | None = None, *,
+    gyro: float, accelerometer: float, gravity: tuple[float, float, float] = GRAVITY, draw: Any, xp: Any,
 ) -> Imu:  # fmt: skip
-    """Rate and specific force R^T (a - gravity), each with its bias and white noise.
+    """Rate and specific force R^T (a - gravity), each with its bias, if it has one, and white noise.
 
     gyro, accelerometer: standard deviations of one reading, rad/s and m/s^2 (a density times the root of the
     rate)."""
     push = motion.acceleration - xp.asarray(gravity, dtype=motion.acceleration.dtype)
     force = rotate(conjugate(motion.attitude, xp=xp), push, xp=xp)
+    rate = motion.rate if gyro_bias is None else motion.rate + gyro_bias.vector
+    force = force if accelerometer_bias is None else force + accelerometer_bias.vector
     white = draw.normal("white", (6,))
-    return Imu(
-        gyro=motion.rate + gyro_bias.vector + gyro * white[:3],
-        specific_force=force + accelerometer_bias.vector + accelerometer * white[3:],
-    )
+    return Imu(gyro=rate + gyro * white[:3], specific_force=force + accelerometer * white[3:])
 
 
 @block
@@ -134,12 +133,15 @@ def read_altimeter(
 
 
 @block
-def true_state(motion: BodyMotion, gyro_bias: Vector, accelerometer_bias: Vector) -> NavigationState:
-    """What a full truth holds."""
+def true_state(
+    motion: BodyMotion, gyro_bias: Vector | None = None, accelerometer_bias: Vector | None = None, *, xp: Any
+) -> NavigationState:
+    """What a full truth holds; a bias that is not there is 0."""
+    none = xp.zeros_like(motion.rate)
     return NavigationState(
         position=motion.position,
         velocity=motion.velocity,
         attitude=motion.attitude,
-        gyro_bias=gyro_bias.vector,
-        accelerometer_bias=accelerometer_bias.vector,
+        gyro_bias=none if gyro_bias is None else gyro_bias.vector,
+        accelerometer_bias=none if accelerometer_bias is None else accelerometer_bias.vector,
     )

@@ -35,6 +35,7 @@ from flowgraph.blocks.signals.calibration import (
     Rest,
     Window,
 )
+from flowgraph.blocks.signals.control import Controller, FlightCommand
 from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
@@ -106,6 +107,8 @@ from flowgraph.blocks.signals.vision import (
 )
 
 __all__ = [
+    "Controller",
+    "FlightCommand",
     "BodyMotion",
     "FigureShape",
     "Vector",
