@@ -33,7 +33,7 @@ def test_it_comes_to_its_corners_and_less_well_the_later_its_poses_are(example) 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_engine_flies_the_same_flight(example, engine: str) -> None:
-    short = {"seconds": 0.8, "latency": 3, "seed": 5}
+    short = {"seconds": 1.2, "latency": 3, "seed": 5}
     want = example["flown"](engine="python", **short)
     same(want, example["flown"](engine=engine, **short), exact=engine == "reference")
     assert np.ptp(want["motion"]["position"], axis=0).max() > 0.03
