@@ -1,5 +1,9 @@
 """Many runs in C: as many at once as there are processors, for a call into C lets other threads go on.
 
+Where a pipeline has a form in lanes, each thread plays several runs side by side in vectors: those that have
+their events at the times of the first. What a run gives is the same to the bit whichever runs lie beside it,
+and within rounding what it gives alone.
+
 What is the same for all runs is made once: the compiled library, the order of the ticks, and the inputs where
 they are shared. An output whose presence follows from its inputs' is written by C straight to its place in an
 array of all runs; of one that depends on data, or where runs have other ticks, the runs are put together
@@ -32,8 +36,7 @@ from flowgraph.types import StructType
 def threaded(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
     """Play the runs, as many at once as there are processors, and lanes in each."""
     lanes = lanes_of(runs.pipeline, options.dtype, runs.first.patterns, passes)
-    kind: type[_Singly | _Abreast] = _Singly if lanes is None else _Abreast
-    play = kind(runs, passes, options, lanes)
+    play = _Singly(runs, passes, options) if lanes is None else _Abreast(runs, passes, options, lanes)
     blocks = [range(n, min(n + play.width, len(runs.seeds))) for n in range(0, len(runs.seeds), play.width)]
     ticks = len(runs.first.time)
     start = perf_counter()
@@ -51,7 +54,9 @@ class _Singly:
 
     width = 1
 
-    def __init__(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions, lanes: Any = None) -> None:
+    def __init__(
+        self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions, lanes: Any = None
+    ) -> None:
         self.many, self.passes, self.real = runs, passes, np.dtype(options.dtype)
         self.outputs = [
             _Output(lanes or self._library(runs.first), k, runs.first, runs.keep.get(p.name), len(runs.seeds))
@@ -129,9 +134,7 @@ class _Output:
         runs: how many.
     """
 
-    def __init__(
-        self, library: Outputs, port: int, first: Tape, leaves: list[str] | None, runs: int
-    ) -> None:
+    def __init__(self, library: Outputs, port: int, first: Tape, leaves: list[str] | None, runs: int) -> None:
         self.port, self.first, self.count = port, first, runs
         self.leaves, self.kept = leaves or [], leaves is not None
         self.name = library.pipeline.outputs[port].name

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, load
+from flowgraph.engines.c.compile import FLAGS, CompileError, load
 from flowgraph.engines.c.lanes.expressions import NoLanesError
 from flowgraph.engines.c.lanes.source import WIDTH, generate_lanes
 from flowgraph.engines.c.library import Outputs, Room, Structs, pointers
@@ -158,7 +158,7 @@ def _aligned(count: int, struct: np.dtype[Any]) -> np.ndarray:
 def lanes_of(
     pipeline: Pipeline, real: Any, keys: Sequence[int], passes: tuple[str, ...] = ()
 ) -> Lanes | None:
-    """The pipeline for several runs at once; None where it has no form in lanes."""
+    """The pipeline for several runs at once; None where it, or the compiler, has no lanes."""
     if np.dtype(real) != np.float64:
         return None
     which = (None if every_pattern(pipeline) is not None else tuple(keys), passes)
@@ -166,6 +166,6 @@ def lanes_of(
     if which not in kept:
         try:
             kept[which] = Lanes(pipeline, keys, passes)
-        except NoLanesError:
+        except (NoLanesError, CompileError):  # vector types are an extension of GCC and Clang
             kept[which] = None
     return kept[which]

@@ -148,7 +148,8 @@ def _reduce(w: LaneWriter, m: Macro) -> None:
         w.line("}")
 
 
-CHOLESKY = """/* lower factor in place, of the lower triangle; NaN in the lanes where that is not positive definite */
+CHOLESKY = """\
+/* lower factor in place, of the lower triangle; NaN in lanes where that is not positive definite */
 static FG_INLINE void NAME(fg_real *a, int32_t n) {
     fg_mask good = fg_mask_of(-1);
     for (int32_t j = 0; j < n; j++) {
@@ -168,7 +169,8 @@ static FG_INLINE void NAME(fg_real *a, int32_t n) {
 }
 """
 
-SOLVE = """/* a x = b in place of b (n x m), by elimination with row exchange; NaN in the lanes where a is singular */
+SOLVE = """\
+/* a x = b in place of b (n x m), by elimination with row exchange; NaN in lanes where a is singular */
 static FG_INLINE void NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
     fg_mask good = fg_mask_of(-1);
     for (int32_t j = 0; j < n; j++) {

@@ -7,15 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from flowgraph.engines.c.entry import reaction_name
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.lanes.expressions import TYPES, LaneExpressions, no_lanes
 from flowgraph.engines.c.lanes.writer import LaneWriter
 from flowgraph.engines.c.names import Names, given, made
 from flowgraph.engines.c.nodes import Node, Tape
 from flowgraph.engines.c.preamble import MACROS, REFUSED
-from flowgraph.engines.c.source import MOST_PATTERNS, File, every_pattern, reaction_name
+from flowgraph.engines.c.source import MOST_PATTERNS, File, every_pattern
 from flowgraph.engines.c.statements import Writer
-from flowgraph.engines.c.syntax import ctype
 from flowgraph.engines.c.values import Value
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 from flowgraph.pipeline.program import Program
@@ -41,9 +41,7 @@ class LaneSource:
         return self.presence.get(key, (0, 0))
 
 
-def generate_lanes(
-    pipeline: Pipeline, keys: Sequence[int], tidy: Callable[[Program], Program]
-) -> LaneSource:
+def generate_lanes(pipeline: Pipeline, keys: Sequence[int], tidy: Callable[[Program], Program]) -> LaneSource:
     """The C of a pipeline for `WIDTH` runs at once, in double precision.
 
     Args:
