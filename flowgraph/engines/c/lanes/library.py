@@ -37,7 +37,7 @@ class Lanes(Outputs):
     def __init__(self, pipeline: Pipeline, keys: Sequence[int], passes: tuple[str, ...]) -> None:
         source = generate_lanes(pipeline, keys, lambda program: optimise(program, passes))
         super().__init__(pipeline, np.float64, source)
-        self._library = load({"lanes.c": source.text}, _FLAGS)
+        self._library = load({f"{source.names.module}_lanes.c": source.text}, _FLAGS)
         self._library.fg_play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 6]
         self._library.fg_play.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
