@@ -23,8 +23,8 @@ NARROWEST, WIDEST = 8, 32
 FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
 
-_FINEST = 40
-"""No fraction is finer than the width by more than this: what is smaller than 2^-40 of nothing is nothing."""
+_BELOW = 8
+"""An element that was never larger than the last bit of the largest beside it, by so many bits, is rounding."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,11 @@ def fraction_for(largest: np.ndarray, width: int) -> np.ndarray:
     """
     sizes = np.asarray(largest, dtype=np.float64)
     most = float(sizes.max(initial=0.0))
-    sizes = np.where(sizes > 0.0, sizes, most if most > 0.0 else 1.0)
+    most = most if most > 0.0 else 1.0
+    sizes = np.where(sizes > 0.0, np.maximum(sizes, math.ldexp(most, -width - _BELOW)), most)
     whole = np.frexp(sizes)[1].astype(np.int64)  # x < 2^whole
     full = np.ldexp(1.0, whole.astype(int)) - sizes < np.ldexp(0.5, whole - width + 1)
-    return np.minimum(width - 1 - (whole + full), width - 1 + _FINEST)
+    return np.asarray(width - 1 - (whole + full))
 
 
 def fraction_of_constant(array: np.ndarray, width: int) -> np.ndarray:
