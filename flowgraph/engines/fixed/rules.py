@@ -79,9 +79,14 @@ def common(fractions: Sequence[np.ndarray]) -> np.ndarray:
     return np.where(most == -FREE, 0, most)
 
 
+def between(fraction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The shift that brings words of a fraction to another; zeros that are free stay."""
+    return np.where(fraction == FREE, 0, fraction - target)
+
+
 def to(fraction: np.ndarray, target: np.ndarray) -> Run:
-    """Words of a fraction brought to another; zeros that are free stay."""
-    return _shifting(np.where(fraction == FREE, 0, fraction - target))
+    """Words of a fraction brought to another."""
+    return _shifting(between(fraction, target))
 
 
 def keeping_nan(run: Run) -> Run:
@@ -91,14 +96,18 @@ def keeping_nan(run: Run) -> Run:
 # -- element by element ------------------------------------------------------------------------------
 
 
+def shifts_of_sum(s: Site) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of both arguments before they are added, and of the sum."""
+    f, g = np.broadcast_arrays(s.real(0), s.real(1))
+    f, g = np.where(f == FREE, g, f), np.where(g == FREE, f, g)
+    at = np.minimum(np.maximum(f, g), np.minimum(f, g) + (62 - s.width))
+    at = np.where(at == FREE, s.out, at)
+    return between(f, at), between(g, at), at - s.out
+
+
 def _sum_of_two(sign: int) -> Callable[[Site], Run]:
     def bind(s: Site) -> Run:
-        f, g = np.broadcast_arrays(s.real(0), s.real(1))
-        f, g = np.where(f == FREE, g, f), np.where(g == FREE, f, g)
-        least = np.minimum(f, g)
-        at = np.minimum(np.maximum(f, g), least + (62 - s.width))
-        at = np.where(at == FREE, s.out, at)
-        left, right, end = to(f, at), to(g, at), _shifting(at - s.out)
+        left, right, end = map(_shifting, shifts_of_sum(s))
         if sign < 0:
             return lambda a, b: end(left(a) - right(b))
         return lambda a, b: end(left(a) + right(b))
@@ -106,22 +115,36 @@ def _sum_of_two(sign: int) -> Callable[[Site], Run]:
     return bind
 
 
-def _multiply(s: Site) -> Run:
+def shift_of_product(s: Site) -> np.ndarray:
+    """Of the product of two words."""
     f, g = np.broadcast_arrays(s.real(0), s.real(1))
-    by = slim(np.where((f == FREE) | (g == FREE), 0, f + g - s.out))
+    return np.where((f == FREE) | (g == FREE), 0, f + g - s.out)
+
+
+def shift_of_quotient(s: Site) -> np.ndarray:
+    """By how much a quotient goes to the left."""
+    f, g = np.broadcast_arrays(s.real(0), s.real(1))
+    return np.where((f == FREE) | (g == FREE), 0, s.out - f + g)
+
+
+def _multiply(s: Site) -> Run:
+    by = slim(shift_of_product(s))
     return lambda a, b: z.product(a, b, by)
 
 
 def _divide(s: Site) -> Run:
-    f, g = np.broadcast_arrays(s.real(0), s.real(1))
-    up = slim(np.where((f == FREE) | (g == FREE), 0, s.out - f + g))
+    up = slim(shift_of_quotient(s))
     return lambda a, b: z.quotient(a, b, up)
+
+
+def bound_fraction(f: np.ndarray) -> np.ndarray:
+    """Fractions as functions take them: a free zero has none."""
+    return np.where(f == FREE, 0, f)
 
 
 def _of_one(function: Callable[..., Any], **options: Any) -> Callable[[Site], Run]:
     def bind(s: Site) -> Run:
-        f = slim(np.where(s.real(0) == FREE, 0, s.real(0)))
-        out = slim(s.out)
+        f, out = slim(bound_fraction(s.real(0))), slim(s.out)
         return lambda x: function(x, f, out, **options)
 
     return bind
@@ -129,7 +152,7 @@ def _of_one(function: Callable[..., Any], **options: Any) -> Callable[[Site], Ru
 
 def _of_two(function: Callable[..., Any]) -> Callable[[Site], Run]:
     def bind(s: Site) -> Run:
-        f, g = (slim(np.where(x == FREE, 0, x)) for x in (s.real(0), s.real(1)))
+        f, g = (slim(bound_fraction(x)) for x in (s.real(0), s.real(1)))
         out = slim(s.out)
         return lambda a, b: function(a, b, f, g, out)
 
@@ -154,15 +177,16 @@ def _sign(s: Site) -> Run:
     return lambda x: end(np.sign(x))
 
 
-def _aligned(s: Site) -> tuple[Run, Run, np.ndarray]:
+def aligned(s: Site) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The shifts that bring two arguments to one fraction, and that fraction."""
     f, g = np.broadcast_arrays(s.real(0), s.real(1))
     at = common([f, g])
-    return to(f, at), to(g, at), at
+    return between(f, at), between(g, at), at
 
 
 def _comparing(compare: Callable[[Any, Any], Any]) -> Callable[[Site], Run]:
     def bind(s: Site) -> Run:
-        left, right, _ = _aligned(s)
+        left, right = map(_shifting, aligned(s)[:2])
         return lambda a, b: compare(left(a), right(b))
 
     return bind
@@ -170,7 +194,7 @@ def _comparing(compare: Callable[[Any, Any], Any]) -> Callable[[Site], Run]:
 
 def _choosing(first: Callable[[Any, Any], Any]) -> Callable[[Site], Run]:
     def bind(s: Site) -> Run:
-        left, right, _ = _aligned(s)
+        left, right = map(_shifting, aligned(s)[:2])
         a_out, b_out = to(s.real(0), s.out), to(s.real(1), s.out)
         return lambda a, b: np.where(first(left(a), right(b)), a_out(a), b_out(b))
 
@@ -214,7 +238,8 @@ def _round(x: Any, f: Any) -> Any:
 
 
 def _remainder(s: Site) -> Run:
-    left, right, at = _aligned(s)
+    *shifts, at = aligned(s)
+    left, right = map(_shifting, shifts)
     end = _shifting(at - s.out)
 
     def run(a: Any, b: Any) -> Any:
@@ -225,7 +250,7 @@ def _remainder(s: Site) -> Run:
 
 
 def _floor_divide(s: Site) -> Run:
-    left, right, _ = _aligned(s)
+    left, right = map(_shifting, aligned(s)[:2])
     end = _shifting(-s.out)
 
     def run(a: Any, b: Any) -> Any:
@@ -255,17 +280,30 @@ def _astype(s: Site) -> Run:
 # -- along axes --------------------------------------------------------------------------------------
 
 
-def _axes(axis: Any, rank: int) -> tuple[int, ...]:
-    axes = range(rank) if axis is None else axis if isinstance(axis, list | tuple) else [axis]
-    return tuple(a % rank for a in axes)
+def axes_of(i: Instruction) -> Callable[[int], tuple[int, ...]]:
+    """The axes that an instruction works along, for an argument of so many."""
+    axis = i.attrs.get("axis", -1 if i.op in ("sort", "argsort") else None)
+
+    def found(rank: int) -> tuple[int, ...]:
+        axes = range(rank) if axis is None else axis if isinstance(axis, list | tuple) else [axis]
+        return tuple(a % rank for a in axes)
+
+    return found
+
+
+def adding(
+    f: np.ndarray, out: np.ndarray, count: int, axes: tuple[int, ...]
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """How `count` terms of fractions `f` are summed: the shift of each, the size at which it is cut, and the
+    shift of the sum; `out` is the result's fraction with those axes of one, as is the last shift."""
+    at = np.minimum(common_along(f, axes), out + _GUARD)
+    most = z.LIMIT // (1 << math.ceil(math.log2(max(count, 1))))
+    return between(f, np.broadcast_to(at, f.shape)), most, at - out
 
 
 def _adding(f: np.ndarray, out: np.ndarray, count: int, axes: tuple[int, ...], add: Run) -> Run:
-    """Terms of fractions `f` summed along axes; `out` is the result's fraction with those axes of one."""
-    at = np.minimum(common_along(f, axes), out + _GUARD)
-    shifted = to(f, np.broadcast_to(at, f.shape))
-    most = z.LIMIT // (1 << math.ceil(math.log2(max(count, 1))))
-    end = _shifting(np.squeeze(at - out, axis=axes) if axes else at - out)
+    by, most, last = adding(f, out, count, axes)
+    shifted, end = _shifting(by), _shifting(np.squeeze(last, axis=axes) if axes else last)
     return lambda terms: end(add(np.clip(shifted(terms), -most, most)))
 
 
@@ -275,29 +313,38 @@ def common_along(f: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     return np.where(bound == -FREE, 0, bound)
 
 
-def _sum(s: Site) -> Run:
+def terms_of_sum(s: Site) -> tuple[np.ndarray, np.ndarray, int, tuple[int, ...]]:
+    """Fractions of the terms and of the result with its axes, their count, and the axes."""
     f = s.real(0)
-    axes = _axes(s.i.attrs.get("axis"), f.ndim)
-    keep = bool(s.i.attrs.get("keepdims", False))
+    axes = axes_of(s.i)(f.ndim)
     out = np.broadcast_to(s.out, s.i.spec.shape)
-    out = out if keep else np.expand_dims(out, axes)
-    count = math.prod(f.shape[a] for a in axes)
+    out = out if s.i.attrs.get("keepdims", False) else np.expand_dims(out, axes)
+    return f, out, math.prod(f.shape[a] for a in axes), axes
+
+
+def _sum(s: Site) -> Run:
+    f, out, count, axes = terms_of_sum(s)
     run = _adding(f, out, count, axes, lambda x: x.sum(axis=axes))
-    return (lambda x: np.expand_dims(run(x), axes)) if keep else run
+    return (lambda x: np.expand_dims(run(x), axes)) if s.i.attrs.get("keepdims", False) else run
 
 
-def _matmul(s: Site) -> Run:
+def terms_of_matmul(s: Site) -> tuple[np.ndarray, np.ndarray, int, tuple[int, ...]]:
+    """The same of a matrix product, its terms (..., m, k, n); vectors are taken as matrices."""
     f, g = s.real(0), s.real(1)
     vector_a, vector_b = f.ndim == 1, g.ndim == 1
     f = f[None] if vector_a else f
     g = g[:, None] if vector_b else g
     out = np.broadcast_to(s.out, s.i.spec.shape)
-    out = out[..., None, :] if vector_a and not vector_b else out
-    out = out[..., None] if vector_b and not vector_a else out
-    out = out[..., None, None] if vector_a and vector_b else out
+    out = out[..., None] if vector_b else out
+    out = out[..., None, :] if vector_a else out
     p, q = f[..., :, :, None], g[..., None, :, :]
     fractions = np.where((p == FREE) | (q == FREE), FREE, p + q)
-    run = _adding(fractions, out[..., :, None, :], f.shape[-1], (fractions.ndim - 2,), lambda x: x.sum(axis=-2))
+    return fractions, out[..., :, None, :], f.shape[-1], (fractions.ndim - 2,)
+
+
+def _matmul(s: Site) -> Run:
+    vector_a, vector_b = s.real(0).ndim == 1, s.real(1).ndim == 1
+    run = _adding(*terms_of_matmul(s), lambda x: x.sum(axis=-2))
 
     def product(a: Any, b: Any) -> Any:
         a, b = a[None] if vector_a else a, b[:, None] if vector_b else b
@@ -308,21 +355,32 @@ def _matmul(s: Site) -> Run:
     return product
 
 
-def _vecdot(s: Site) -> Run:
+def terms_of_vecdot(s: Site) -> tuple[np.ndarray, np.ndarray, int, tuple[int, ...]]:
+    """The same of a product of vectors."""
     f, g = np.broadcast_arrays(s.real(0), s.real(1))
     fractions = np.where((f == FREE) | (g == FREE), FREE, f + g)
-    out = np.broadcast_to(s.out, s.i.spec.shape)[..., None]
-    run = _adding(fractions, out, f.shape[-1], (f.ndim - 1,), lambda x: x.sum(axis=-1))
+    return fractions, np.broadcast_to(s.out, s.i.spec.shape)[..., None], f.shape[-1], (f.ndim - 1,)
+
+
+def _vecdot(s: Site) -> Run:
+    run = _adding(*terms_of_vecdot(s), lambda x: x.sum(axis=-1))
     return lambda a, b: run(a * b)
 
 
-def _cumulative_sum(s: Site) -> Run:
+def shifts_of_running_sum(s: Site) -> tuple[np.ndarray, int, np.ndarray]:
+    """Of each term, the size at which it is cut, and of each sum."""
     f = s.real(0)
     axis = s.i.attrs["axis"] % f.ndim
     out = np.broadcast_to(s.out, f.shape)
     at = np.minimum(common_along(f, (axis,)), out.min(axis=axis, keepdims=True) + _GUARD)
     most = z.LIMIT // (1 << math.ceil(math.log2(max(f.shape[axis], 1))))
-    start, end = to(f, np.broadcast_to(at, f.shape)), _shifting(at - out)
+    return between(f, np.broadcast_to(at, f.shape)), most, at - out
+
+
+def _cumulative_sum(s: Site) -> Run:
+    axis = s.i.attrs["axis"] % s.real(0).ndim
+    by, most, last = shifts_of_running_sum(s)
+    start, end = _shifting(by), _shifting(last)
     return lambda x: end(np.cumsum(np.clip(start(x), -most, most), axis=axis))
 
 
@@ -331,8 +389,7 @@ def _along(run: Callable[..., Any], *, real: bool) -> Callable[[Site], Run]:
 
     def bind(s: Site) -> Run:
         f = s.real(0)
-        sorts = s.i.op in ("sort", "argsort")
-        axes = _axes(s.i.attrs.get("axis", -1 if sorts else None), f.ndim)
+        axes = axes_of(s.i)(f.ndim)
         at = common_along(f, axes)
         start = to(f, np.broadcast_to(at, f.shape))
         if not real:
