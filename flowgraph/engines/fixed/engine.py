@@ -39,7 +39,7 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Bound:
+class Bound:
     """A program with its shifts worked out."""
 
     program: Program
@@ -68,13 +68,14 @@ class Integers:
         self.most = np.int64(2 ** (self.formats.width - 1) - 1)
         self.saturations: dict[int, int] = {}
         self._cells = [c for r in pipeline.registers for c in r.cells]
-        self._bound: dict[int, _Bound] = {}
+        self._bound: dict[int, Bound] = {}
         self.cells = [
-            self._word(c.read, v, c.shape) if c.dtype == "real" else np.asarray(v)
+            self.words(c.read, v, c.shape) if c.dtype == "real" else np.asarray(v)
             for c, v in zip(self._cells, cells, strict=True)
         ]
 
-    def _word(self, value: int, x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    def words(self, value: int, x: Any, shape: tuple[int, ...]) -> np.ndarray:
+        """Reals as words of an input's or register's format; `x` may have axes before `shape`."""
         real = np.asarray(x, dtype=np.float64)
         fraction = self.fraction(value, shape)
         words = whole_numbers(real, fraction, self.formats.width)
@@ -140,11 +141,9 @@ class Integers:
                 )
         return made
 
-    def values(self, time: int, key: int, values: list[tuple[Any, ...]]) -> tuple[_Bound, dict[int, Any]]:
+    def values(self, time: int, key: int, values: list[tuple[Any, ...]]) -> tuple[Bound, dict[int, Any]]:
         """The bound program of a tick, and every value in it by number: words, integers and truth values."""
-        if key not in self._bound:
-            self._bound[key] = self._bind(key)
-        bound = self._bound[key]
+        bound = self.bind(key)
         env = dict(bound.known)
         env[self.pipeline.time] = np.int64(time)
         env[self.pipeline.seed] = self.seed
@@ -153,7 +152,7 @@ class Integers:
         for k, port in enumerate(self.pipeline.inputs):
             if key >> k & 1:
                 for leaf, x in zip(port.leaves, next(present), strict=True):
-                    env[leaf.value] = self._word(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x
+                    env[leaf.value] = self.words(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x
         cut: dict[int, Any] = {}
         for step in bound.steps:
             made = step.run(*[env[a] for a in step.args])
@@ -176,7 +175,13 @@ class Integers:
         if n:
             self.saturations[value] = self.saturations.get(value, 0) + n
 
-    def _bind(self, key: int) -> _Bound:
+    def bind(self, key: int) -> Bound:
+        """The program of a pattern of present inputs, with its shifts worked out."""
+        if key not in self._bound:
+            self._bound[key] = self._made(key)
+        return self._bound[key]
+
+    def _made(self, key: int) -> Bound:
         program = specialise(self.pipeline, key)
         specs, width = program.specs, self.formats.width
         fractions: dict[int, np.ndarray] = {}
@@ -214,7 +219,7 @@ class Integers:
             _moving(fractions[n], fractions[c.read], specs[n]) if c.dtype == "real" else None
             for c, n in zip(self._cells, program.writes, strict=True)
         )
-        return _Bound(program, tuple(steps), known, fractions, writes)
+        return Bound(program, tuple(steps), known, fractions, writes)
 
 
 def _moving(have: np.ndarray, want: np.ndarray, spec: Spec) -> Run:

@@ -65,17 +65,16 @@ def root_of(x: Ints) -> Ints:
 
 def square_root(x: Ints, fraction: Ints, out: Ints) -> Ints:
     """sqrt of words; of what is negative, zero."""
-    size = np.maximum(x, 0)
+    size = np.maximum(x, 1)
     lift = 62 - bit_length(size)
     lift = lift - ((fraction + lift) & 1)
-    lift = np.where(size == 0, fraction & 1, lift)
-    return shift(root_of(size << lift), ((fraction + lift) >> 1) - out)
+    return np.where(x <= 0, 0, shift(root_of(size << lift), ((fraction + lift) >> 1) - out))
 
 
-_TURN = np.int64(round(2.0 / math.pi * 2**31))
-_SINC = [round((-1) ** k * (math.pi / 2) ** (2 * k) / math.factorial(2 * k + 1) * 2**30) for k in range(6)]
-_COSINE = [round((-1) ** k * (math.pi / 2) ** (2 * k) / math.factorial(2 * k) * 2**30) for k in range(7)]
-_QUARTER = np.int64(round(math.pi / 2 * 2**30))
+QUARTER_TURNS = np.int64(round(2.0 / math.pi * 2**31))
+SINC = [round((-1) ** k * (math.pi / 2) ** (2 * k) / math.factorial(2 * k + 1) * 2**30) for k in range(6)]
+COSINE = [round((-1) ** k * (math.pi / 2) ** (2 * k) / math.factorial(2 * k) * 2**30) for k in range(7)]
+QUARTER = np.int64(round(math.pi / 2 * 2**30))
 
 
 def _horner(coefficients: list[int], u: Ints) -> Ints:
@@ -87,29 +86,29 @@ def _horner(coefficients: list[int], u: Ints) -> Ints:
 
 def sine(x: Ints, fraction: Ints, out: Ints, *, ahead: int = 0) -> Ints:
     """sin(x), or with `ahead` = 1 cos(x), of words in radians; small angles to their own precision."""
-    turns = shift(x * _TURN, fraction + 1)  # quarter turns, 30 bits behind the point
+    turns = shift(x * QUARTER_TURNS, fraction + 1)  # quarter turns, 30 bits behind the point
     n = (turns + (1 << 29)) >> 30
     r = turns - (n << 30)
     u = (r * r + (1 << 29)) >> 30
-    sinc, cosine = _horner(_SINC, u), _horner(_COSINE, u)
+    sinc, cosine = _horner(SINC, u), _horner(COSINE, u)
     small = shift(x * sinc, fraction + 30 - out)
-    sin = shift(((r * _QUARTER + (1 << 29)) >> 30) * sinc, 60 - out)
+    sin = shift(((r * QUARTER + (1 << 29)) >> 30) * sinc, 60 - out)
     cos = shift(cosine, 30 - out)
     n = n + ahead
     value = np.where(n & 1, cos, np.where((n == 0) & (ahead == 0), small, sin))
     return np.where(n & 2, -value, value)
 
 
-_LOG2_E = np.int64(round(math.log2(math.e) * 2**30))
-_LN_2 = np.int64(round(math.log(2.0) * 2**30))
-_POWER = [round(math.log(2.0) ** k / math.factorial(k) * 2**30) for k in range(9)]
+LOG2_E = np.int64(round(math.log2(math.e) * 2**30))
+LN_2 = np.int64(round(math.log(2.0) * 2**30))
+POWER = [round(math.log(2.0) ** k / math.factorial(k) * 2**30) for k in range(9)]
 
 
 def exponential(x: Ints, fraction: Ints, out: Ints) -> Ints:
     """exp(x) of words."""
-    y = shift(x * _LOG2_E, fraction)
+    y = shift(x * LOG2_E, fraction)
     n = (y + (1 << 29)) >> 30
-    m = _horner(_POWER, y - (n << 30))
+    m = _horner(POWER, y - (n << 30))
     return shift(m, 30 - n - out)
 
 
@@ -124,13 +123,13 @@ def logarithm(x: Ints, fraction: Ints, out: Ints) -> Ints:
         big = m >= (1 << 31)
         y = y + np.where(big, _ONE << (30 - k), 0)
         m = m >> big
-    value = (length - 1 - fraction) * _LN_2 + ((y * _LN_2 + (1 << 29)) >> 30)
+    value = (length - 1 - fraction) * LN_2 + ((y * LN_2 + (1 << 29)) >> 30)
     return np.where(x <= 0, -LIMIT, shift(value, 30 - out))
 
 
 _STEPS = 40
-_ANGLES = [round(math.atan(2.0**-k) * 2**60) for k in range(_STEPS)]
-_HALF = np.int64(round(math.pi * 2**60))
+ANGLES = [round(math.atan(2.0**-k) * 2**60) for k in range(_STEPS)]
+HALF_TURN = np.int64(round(math.pi * 2**60))
 
 
 def angle(y: Ints, x: Ints, fraction_y: Ints, fraction_x: Ints, out: Ints) -> Ints:
@@ -139,16 +138,16 @@ def angle(y: Ints, x: Ints, fraction_y: Ints, fraction_x: Ints, out: Ints) -> In
     up, along = shift(y, fraction_y - (59 - top)), shift(x, fraction_x - (59 - top))
     behind = along < 0
     below = up < 0
-    turned = np.where(behind, np.where(below, -_HALF, _HALF), 0)
+    turned = np.where(behind, np.where(below, -HALF_TURN, HALF_TURN), 0)
     along, up = np.where(behind, -along, along), np.where(behind, -up, up)
     for k in range(_STEPS):
         high = up > 0
         step_x, step_y = up >> k, along >> k
         along, up = along + np.where(high, step_x, -step_x), up - np.where(high, step_y, -step_y)
-        turned = turned + np.where(high, _ANGLES[k], -_ANGLES[k])
+        turned = turned + np.where(high, ANGLES[k], -ANGLES[k])
     value = shift(turned, 60 - out)
     # CORDIC always turns; on the axis itself the angle is known
-    value = np.where(y == 0, shift(np.where(x < 0, _HALF, 0), 60 - out), value)
+    value = np.where(y == 0, shift(np.where(x < 0, HALF_TURN, 0), 60 - out), value)
     return value
 
 

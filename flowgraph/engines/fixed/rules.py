@@ -404,10 +404,15 @@ def _along(run: Callable[..., Any], *, real: bool) -> Callable[[Site], Run]:
     return bind
 
 
-def _searchsorted(s: Site) -> Run:
+def shifts_of_search(s: Site) -> tuple[np.ndarray, np.ndarray]:
+    """Of what is searched in, and of what is searched for: all to one fraction."""
     f, g = s.real(0), s.real(1)
     at = max(int(common_along(x, tuple(range(x.ndim))).max(initial=-FREE)) for x in (f, g))
-    left, right = to(f, np.full(f.shape, at)), to(g, np.full(g.shape, at))
+    return between(f, np.full(f.shape, at)), between(g, np.full(g.shape, at))
+
+
+def _searchsorted(s: Site) -> Run:
+    left, right = map(_shifting, shifts_of_search(s))
     side = s.i.attrs.get("side", "left")
     return lambda a, v: np.searchsorted(left(a), right(v), side=side).astype(np.int64)
 
@@ -436,6 +441,12 @@ def moved(i: Instruction, fractions: Sequence[np.ndarray | None]) -> np.ndarray:
         kept = OPS[i.op].run(NUMPY, np.ones(first.shape, bool), **i.attrs)
         return np.where(kept, first, FREE)
     return np.asarray(OPS[i.op].run(NUMPY, *fractions, **i.attrs))
+
+
+def moved_from(i: Instruction, shape: tuple[int, ...]) -> np.ndarray:
+    """For each element of the result of a move of one argument, the place that it comes from, row by row."""
+    places = np.arange(math.prod(shape), dtype=np.int64).reshape(shape)
+    return np.asarray(OPS[i.op].run(NUMPY, places, **i.attrs)).reshape(i.spec.shape)
 
 
 def _move(s: Site) -> Run:
