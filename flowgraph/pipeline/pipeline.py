@@ -22,6 +22,7 @@ from flowgraph.data.files import content_of, put_new, text_of
 from flowgraph.errors import LoweringError, PipelineError, UnknownNameError
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
+from flowgraph.pipeline.formats import Formats
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
@@ -158,6 +159,7 @@ class Pipeline:
         seed: number of the value that holds the run's seed (two uint32 words, low first).
         inputs, outputs, registers, constants, stages, faults, random, limits: see their classes.
         host: what the graph does outside the pipeline, in firing order; a pipeline alone does not run it.
+        formats: how real values are kept as whole numbers, where that was decided.
     """
 
     name: str
@@ -173,6 +175,7 @@ class Pipeline:
     random: tuple[RandomSite, ...] = ()
     limits: tuple[Limit, ...] = ()
     host: tuple[HostStage, ...] = ()
+    formats: Formats | None = None
 
     def need_numbers(self, kind: str) -> None:
         """Refuse a kind of number, "float64", "float32" or "fixed", in which a block must not be computed.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.pipeline.pipeline import Pipeline, work
-from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.ops import ELEMENTWISE, Spec
 from flowgraph.recorder.trace import Instruction
 
 
@@ -132,6 +132,41 @@ def _fold(
         unknown = [a for a, f in zip(args, facts, strict=True) if f is None]
         return (not ends) if not unknown else unknown[0] if len(unknown) == 1 else None
     return None
+
+
+def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
+    """Which elements of each value bear on an output or a register in this tick: a mask, or True for all.
+
+    A selection needs what it takes: the quotient beside a guard `where(small, 1.0, x / y)` may be of any size.
+    """
+    taken: dict[int, Any] = dict.fromkeys(program.writes, True)
+    for flag, leaves in program.outputs:
+        if flag is not None and env.get(flag, True):
+            taken.update(dict.fromkeys((flag, *leaves), True))
+    for i in reversed(program.instructions):
+        mask = taken.get(i.out)
+        if mask is None:
+            continue
+        if i.op == "where":
+            chosen = np.asarray(env[i.args[0]], bool)
+            masks = [mask, chosen & mask, ~chosen & mask]
+        else:
+            masks = [mask if i.op in ELEMENTWISE else True] * len(i.args)
+        for a, m in zip(i.args, masks, strict=True):
+            if m is not True:
+                m = _reduced(np.broadcast_to(m, i.spec.shape), np.shape(env[a]))
+                if not m.any():
+                    continue
+            before = taken.get(a)
+            taken[a] = m if before is None else True if before is True or m is True else before | m
+    return taken
+
+
+def _reduced(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A mask of a result for an argument that was broadcast to it."""
+    mask = mask.any(axis=tuple(range(mask.ndim - len(shape))))
+    wide = tuple(a for a, n in enumerate(shape) if n == 1 and mask.shape[a] != 1)
+    return mask.any(axis=wide, keepdims=True) if wide else mask
 
 
 def _live(instructions: list[Instruction], wanted: list[int]) -> tuple[tuple[Instruction, ...], set[int]]:
