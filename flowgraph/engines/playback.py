@@ -97,7 +97,9 @@ def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engi
         for name, count in state["registers"][r.path].items()
         if name.startswith(COUNTED)
     }
-    return Result(pipeline.name, engine, series, state, stats, len(events.time), outcome.wall_s)
+    stats |= outcome.stats
+    ticks = len(events.time)
+    return Result(pipeline.name, engine, series, state, stats, ticks, outcome.wall_s, outcome.notes)
 
 
 def chosen_passes(engine: PipelineEngine, options: RunOptions) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
 """Number formats: how each real value of a pipeline is kept as a whole number.
 
-A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included; the fraction f is
-chosen for each element from the largest size that the element takes, since the entries of one covariance differ
-by many powers of ten. Elements along an axis of particles share one. Values that are only moved (an element, a
-row, a transpose) keep the formats that they had.
+A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included; the
+fraction f is chosen for each element from the largest size that the element takes, since the entries of one
+covariance differ by many powers of ten. Elements along an axis of particles share one. Values that are only
+moved (an element, a row, a transpose) keep the formats that they had.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
 
 _BELOW = 8
-"""An element that was never larger than the last bit of the largest beside it, by so many bits, is rounding."""
+"""An element that was never larger than the last bit of the largest beside it, by so many bits, is
+rounding."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Formats:
 
     Args:
         width: bits of a word, with its sign.
-        fractions: by value number, the fraction of each element: integers that broadcast to the value's shape.
+        fractions: by value number, the fraction of each element: integers that broadcast to the value's
+            shape.
         margin: by how much the sizes were widened that the fractions were chosen from.
         absent: the inputs and registers that may be NaN: readings that are not there.
 

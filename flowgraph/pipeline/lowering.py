@@ -174,7 +174,9 @@ class _Lowering(StageList):
         if stamp not in self.durations:
             (last,) = self.reads[stamp]
             first = self.emit("equal", last, self.constant(np.int64(NEVER)))
-            since = self.emit("subtract", self.time, last)  # chosen among integers: what is no duration is no real
+            since = self.emit(
+                "subtract", self.time, last
+            )  # chosen among integers: what is no duration is no real
             gap = self.emit("where", first, self.constant(np.int64(0)), since)
             seconds = self.emit("astype", gap, dtype="real")
             self.durations[stamp] = self.emit("multiply", seconds, self.constant(np.float64(1e-9)))

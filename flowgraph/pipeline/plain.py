@@ -1,8 +1,8 @@
 """Plain instructions: factorizations and powers written out in sums, products, quotients and roots.
 
-An array engine is best served by `solve` as one operation. A machine that has adders and multipliers alone needs
-its steps, and whoever asks what range a number has needs them as values. `plain` writes them out: the same
-pipeline, whose new values follow the old ones in number, for any engine.
+An array engine is best served by `solve` as one operation. A machine that has adders and multipliers alone
+needs its steps, and whoever asks what range a number has needs them as values. `plain` writes them out: the
+same pipeline, whose new values follow the old ones in number, for any engine.
 """
 
 from __future__ import annotations

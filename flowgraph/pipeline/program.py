@@ -137,7 +137,8 @@ def _fold(
 def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
     """Which elements of each value bear on an output or a register in this tick: a mask, or True for all.
 
-    A selection needs what it takes: the quotient beside a guard `where(small, 1.0, x / y)` may be of any size.
+    A selection needs what it takes: the quotient beside a guard `where(small, 1.0, x / y)` may be of any
+        size.
     """
     taken: dict[int, Any] = dict.fromkeys(program.writes, True)
     for flag, leaves in program.outputs:

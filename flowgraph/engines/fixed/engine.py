@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -11,9 +11,10 @@ import numpy as np
 
 from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import Outcome, PipelineEngine, Player
-from flowgraph.engines.fixed.rules import (
-    MOVES, Run, Site, bind, keeping_nan, may_be_nan, moved, passing_nan, to,
-)
+from flowgraph.engines.fixed.absent import Run, keeping_nan, may_be_nan, passing_nan
+from flowgraph.engines.fixed.counts import Counts
+from flowgraph.engines.fixed.rules import bind, to
+from flowgraph.engines.fixed.shifts import MOVES, Site, moved
 from flowgraph.engines.options import Meter
 from flowgraph.errors import DataError, DeclarationError, LoweringError
 from flowgraph.pipeline.formats import (
@@ -29,6 +30,14 @@ from flowgraph.pipeline.program import Program, needed, specialise
 from flowgraph.recorder.ops import Spec
 from flowgraph.types import DTYPES
 
+LOSE: dict[str, Callable[..., Any]] = {
+    "multiply": lambda a, b: (a != 0) & (b != 0),
+    "divide": lambda a, b: (a != 0) & (b != 0),
+    "sqrt": lambda x: x > 0,
+    "exp": lambda x: np.ones(np.shape(x), bool),
+}
+"""For operations whose words may be lost, where of its arguments the result is not zero."""
+
 
 @dataclass(frozen=True)
 class _Step:
@@ -36,6 +45,7 @@ class _Step:
     args: tuple[int, ...]
     out: int
     real: bool
+    op: str
 
 
 @dataclass(frozen=True)
@@ -58,15 +68,14 @@ class Integers:
         seed: (2,) uint32.
 
     Attributes:
-        saturations: by value number, how many words did not fit and were cut to the largest. What no selection
-            took is not counted.
+        counts: what did not fit, so far.
     """
 
     def __init__(self, pipeline: Pipeline, cells: Sequence[Any], seed: np.ndarray) -> None:
         self.pipeline, self.seed = pipeline, seed
         self.formats = formats_of(pipeline)
         self.most = np.int64(2 ** (self.formats.width - 1) - 1)
-        self.saturations: dict[int, int] = {}
+        self.counts = Counts()
         self._cells = [c for r in pipeline.registers for c in r.cells]
         self._bound: dict[int, Bound] = {}
         self.cells = [
@@ -80,8 +89,11 @@ class Integers:
         fraction = self.fraction(value, shape)
         words = whole_numbers(real, fraction, self.formats.width)
         with np.errstate(invalid="ignore", over="ignore"):
-            off = np.abs(np.ldexp(real, np.where(fraction == FREE, 0, fraction).astype(int))) > float(self.most) + 0.5
-        self._count(value, off)
+            off = (
+                np.abs(np.ldexp(real, np.where(fraction == FREE, 0, fraction).astype(int)))
+                > float(self.most) + 0.5
+            )
+        self.counts.add("saturations", value, off)
         if np.isnan(real).any() and value not in self.formats.absent:
             raise DataError(
                 "a reading is NaN that never was one when the number formats were found",
@@ -127,7 +139,7 @@ class Integers:
             for c, n, end in zip(self._cells, program.writes, bound.writes, strict=True)
         ]
         for value, off in cut.items():
-            self._count(value, off)
+            self.counts.add("saturations", value, off)
         made: list[tuple[Any, ...] | None] = []
         for flag, leaves in program.outputs:
             if flag is None or not env.get(flag, True):
@@ -154,13 +166,27 @@ class Integers:
                 for leaf, x in zip(port.leaves, next(present), strict=True):
                     env[leaf.value] = self.words(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x
         cut: dict[int, Any] = {}
+        by_zero: dict[int, Any] = {}
         for step in bound.steps:
-            made = step.run(*[env[a] for a in step.args])
-            env[step.out] = self._fitted(step.out, made, cut) if step.real else made
-        if cut:
+            given = [env[a] for a in step.args]
+            made = step.run(*given)
+            if not step.real:
+                env[step.out] = made
+                continue
+            env[step.out] = made = self._fitted(step.out, made, cut)
+            lose = LOSE.get(step.op)
+            if lose is None:
+                continue
+            gone = made == 0
+            if np.any(gone):
+                self.counts.add("lost_bits", step.out, gone & lose(*given))
+            if step.op == "divide" and not np.all(given[1]):
+                by_zero[step.out] = np.broadcast_to(given[1] == 0, np.shape(made))
+        if cut or by_zero:
             taken = needed(bound.program, env)
-            for value, off in cut.items():
-                self._count(value, off & taken.get(value, False))
+            for kind, found in (("saturations", cut), ("divisions_by_zero", by_zero)):
+                for value, off in found.items():
+                    self.counts.add(kind, value, off & taken.get(value, False))
         return bound, env
 
     def _fitted(self, value: int, words: Any, cut: dict[int, Any]) -> Any:
@@ -169,11 +195,6 @@ class Integers:
             return words
         cut[value] = off
         return np.where(off, np.clip(words, -self.most, self.most), words)
-
-    def _count(self, value: int, off: Any) -> None:
-        n = int(np.count_nonzero(off))
-        if n:
-            self.saturations[value] = self.saturations.get(value, 0) + n
 
     def bind(self, key: int) -> Bound:
         """The program of a pattern of present inputs, with its shifts worked out."""
@@ -195,7 +216,9 @@ class Integers:
         for k, port in enumerate(self.pipeline.inputs):
             for leaf in port.leaves:
                 if not key >> k & 1:  # a selection may name it without taking it
-                    known[leaf.value] = np.zeros(leaf.shape, np.int64 if leaf.dtype == "real" else DTYPES[leaf.dtype])
+                    known[leaf.value] = np.zeros(
+                        leaf.shape, np.int64 if leaf.dtype == "real" else DTYPES[leaf.dtype]
+                    )
                 if leaf.dtype == "real":
                     absent = np.full(leaf.shape, FREE)
                     fractions[leaf.value] = self.fraction(leaf.value, leaf.shape) if key >> k & 1 else absent
@@ -214,7 +237,7 @@ class Integers:
             run = bind(Site(i, given, out, specs, width))
             if any(a in doubtful for a in i.args):
                 run = passing_nan(i, run)
-            steps.append(_Step(run, i.args, i.out, real))
+            steps.append(_Step(run, i.args, i.out, real, i.op))
         writes = tuple(
             _moving(fractions[n], fractions[c.read], specs[n]) if c.dtype == "real" else None
             for c, n in zip(self._cells, program.writes, strict=True)
@@ -270,7 +293,10 @@ class _Prepared(Player):
                 for column, leaf in zip(columns, port.leaves, strict=True)
             ]
             stacked.append((np.asarray(times, dtype=np.int64), arrays))
-        return Outcome(player.reals(), stacked, wall)
+        counts = player.counts
+        return Outcome(
+            player.reals(), stacked, wall, counts.stats(self._pipeline), counts.notes(self._pipeline)
+        )
 
 
 class FixedEngine(PipelineEngine):

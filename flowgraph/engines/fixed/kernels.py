@@ -41,11 +41,19 @@ static inline int fx_bits(int64_t x) {
   return n + (x != 0);
 }
 
-static inline int64_t fx_fit(int64_t x, int64_t most, int64_t *count) {
-  if (x == FX_NAN || (x <= most && x >= -most)) return x;
-  ++*count;
-  return x > 0 ? most : -most;
+static inline int64_t fx_fit(int64_t x, uint8_t *off, int place) { /* a word, or the largest, marked */
+  if (x == FX_NAN || (x <= FX_MOST && x >= -FX_MOST)) return x;
+  off[place] |= 1;
+  off[FX_SIZE] = 1;
+  return x > 0 ? FX_MOST : -FX_MOST;
 }
+
+static inline int64_t fx_lost(int64_t x, int is_not_zero, int64_t *count) {
+  if (x == 0 && is_not_zero) ++*count;
+  return x;
+}
+#define FX_FIT(x, place) fx_fit(x, off, place)
+#define FX_MARK(place, why) (off[place] |= (why), off[FX_SIZE] = 1)
 
 static inline int64_t fx_quotient(int64_t a, int64_t b, int64_t up) {
   if (a == 0) return 0;
@@ -177,11 +185,12 @@ def _list(numbers: list[int]) -> str:
     return ", ".join(f"INT64_C({n})" for n in numbers)
 
 
-def kernels() -> str:
-    """The text, with the constants of `integers`."""
+def kernels(most: int, size: int) -> str:
+    """The text, with the constants of `integers`, the largest word, and the number of words that are kept."""
     assert NOT_A_NUMBER == -z.LIMIT
     head = _HEAD.format(
         turn=z.QUARTER_TURNS, quarter=z.QUARTER, log2_e=z.LOG2_E, ln_2=z.LN_2, half=z.HALF_TURN,
         sinc=_list(z.SINC), cosine=_list(z.COSINE), power=_list(z.POWER), angles=_list(z.ANGLES),
     )  # fmt: skip
-    return f"#include <stdint.h>\n{head}#define FX_STEPS {len(z.ANGLES)}\n{_BODY}"
+    sizes = f"#define FX_MOST INT64_C({most})\n#define FX_SIZE {size}\n#define FX_STEPS {len(z.ANGLES)}"
+    return f"#include <stdint.h>\n{head}{sizes}\n{_BODY}"

@@ -59,7 +59,9 @@ class Sizes:
                 for n in (made | given) & self._real:
                     self._see(n, np.where(taken.get(n, False), env[n], 0.0))
                 self.absent |= {n for n in given & self._real if np.isnan(env[n]).any()}
-                for cell, n in zip((c for r in self.pipeline.registers for c in r.cells), program.writes, strict=True):
+                for cell, n in zip(
+                    (c for r in self.pipeline.registers for c in r.cells), program.writes, strict=True
+                ):
                     if cell.dtype == "real":
                         self._see(cell.read, env[n])
                         if np.isnan(env[n]).any():
@@ -82,5 +84,3 @@ class Sizes:
 def _parts(pipeline: Pipeline) -> Iterable[Any]:
     yield from (c for r in pipeline.registers for c in r.cells)
     yield from (x for port in (*pipeline.inputs, *pipeline.outputs) for x in port.leaves)
-
-
