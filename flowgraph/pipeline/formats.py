@@ -38,6 +38,7 @@ class Formats:
             shape.
         margin: by how much the sizes were widened that the fractions were chosen from.
         absent: the inputs and registers that may be NaN: readings that are not there.
+        structure: a digest of the plain pipeline that they are for; empty where nobody asks.
 
     Raises:
         DeclarationError: for a width that no word has.
@@ -47,6 +48,7 @@ class Formats:
     fractions: Mapping[int, np.ndarray]
     margin: float = 1.0
     absent: frozenset[int] = frozenset()
+    structure: str = ""
 
     def __post_init__(self) -> None:
         if not NARROWEST <= self.width <= WIDEST:
@@ -62,10 +64,39 @@ class Formats:
         """As plain JSON values."""
         return {
             "width": self.width,
+            "rounding": "nearest, half up",
+            "overflow": "saturate",
             "margin": self.margin,
             "absent": sorted(self.absent),
-            "fractions": [{"value": n, "fraction": f.tolist()} for n, f in sorted(self.fractions.items())],
+            "structure": self.structure,
+            "fractions": [
+                {"value": n, "fraction": np.asarray(f).tolist()} for n, f in sorted(self.fractions.items())
+            ],
         }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Formats:
+        """From `to_json`'s form.
+
+        Raises:
+            KeyError, TypeError, ValueError: where it is another.
+        """
+        for name in ("rounding", "overflow"):
+            if data[name] != cls(NARROWEST, {}).to_json()[name]:
+                raise ValueError(f"{name} {data[name]!r}")
+        fractions = {}
+        for one in data["fractions"]:
+            found = np.asarray(one["fraction"])
+            if found.dtype.kind != "i":
+                raise ValueError(f"the fraction of value {one['value']} is no array of integers")
+            fractions[int(one["value"])] = found.astype(np.int64)
+        return cls(
+            int(data["width"]),
+            fractions,
+            float(data["margin"]),
+            frozenset(map(int, data["absent"])),
+            str(data["structure"]),
+        )
 
 
 def fraction_for(largest: np.ndarray, width: int) -> np.ndarray:

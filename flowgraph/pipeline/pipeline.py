@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight
 
-FORMAT, VERSION = "flowgraph-pipeline", 1
+FORMAT, VERSION = "flowgraph-pipeline", 2
+READ = (1, 2)
+"""The versions that are read: 1 has no formats."""
 _FILE = "pipeline.json"
 _SCHEMA = Path(__file__).with_name("pipeline.schema.json")
 

@@ -44,7 +44,7 @@ def may_be_nan(instructions: Sequence[Instruction], given: Collection[int]) -> s
             value, number = asks[i.args[0]]
             asks[i.out] = (value, not number)
         elif i.op == "where":
-            value, number = asks.get(i.args[0], (None, True))
+            value, number = asks.get(i.args[0], (-1, True))
             taken, other = (i.args[1], i.args[2]) if number else (i.args[2], i.args[1])
             if other in found or (taken in found and taken != value):
                 found.add(i.out)

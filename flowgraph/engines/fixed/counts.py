@@ -29,15 +29,19 @@ _SAID = 5
 
 @dataclass
 class Counts:
-    """Counts by value number."""
+    """Counts by value number; `cut` marks the elements that saturated."""
 
     saturations: dict[int, int] = field(default_factory=dict)
     divisions_by_zero: dict[int, int] = field(default_factory=dict)
     lost_bits: dict[int, int] = field(default_factory=dict)
+    cut: dict[int, np.ndarray] = field(default_factory=dict)
 
     def add(self, kind: str, value: int, many: Any) -> None:
         """Count once for each true element of `many`, or so many times."""
-        n = int(np.count_nonzero(many)) if np.asarray(many).dtype == bool else int(many)
+        marks = np.asarray(many)
+        n = int(np.count_nonzero(marks)) if marks.dtype == bool else int(many)
+        if n and kind == "saturations" and marks.dtype == bool:
+            self.mark(value, marks)
         if n:
             counted: dict[int, int] = getattr(self, kind)
             counted[value] = counted.get(value, 0) + n
@@ -45,6 +49,23 @@ class Counts:
     def total(self, kind: str) -> int:
         """Of all values."""
         return sum(getattr(self, kind).values())
+
+    def mark(self, value: int, elements: np.ndarray) -> None:
+        """Elements that saturated."""
+        self.cut[value] = np.asarray(self.cut.get(value, np.False_) | elements)
+
+    def join(self, other: Counts) -> None:
+        """Add those of another run of the same pipeline."""
+        for kind in KINDS:
+            mine: dict[int, int] = getattr(self, kind)
+            for value, n in getattr(other, kind).items():
+                mine[value] = mine.get(value, 0) + n
+        for value, marks in other.cut.items():
+            self.mark(value, marks)
+
+    def first(self, pipeline: Pipeline, kind: str) -> str:
+        """The value that has most of a kind."""
+        return next((name for k, name, _ in self._named(pipeline) if k == kind), pipeline.name)
 
     def stats(self, pipeline: Pipeline) -> dict[str, int]:
         """The totals, always there, then what is not zero by value: "saturations.v7 divide, module:12"."""

@@ -20,7 +20,6 @@ from flowgraph.errors import DataError, DeclarationError, LoweringError
 from flowgraph.pipeline.formats import (
     FREE,
     NOT_A_NUMBER,
-    Formats,
     fraction_of_constant,
     real_numbers,
     whole_numbers,
@@ -73,7 +72,9 @@ class Integers:
 
     def __init__(self, pipeline: Pipeline, cells: Sequence[Any], seed: np.ndarray) -> None:
         self.pipeline, self.seed = pipeline, seed
-        self.formats = formats_of(pipeline)
+        formats = need_formats(pipeline).formats
+        assert formats is not None
+        self.formats = formats
         self.most = np.int64(2 ** (self.formats.width - 1) - 1)
         self.counts = Counts()
         self._cells = [c for r in pipeline.registers for c in r.cells]
@@ -93,7 +94,9 @@ class Integers:
                 np.abs(np.ldexp(real, np.where(fraction == FREE, 0, fraction).astype(int)))
                 > float(self.most) + 0.5
             )
-        self.counts.add("saturations", value, off)
+        if off.any():
+            self.counts.add("saturations", value, np.count_nonzero(off))
+            self.counts.mark(value, off.reshape(-1, *shape).any(axis=0))
         if np.isnan(real).any() and value not in self.formats.absent:
             raise DataError(
                 "a reading is NaN that never was one when the number formats were found",
@@ -249,8 +252,8 @@ def _moving(have: np.ndarray, want: np.ndarray, spec: Spec) -> Run:
     return keeping_nan(to(np.broadcast_to(have, spec.shape), np.broadcast_to(want, spec.shape)))
 
 
-def formats_of(pipeline: Pipeline) -> Formats:
-    """The formats that a pipeline carries.
+def need_formats(pipeline: Pipeline) -> Pipeline:
+    """The pipeline, if it carries number formats.
 
     Raises:
         DeclarationError: where it carries none.
@@ -263,7 +266,7 @@ def formats_of(pipeline: Pipeline) -> Formats:
             got="none",
             fix="flowgraph quantise GRAPH --data SPEC -o DIR, then formats=DIR",
         )
-    return pipeline.formats
+    return pipeline
 
 
 class _Prepared(Player):
@@ -288,7 +291,7 @@ class _Prepared(Player):
         stacked = []
         for port, (times, kept) in zip(ports, outputs, strict=True):
             columns: Any = zip(*kept, strict=True) if kept else [[] for _ in port.leaves]
-            arrays = [
+            arrays: list[np.ndarray] = [
                 np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
                 for column, leaf in zip(columns, port.leaves, strict=True)
             ]
@@ -303,13 +306,13 @@ class FixedEngine(PipelineEngine):
     """Integers of a pipeline's formats, in NumPy: the definition of fixed point. Its results are float64."""
 
     name = "fixed"
-    dtypes = ("float64",)
+    dtypes = ("fixed", "float64")  # the second is what a user gets who leaves dtype out
 
     def prepare(
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
-        formats_of(pipeline)
-        return _Prepared(pipeline)
+        pipeline.need_numbers("fixed")
+        return _Prepared(need_formats(pipeline))
 
 
 ENGINE = FixedEngine()

@@ -1,17 +1,35 @@
-"""How large numbers get: the sizes of all values of a pipeline, over recorded flights in floating point."""
+"""How large numbers get: the sizes of all values of a pipeline, over recorded flights in floating point.
+
+What is rounding alone has no size of its own in floating point, such as an element of a product that is zero
+by symmetry. In words it takes the rounding of what is around it, which is larger; so the error of each value
+is bounded to the first order from the formats of its arguments, and a format fits that too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from flowgraph.data.tape import Tape
+from flowgraph.engines.fixed.shifts import MOVES, Site, moved
 from flowgraph.engines.reference import Interpreter
-from flowgraph.pipeline.formats import Formats, fraction_for
+from flowgraph.pipeline.format_files import structure_of
+from flowgraph.pipeline.formats import FREE, Formats, fraction_for, fraction_of_constant
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import needed
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.trace import Instruction
+
+_TOGETHER = 128
+"""Ticks whose values are looked at in one go."""
+
+_HELD = 16.0
+"""Errors of a register, in units of its last place: it gathers those of many ticks."""
+
+_MOST = 64.0
+"""Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
 
 
 class Sizes:
@@ -31,54 +49,178 @@ class Sizes:
         self.largest: dict[int, np.ndarray] = {}
         self.absent: set[int] = set()
         self.ticks = 0
+        self._cells = [c for r in pipeline.registers for c in r.cells]
         self._real = {n for n, s in pipeline.specs.items() if s.dtype == "real"} - set(pipeline.constants)
         self._shared = {
             n for part in _parts(pipeline) for n, axis in zip(part.shape, part.axes, strict=False) if axis
         }
+        self._waiting: dict[int, list[Any]] = {}
+        self._fits: dict[int, np.ndarray] = {}
 
-    def play(self, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
-        """Play one flight, and widen the sizes by what occurs in it."""
-        player = Interpreter(self.pipeline, cells, np.dtype(np.float64), seed)
+    def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
+        """Play one flight, and widen the sizes by what occurs in it.
+
+        Args:
+            pipeline: of the same structure, with the numbers of this flight.
+            tape: its ticks.
+            cells: register cells at the start.
+            seed: (2,) uint32.
+        """
+        player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
         rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
-        for cell, value in zip((c for r in self.pipeline.registers for c in r.cells), cells, strict=True):
-            if cell.dtype == "real":
-                self._see(cell.read, np.asarray(value))
+        for cell, value in zip(self._cells, cells, strict=True):
+            self._see(cell.read, cell.dtype, value)
         with np.errstate(all="ignore"):
             for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
                 values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
                 program, env = player.values(time, key, values)
                 player.cells = [env[n] for n in program.writes]
-                made = {i.out for i in program.instructions}
-                given = {
+                given = [
                     leaf.value
-                    for k, port in enumerate(self.pipeline.inputs)
+                    for k, port in enumerate(pipeline.inputs)
                     if key >> k & 1
                     for leaf in port.leaves
-                }
+                    if leaf.dtype == "real"
+                ]
                 taken = needed(program, env)
-                for n in (made | given) & self._real:
-                    self._see(n, np.where(taken.get(n, False), env[n], 0.0))
-                self.absent |= {n for n in given & self._real if np.isnan(env[n]).any()}
-                for cell, n in zip(
-                    (c for r in self.pipeline.registers for c in r.cells), program.writes, strict=True
-                ):
-                    if cell.dtype == "real":
-                        self._see(cell.read, env[n])
-                        if np.isnan(env[n]).any():
-                            self.absent.add(cell.read)
+                for n in (*given, *(i.out for i in program.instructions if i.spec.dtype == "real")):
+                    mask = taken.get(n, False)
+                    if mask is not False:
+                        self._see(n, "real", env[n] if mask is True else np.where(mask, env[n], 0.0))
+                    else:
+                        self._waiting.setdefault(n, [np.zeros(np.shape(env[n]))])
+                self.absent |= {n for n in given if np.isnan(env[n]).any()}
+                for cell, n in zip(self._cells, program.writes, strict=True):
+                    self._see(cell.read, cell.dtype, env[n])
                 self.ticks += 1
+                if self.ticks % _TOGETHER == 0:
+                    self._look()
+        self._look()
 
-    def _see(self, value: int, x: Any) -> None:
-        size = np.abs(np.asarray(x, dtype=np.float64))
-        axes = tuple(a for a, n in enumerate(size.shape) if n in self._shared)
-        size = np.where(np.isfinite(size), size, 0.0).max(axis=axes, keepdims=True, initial=0.0)
-        before = self.largest.get(value)
-        self.largest[value] = size if before is None else np.maximum(before, size)
+    def _see(self, value: int, dtype: str, x: Any) -> None:
+        if dtype == "real":
+            self._waiting.setdefault(value, []).append(x)
+
+    def _look(self) -> None:
+        """Widen the sizes by the values that wait."""
+        held = {c.read for c in self._cells}
+        for value, rows in self._waiting.items():
+            size = np.abs(np.asarray(rows, dtype=np.float64))
+            axes = tuple(a for a, n in enumerate(size.shape[1:]) if n in self._shared)
+            finite = np.isfinite(size)
+            if not finite.all():
+                if value in held and np.isnan(size).any():
+                    self.absent.add(value)
+                size = np.where(finite, size, 0.0)
+            size = size.max(axis=0).max(axis=axes, keepdims=True, initial=0.0)
+            before = self.largest.get(value)
+            self.largest[value] = size if before is None else np.maximum(before, size)
+        self._waiting = {}
+
+    def widen(self, value: int, marks: np.ndarray, factor: float) -> None:
+        """Make the elements that are marked larger than what the last formats were made for, by so much."""
+        axes = tuple(a for a, n in enumerate(marks.shape) if n in self._shared)
+        wider = marks.any(axis=axes, keepdims=True)
+        size = np.maximum(self.largest[value], np.where(wider, self._fits[value] * factor, 0.0))
+        self.largest[value] = size
 
     def formats(self, width: int, margin: float = 2.0) -> Formats:
         """Formats in which numbers fit that are `margin` times as large as any that was seen."""
-        fractions = {n: fraction_for(margin * size, width) for n, size in self.largest.items()}
-        return Formats(width, fractions, margin, frozenset(self.absent))
+        fractions: dict[int, np.ndarray] = {}
+        errors = _Errors(self.pipeline, width)
+        for n, size in self.largest.items():
+            if n in errors.given:
+                fractions[n] = fraction_for(margin * size, width)
+                errors.start(n, fractions[n], margin * size)
+        for i in self.pipeline.instructions:
+            found = self.largest.get(i.out)
+            if found is None:
+                continue
+            rounding = errors.of(i)
+            axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
+            rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
+            size = margin * np.maximum(found, rounding)
+            fractions[i.out] = fraction_for(size, width)
+            errors.add(i, fractions[i.out], size, rounding)
+        self._fits = {n: np.ldexp(0.5, width - 1 - f.astype(int)) / margin for n, f in fractions.items()}
+        return Formats(width, fractions, margin, frozenset(self.absent), structure_of(self.pipeline))
+
+
+class _Errors:
+    """Sizes and rounding errors of values, in the order in which they are computed.
+
+    Attributes:
+        given: the inputs and registers.
+    """
+
+    def __init__(self, pipeline: Pipeline, width: int) -> None:
+        self._specs: Mapping[int, Spec] = pipeline.specs
+        self._width = width
+        self._size: dict[int, np.ndarray] = {}
+        self._error: dict[int, np.ndarray] = {}
+        self._fraction: dict[int, np.ndarray] = {}
+        self._registers = {c.read for r in pipeline.registers for c in r.cells}
+        self.given = self._registers | {x.value for port in pipeline.inputs for x in port.leaves}
+        for n, array in pipeline.constants.items():
+            if array.dtype.kind == "f":
+                fraction = fraction_of_constant(array, width)
+                self._keep(n, fraction, np.abs(array), 0.0)
+
+    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any) -> None:
+        shape = self._specs[n].shape
+        last = np.where(fraction == FREE, 0.0, np.ldexp(1.0, -np.minimum(fraction, 1000).astype(int)))
+        self._fraction[n] = np.broadcast_to(fraction, shape)
+        self._size[n] = np.broadcast_to(size, shape)
+        self._error[n] = np.broadcast_to(np.minimum(error + last, _MOST * last), shape)
+
+    def start(self, n: int, fraction: np.ndarray, size: np.ndarray) -> None:
+        """A value that is given."""
+        last = np.ldexp(1.0, -fraction.astype(int))
+        self._keep(n, fraction, size, (_HELD - 1.0) * last if n in self._registers else 0.0)
+
+    def add(self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray) -> None:
+        """A value that was computed; one that is only moved keeps its formats."""
+        if i.op in MOVES and all(a in self._fraction for a in i.args[:1]):
+            given = [self._fraction.get(a) for a in i.args]
+            if all(f is not None for f in given) or i.op == "take":
+                fraction = moved(i, given)
+                self._keep(i.out, fraction, size, error - np.ldexp(1.0, -np.minimum(fraction, 1000)))
+                return
+        self._keep(i.out, fraction, size, error)
+
+    def of(self, i: Instruction) -> np.ndarray:
+        """The error of a result from those of its arguments, of its shape; zero where none is known."""
+        rule = _GROWTH.get(i.op)
+        if i.op in MOVES and i.op != "take":
+            rule = _moved
+        if rule is None or any(a not in self._size for a in i.args):
+            return np.zeros(i.spec.shape)
+        site = Site(i, [], None, self._specs, self._width)
+        sizes, errors = [self._size[a] for a in i.args], [self._error[a] for a in i.args]
+        return np.broadcast_to(rule(site, sizes, errors), i.spec.shape)
+
+
+def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
+    op = s.i.op
+    return errors[0] if op in ("negative", "abs", "positive", "materialise") else moved(s.i, errors)
+
+
+def _product(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
+    return sizes[0] * errors[1] + errors[0] * sizes[1]
+
+
+_GROWTH: dict[str, Callable[[Site, list[np.ndarray], list[np.ndarray]], Any]] = {
+    "add": lambda s, x, e: e[0] + e[1],
+    "subtract": lambda s, x, e: e[0] + e[1],
+    "multiply": _product,
+    "matmul": lambda s, x, e: x[0] @ e[1] + e[0] @ x[1],
+    "vecdot": lambda s, x, e: (x[0] * e[1] + e[0] * x[1]).sum(axis=-1),
+    "sum": lambda s, x, e: np.sum(
+        e[0],
+        axis=tuple(s.i.attrs["axis"]) if isinstance(s.i.attrs.get("axis"), list) else s.i.attrs.get("axis"),
+        keepdims=bool(s.i.attrs.get("keepdims", False)),
+    ),
+}
 
 
 def _parts(pipeline: Pipeline) -> Iterable[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -245,7 +244,7 @@ class Writer(Elements):
             return
         shape = self.shape(i.args[0])
         where = shifts.moved_from(i, shape)
-        source = self.at(i.args[0], shape)
+        begin = self.at(i.args[0], shape)
         affine = _affine(where)
         with self.loops(i.spec.shape) as index:
             if affine is None:
@@ -258,7 +257,7 @@ class Writer(Elements):
                     if k and x != "0"
                 ]
                 found = " + ".join([*([str(base)] if base or not parts else []), *parts])
-            self.put(f"{self.word(i.out, index)} = w[{plus(source, found)}];")
+            self.put(f"{self.word(i.out, index)} = w[{plus(begin, found)}];")
 
     def take(self, s: Site) -> None:
         i = s.i
@@ -283,7 +282,7 @@ class Writer(Elements):
     def writes(self) -> None:
         """Registers at the end of a tick; all are read before the first is written."""
         cells = [c for r in self.pipeline.registers for c in r.cells]
-        later: list[Callable[[], None]] = []
+        later: list[str] = []
         for c, n in zip(cells, self.bound.program.writes, strict=True):
             if n == c.read:
                 continue
@@ -298,14 +297,11 @@ class Writer(Elements):
                 to = f"w[{plus(kept, flat(c.shape, index))}]"
                 self.put(self.fitted(to, text) if real else f"{to} = {text};")
             size = max(math.prod(c.shape), 1)
-            place = self.at(c.read, c.shape)
             later.append(
-                lambda p=place, k=kept, n=size: self.put(
-                    f"for (int k = 0; k < {n}; ++k) w[{p} + k] = w[{k} + k];"
-                )
+                f"for (int k = 0; k < {size}; ++k) w[{self.at(c.read, c.shape)} + k] = w[{kept} + k];"
             )
-        for write in later:
-            write()
+        for copy in later:
+            self.put(copy)
 
 
 def _affine(where: np.ndarray) -> tuple[int, list[int]] | None:

@@ -123,7 +123,7 @@ class CompiledIntegers(Player):
                 place = self.source.place.get(-1 - c.read)
                 if place is not None:
                     marks = off[place : place + math.prod(c.shape)]
-                    counts.add("saturations", c.read, marks > 0)
+                    counts.add("saturations", c.read, (marks > 0).reshape(c.shape))
                     marks[:] = 0
 
     def _set(self, w: np.ndarray, value: int, x: Any) -> None:
