@@ -33,7 +33,7 @@ def quantise(
             " estimate_difference_relative; repeatable.",
         ),
     ] = None,
-    margin: Annotated[float, typer.Option(min=1.0, help="The sizes that occur, times this, fit.")] = 4.0,
+    margin: Annotated[float, typer.Option(min=1.0, help="The sizes that occur, times this, fit.")] = 2.0,
     truth: Truth = None,
     settings: Settings = None,
     settings_file: SettingsFile = None,

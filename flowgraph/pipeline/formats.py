@@ -23,6 +23,9 @@ NARROWEST, WIDEST = 8, 32
 FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
 
+_NOISE = 48
+"""An element below the largest beside it by so many powers of two is zero but for rounding."""
+
 _BELOW = 8
 """An element that was never larger than the last bit of the largest beside it, by so many bits, is
 rounding."""
@@ -109,7 +112,9 @@ def fraction_for(largest: np.ndarray, width: int) -> np.ndarray:
     sizes = np.asarray(largest, dtype=np.float64)
     most = float(sizes.max(initial=0.0))
     most = most if most > 0.0 else 1.0
-    sizes = np.where(sizes > 0.0, np.maximum(sizes, math.ldexp(most, -width - _BELOW)), most)
+    sizes = np.where(
+        sizes > math.ldexp(most, -_NOISE), np.maximum(sizes, math.ldexp(most, -width - _BELOW)), most
+    )
     whole = np.frexp(sizes)[1].astype(np.int64)  # x < 2^whole
     full = np.ldexp(1.0, whole.astype(int)) - sizes < np.ldexp(0.5, whole - width + 1)
     return np.asarray(width - 1 - (whole + full))

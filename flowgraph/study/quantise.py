@@ -40,7 +40,7 @@ RELATIVE, DECISIONS = "estimate_difference_relative", "decisions_differing"
 FIGURES = (POSITION, ATTITUDE, RELATIVE, DECISIONS)
 """What a bound may be of."""
 
-MARGIN = 4.0
+MARGIN = 2.0
 """The sizes that occurred times this fit their formats, if nobody says otherwise."""
 
 _ROUNDS = 10
@@ -303,7 +303,7 @@ def differences(reference: Result, found: Mapping[str, Series], estimate: str) -
     """How two runs of one filter differ, by the figures of `FIGURES` that it has.
 
     A decision is an event of an output in which a truth value or an integer differs, or that only one has.
-    The relative difference is the root mean square of a leaf's, divided by that of the leaf; the worst leaf's.
+    The relative difference is the root mean square of a leaf's, divided by that of the leaf: the worst.
     """
     differing = 0
     for name, ours in found.items():

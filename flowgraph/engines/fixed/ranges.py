@@ -28,8 +28,12 @@ _TOGETHER = 128
 _HELD = 16.0
 """Errors of a register, in units of its last place: it gathers those of many ticks."""
 
-_MOST = 64.0
+_MOST = 256.0
 """Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
+
+
+_CORRELATION = 2.0**-7
+"""The smallest that an element of a matrix is taken for, beside its diagonal."""
 
 
 class Sizes:
@@ -130,8 +134,9 @@ class Sizes:
         errors = _Errors(self.pipeline, width)
         for n, size in self.largest.items():
             if n in errors.given:
-                fractions[n] = fraction_for(margin * size, width)
-                errors.start(n, fractions[n], margin * size)
+                wide = margin * _beside_its_diagonal(size)
+                fractions[n] = fraction_for(wide, width)
+                errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
             found = self.largest.get(i.out)
             if found is None:
@@ -139,11 +144,23 @@ class Sizes:
             rounding = errors.of(i)
             axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
             rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
-            size = margin * np.maximum(found, rounding)
+            size = margin * _beside_its_diagonal(np.maximum(found, rounding))
             fractions[i.out] = fraction_for(size, width)
             errors.add(i, fractions[i.out], size, rounding)
         self._fits = {n: np.ldexp(0.5, width - 1 - f.astype(int)) / margin for n, f in fractions.items()}
         return Formats(width, fractions, margin, frozenset(self.absent), structure_of(self.pipeline))
+
+
+def _beside_its_diagonal(size: np.ndarray) -> np.ndarray:
+    """The elements of a square matrix, no smaller than a small part of what its diagonal would let them be.
+
+    In a covariance P_ij^2 <= P_ii P_jj, and where it is near zero it is what is left of larger numbers. Finer
+    formats than this only tell the rounding of the diagonal.
+    """
+    if size.ndim < 2 or size.shape[-1] != size.shape[-2] or size.shape[-1] < 2:
+        return size
+    root = np.sqrt(np.diagonal(size, axis1=-2, axis2=-1))
+    return np.maximum(size, _CORRELATION * root[..., :, None] * root[..., None, :])
 
 
 class _Errors:

@@ -62,6 +62,9 @@ class Writer(Elements):
             self.running(s)
         elif i.op == "searchsorted":
             self.search(s)
+        elif i.op in ("sort", "argsort"):
+            self.refuse_lost(i, lost)
+            self.order(s)
         else:
             self.each(s, lost)
 
@@ -218,6 +221,33 @@ class Writer(Elements):
             before = f"fx_shift(w[{base} + middle], {p}) {order} x"
             self.put(f"    if ({before}) low = middle + 1; else high = middle; }}")
             self.put(f"  {self.word(i.out, index)} = low; }}")
+
+    def order(self, s: Site) -> None:
+        """Sorting by insertion, which keeps the order of what is equal."""
+        i = s.i
+        shape = self.shape(i.args[0])
+        (axis,) = shifts.axes_of(i)(len(shape))
+        by = at = np.zeros((), np.int64)
+        if s.specs[i.args[0]].dtype == "real":
+            at = shifts.common_along(s.real(0), (axis,))
+            by = shifts.between(s.real(0), np.broadcast_to(at, shape))
+        with self.loops([1 if n == axis else size for n, size in enumerate(shape)]) as index:
+
+            def along(name: str) -> list[str]:
+                return [name if n == axis else x for n, x in enumerate(index)]
+
+            def key(name: str) -> str:
+                return f"fx_shift({self.word(i.args[0], along(name))}, {self.shift(by, along(name))})"
+
+            k, m, n = (self.word(i.out, along(name)) for name in "kmn")
+            self.put(f"for (int n = 0; n < {shape[axis]}; ++n) {{ int64_t x = {key('n')}; int k = n;")
+            held = "m" if i.op == "sort" else f"(int){m}"
+            self.put(f"  for (; k > 0; --k) {{ int m = k - 1; {k} = {m}; m = {held};")
+            self.put(f"    if ({m if i.op == 'sort' else key('m')} <= x) break; }}")
+            self.put(f"  {k} = {'x' if i.op == 'sort' else 'n'}; }}")
+            if i.op == "sort" and i.spec.dtype == "real":
+                end = self.shift(at - np.broadcast_to(s.out, shape), along("n"))
+                self.put(f"for (int n = 0; n < {shape[axis]}; ++n) {self.fitted(n, f'fx_shift({n}, {end})')}")
 
     def move(self, s: Site) -> None:
         i = s.i
