@@ -66,7 +66,7 @@ def test_formats_are_part_of_the_description(tmp_path):
     made = with_formats(pipeline, _some(pipeline))
     made.save(tmp_path)
     read = Pipeline.load(tmp_path)
-    assert read.formats is not None
+    assert read.formats is not None and made.formats is not None  # noqa: PT018  for the checker
     assert read.formats.to_json() == made.formats.to_json()
     assert read.formats.width == 20
     assert len(read.formats.fractions) == len(made.formats.fractions) > 0

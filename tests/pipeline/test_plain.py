@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from flowgraph.pipeline.plain import plain
 TIMES = np.arange(4, dtype=np.int64) * 1_000_000
 
 
-Three = real(3)
+Three = Annotated[Any, real(3)]
 
 
 def _played(function, values):

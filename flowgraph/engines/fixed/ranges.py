@@ -44,6 +44,7 @@ class Sizes:
 
     Attributes:
         largest: by value number, an array that broadcasts to the value's shape.
+        untaken: the same of elements that no selection took, whatever they were.
         absent: the inputs and registers that were NaN at some time.
         ticks: how many were played.
     """
@@ -51,6 +52,7 @@ class Sizes:
     def __init__(self, pipeline: Pipeline) -> None:
         self.pipeline = pipeline
         self.largest: dict[int, np.ndarray] = {}
+        self.untaken: dict[int, np.ndarray] = {}
         self.absent: set[int] = set()
         self.ticks = 0
         self._cells = [c for r in pipeline.registers for c in r.cells]
@@ -59,6 +61,7 @@ class Sizes:
             n for part in _parts(pipeline) for n, axis in zip(part.shape, part.axes, strict=False) if axis
         }
         self._waiting: dict[int, list[Any]] = {}
+        self._idle: dict[int, list[Any]] = {}
         self._fits: dict[int, np.ndarray] = {}
 
     def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
@@ -89,10 +92,9 @@ class Sizes:
                 taken = needed(program, env)
                 for n in (*given, *(i.out for i in program.instructions if i.spec.dtype == "real")):
                     mask = taken.get(n, False)
-                    if mask is not False:
-                        self._see(n, "real", env[n] if mask is True else np.where(mask, env[n], 0.0))
-                    else:
-                        self._waiting.setdefault(n, [np.zeros(np.shape(env[n]))])
+                    if mask is not True:
+                        self._idle.setdefault(n, []).append(env[n])
+                    self._see(n, "real", env[n] if mask is True else np.where(mask, env[n], 0.0))
                 self.absent |= {n for n in given if np.isnan(env[n]).any()}
                 for cell, n in zip(self._cells, program.writes, strict=True):
                     self._see(cell.read, cell.dtype, env[n])
@@ -108,18 +110,25 @@ class Sizes:
     def _look(self) -> None:
         """Widen the sizes by the values that wait."""
         held = {c.read for c in self._cells}
-        for value, rows in self._waiting.items():
-            size = np.abs(np.asarray(rows, dtype=np.float64))
-            axes = tuple(a for a, n in enumerate(size.shape[1:]) if n in self._shared)
-            finite = np.isfinite(size)
-            if not finite.all():
-                if value in held and np.isnan(size).any():
-                    self.absent.add(value)
-                size = np.where(finite, size, 0.0)
-            size = size.max(axis=0).max(axis=axes, keepdims=True, initial=0.0)
-            before = self.largest.get(value)
-            self.largest[value] = size if before is None else np.maximum(before, size)
-        self._waiting = {}
+        for waiting, sizes in ((self._waiting, self.largest), (self._idle, self.untaken)):
+            for value, rows in waiting.items():
+                size = np.abs(np.asarray(rows, dtype=np.float64))
+                axes = tuple(a for a, n in enumerate(size.shape[1:]) if n in self._shared)
+                finite = np.isfinite(size)
+                if not finite.all():
+                    if value in held and np.isnan(size).any():
+                        self.absent.add(value)
+                    size = np.where(finite, size, 0.0)
+                size = size.max(axis=0).max(axis=axes, keepdims=True, initial=0.0)
+                sizes[value] = np.maximum(sizes.get(value, 0.0), size)
+            waiting.clear()
+
+    def _size(self, value: int) -> np.ndarray | None:
+        """Of what was taken; where an element never was, of what it would have been."""
+        found = self.largest.get(value)
+        if found is None or value not in self.untaken:
+            return found
+        return np.asarray(np.where(found > 0.0, found, self.untaken[value]))
 
     def widen(self, value: int, marks: np.ndarray, factor: float) -> None:
         """Make the elements that are marked larger than what the last formats were made for, by so much."""
@@ -138,7 +147,7 @@ class Sizes:
                 fractions[n] = fraction_for(wide, width)
                 errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
-            found = self.largest.get(i.out)
+            found = self._size(i.out)
             if found is None:
                 continue
             rounding = errors.of(i)
@@ -160,7 +169,7 @@ def _beside_its_diagonal(size: np.ndarray) -> np.ndarray:
     if size.ndim < 2 or size.shape[-1] != size.shape[-2] or size.shape[-1] < 2:
         return size
     root = np.sqrt(np.diagonal(size, axis1=-2, axis2=-1))
-    return np.maximum(size, _CORRELATION * root[..., :, None] * root[..., None, :])
+    return np.asarray(np.maximum(size, _CORRELATION * root[..., :, None] * root[..., None, :]))
 
 
 class _Errors:
@@ -214,16 +223,16 @@ class _Errors:
             return np.zeros(i.spec.shape)
         site = Site(i, [], None, self._specs, self._width)
         sizes, errors = [self._size[a] for a in i.args], [self._error[a] for a in i.args]
-        return np.broadcast_to(rule(site, sizes, errors), i.spec.shape)
+        return np.asarray(np.broadcast_to(rule(site, sizes, errors), i.spec.shape))
 
 
 def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
     op = s.i.op
-    return errors[0] if op in ("negative", "abs", "positive", "materialise") else moved(s.i, errors)
+    return errors[0] if op in ("negative", "abs", "positive", "materialise") else moved(s.i, list(errors))
 
 
 def _product(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
-    return sizes[0] * errors[1] + errors[0] * sizes[1]
+    return np.asarray(sizes[0] * errors[1] + errors[0] * sizes[1])
 
 
 _GROWTH: dict[str, Callable[[Site, list[np.ndarray], list[np.ndarray]], Any]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,8 @@ from tests.graphs.library import library_case
 from tests.support import same
 
 MS = 1_000_000
-Two, Three = real(2), real(3)
+Two = Annotated[Any, real(2)]
+Three = Annotated[Any, real(3)]
 
 
 def sizes_of(built, inputs):
@@ -58,10 +60,8 @@ def formats_of(name, width, duration=0.5):
 def test_c_is_equal_to_the_interpreter_and_both_are_near_to_float64(name, width, most):
     case = library_case(name, 0.5)
     formats = formats_of(name, width)
-    ours, theirs = (
-        simulate(case.graph, case.inputs, formats=formats, **options)
-        for options in ({"engine": "fixed"}, {"engine": "c", "dtype": "fixed"})
-    )
+    ours = simulate(case.graph, case.inputs, engine="fixed", formats=formats)
+    theirs = simulate(case.graph, case.inputs, engine="c", dtype="fixed", formats=formats)
     same(ours, theirs)  # with the counts
     assert ours.notes == theirs.notes
     assert ours.ticks > 20
@@ -192,9 +192,9 @@ def test_a_pattern_that_was_not_seen_is_refused_with_the_place():
 
 def test_without_formats_a_run_says_where_they_come_from():
     case = library_case("kalman", 0.5)
-    for options in ({"engine": "fixed"}, {"engine": "c", "dtype": "fixed"}):
+    for engine in ("fixed", "c"):
         with pytest.raises(DeclarationError, match="(?s)no number formats.*flowgraph quantise"):
-            simulate(case.graph, case.inputs, **options)
+            simulate(case.graph, case.inputs, engine=engine, dtype="fixed")
 
 
 def test_formats_are_for_fixed_point_alone():

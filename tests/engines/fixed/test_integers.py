@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -43,7 +45,7 @@ def test_products_quotients_and_roots_are_rounded_to_the_last_place(seed):
     assert error(z.square_root(np.abs(a), f, out), out, np.sqrt(np.abs(x))) <= 1.0
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, tuple[Any, Any, float]] = {
     "sine": (lambda a, f, out: z.sine(a, f, out), np.sin, 4.0),
     "cosine": (lambda a, f, out: z.sine(a, f, out, ahead=1), np.cos, 4.0),
     "angle": (lambda a, f, out: z.angle(a, a[::-1], f, f[::-1], out), lambda x: np.arctan2(x, x[::-1]), 1.0),
