@@ -16,6 +16,7 @@ from flowgraph.cli import (  # noqa: F401  each adds its commands
     contents,
     filters,
     lower,
+    quantise,
     study,
     tune,
     watch,
