@@ -13,7 +13,7 @@ from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join, primitive
-from flowgraph.blocks.world.motion import Motion, World
+from flowgraph.blocks.world.motion import Motion, World, world_motion
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
 from flowgraph.blocks.world.smooth import AT_REST, figure_motion, figure_shape, shaped, smooth_motion
@@ -22,6 +22,7 @@ from flowgraph.blocks.world.thesis import thesis_flight
 __all__ = [
     "World",
     "Motion",
+    "world_motion",
     "KeyPoint",
     "Primitives",
     "join",
