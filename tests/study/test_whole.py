@@ -52,6 +52,7 @@ def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
     assert len({row["position_rmse_m"] for row in found}) == 4, "seeds choose the flight"
 
 
+@pytest.mark.slow
 def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> None:
     first = run_study(study(seeds=3), tmp_path)
     again = run_study(study(seeds=6), tmp_path)
@@ -60,6 +61,7 @@ def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> Non
     assert [figures(row) for row in again.rows] == [figures(row) for row in alone.rows]
 
 
+@pytest.mark.slow
 def test_a_setting_that_a_program_cannot_take_is_an_error_of_its_rows_alone(tmp_path) -> None:
     rows = run_study(study(seeds=2, parameters={"position_noise": [0.01, -1.0]}), tmp_path).rows
     assert [row["error"] is None for row in rows] == [True, True, False, False]
