@@ -1,4 +1,4 @@
-"""Straight code that the compiler packs into vectors: sigma points of a turn, whose rows gcc 12.2 mixed up."""
+"""Straight code that the compiler packs into vectors: sigma points of a turn, whose rows it has mixed up."""
 
 from __future__ import annotations
 
