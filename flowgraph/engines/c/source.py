@@ -52,6 +52,7 @@ class Source:
         patterns: the keys that have a reaction of their own, or None where one serves all.
         presence: by key, or None for all, the outputs that are present for certain and those that can be, a
             bit each.
+        longest: turns of the longest loop.
     """
 
     names: Names
@@ -60,6 +61,7 @@ class Source:
     source: str
     patterns: tuple[int, ...] | None
     presence: Mapping[int | None, tuple[int, int]]
+    longest: int
 
     def presence_of(self, key: int) -> tuple[int, int]:
         """The outputs that are present for certain in a tick of this pattern, and those that can be."""
@@ -135,6 +137,7 @@ class File:
         self.constants: dict[Any, tuple[str, Buffer]] = {}
         self.pool: dict[str, list[int]] = {}
         self.presence: dict[int | None, tuple[int, int]] = {}
+        self.longest = 0
 
     def source(self) -> Source:
         m = self.names.module
@@ -165,6 +168,7 @@ class File:
             text,
             None if self.patterns is None else tuple(self.patterns),
             self.presence,
+            self.longest,
         )
 
     # -- one reaction --------------------------------------------------------------------------------
@@ -206,6 +210,7 @@ class File:
         work, local = self._memory(plan.span)
         writer = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
         body = writer.body()
+        self.longest = max(self.longest, *(math.prod(space) for _, space in writer.groups), 0)
         must = may = 0
         for k, present in flags:
             must, may = must | (writer.ref(present) == "true") << k, may | 1 << k
