@@ -62,7 +62,7 @@ __all__ = [
 STATE = StateSpace(euclidean(3), angle(3), euclidean(9))
 """(p, e, v, b_g, b_a)."""
 
-_POSE = StateSpace(euclidean(3), angle(3))
+POSE_ANGLES = StateSpace(euclidean(3), angle(3))
 _SEES_POSE = np.eye(6, 15)
 
 
@@ -265,7 +265,7 @@ def update_pose_angles(
     e = prior.mean[..., 3:6]
     z = xp.concat([pose.position, measured_angles(pose.attitude, e, order=order, xp=xp)], axis=-1)
     expected = xp.concat([seen_place(prior.mean, lever, order=order, xp=xp), e], axis=-1)
-    residual = _POSE.minus(z, expected, xp)
+    residual = POSE_ANGLES.minus(z, expected, xp)
     H = sees_pose(e, lever, order=order, xp=xp)
     noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
     return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, xp=xp), xp)

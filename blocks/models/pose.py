@@ -107,7 +107,7 @@ def predict_pose(
     wide = xp.asarray(np.zeros((6, 4)), dtype=kind)
     Q = xp.concat([xp.concat([Q_vp, wide], axis=-1), xp.concat([wide.mT, Q_q], axis=-1)], axis=-2)
     P = F @ belief.covariance @ F.mT + Q
-    return _unit(v, p, q, P, xp)
+    return unit(v, p, q, P, xp)
 
 
 @block
@@ -150,7 +150,7 @@ def update_pose(
     R = xp.asarray(R, dtype=kind)
     found = correct(prior.covariance, residual, H, R, present=present, gate=gate, xp=xp)
     d = found.shift
-    posterior = _unit(
+    posterior = unit(
         prior.velocity + d[..., 0:3],
         prior.position + d[..., 3:6],
         prior.attitude + d[..., 6:10],
@@ -326,7 +326,7 @@ def _to_tangent(q: Array, xp: Any) -> Array:
     return xp.concat([swap, xp.concat([none, none, angle], axis=-1)], axis=-2)
 
 
-def _unit(v: Array, p: Array, q: Array, P: Array, xp: Any) -> QuaternionBelief:
+def unit(v: Array, p: Array, q: Array, P: Array, xp: Any) -> QuaternionBelief:
     """A belief with q scaled to unit norm and its covariance with it: N = (I - q q^T) / |q|."""
     size = xp.sqrt(xp.linalg.vecdot(q, q))[..., None]
     q = q / size

@@ -1,0 +1,233 @@
+"""Jacobians by hand of poses without biases: `ekf`, `ins_ekf_pose`, `outdoor_eskf`, `attitude_mekf`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array, jacobian
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.geometry.rotations import (
+    from_rotation_vector,
+    multiply,
+    rotate,
+)
+from flowgraph.blocks.kalman.filters import correct, update_extended
+from flowgraph.blocks.models import euler_ins, pose
+from flowgraph.blocks.orientation.commanded import TURN, predict_turn
+from flowgraph.blocks.outdoor import belief as outdoor
+from flowgraph.blocks.signals import (
+    BodyRate,
+    Gaussian,
+    Pose,
+    PoseMeasurement,
+    QuaternionBelief,
+)
+from flowgraph.graphs.benches.jacobian_inertial import moved_inertially
+from flowgraph.graphs.benches.jacobian_pairs import (
+    LEVER,
+    NOISE,
+    SIGMA,
+    Pair,
+    Step,
+    corrected,
+    gaussian,
+    imu_of,
+    imu_reading,
+    in_tangent_space,
+    pose_reading,
+    predicted,
+    state,
+    vector,
+)
+
+__all__ = ["POSE_PAIRS"]
+
+# The pose of `ekf`, in ten numbers: (v, p, q), with the errors of each.
+
+PLAIN = StateSpace(euclidean(10))
+
+
+def _ten(rng: np.random.Generator) -> np.ndarray:
+    q = rng.normal(size=4)
+    return np.concatenate([rng.normal(size=6), q / np.linalg.norm(q)])
+
+
+def _quaternion(x: Array, P: Array) -> QuaternionBelief:
+    return QuaternionBelief(velocity=x[..., 0:3], position=x[..., 3:6], attitude=x[..., 6:10], covariance=P)
+
+
+def _pose_by_hand(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    return gaussian(pose.predict_pose.step(_quaternion(x, P), imu_of(z), noise=NOISE, dt=dt, xp=xp), xp)
+
+
+def _pose_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    def move(s: Array, xp: Any) -> Array:
+        v, p, q = s[..., 0:3], s[..., 3:6], s[..., 6:10]
+        return xp.concat(pose.move(v, p, q, imu_of(z), dt, xp), axis=-1)
+
+    y, F = jacobian(move, x, xp)
+    none = _quaternion(x, 0.0 * P)  # of nothing but noise
+    Q = pose.predict_pose.step(none, imu_of(z), noise=NOISE, dt=dt, xp=xp).covariance
+    found = pose.unit(y[..., 0:3], y[..., 3:6], y[..., 6:10], F @ P @ F.mT, xp)
+    return gaussian(found.replace(covariance=found.covariance + Q), xp)
+
+
+def _captured(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    measured = Pose(position=z[..., :3], attitude=z[..., 3:7])
+    found, _ = pose.update_pose.step(
+        _quaternion(x, P), measured, position_noise=SIGMA, attitude_noise=SIGMA, lever=LEVER, xp=xp
+    )
+    return gaussian(found, xp)
+
+
+def _captured_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    def see(s: Array, xp: Any) -> Array:
+        place = s[..., 3:6] + rotate(s[..., 6:10], xp.asarray(LEVER, dtype=x.dtype), xp=xp)
+        return xp.concat([place, s[..., 6:10]], axis=-1)
+
+    y, H = in_tangent_space(see, PLAIN, pose.POSE, x, xp)
+    R = xp.asarray(SIGMA**2 * np.eye(6), dtype=x.dtype)
+    found = correct(P, pose.POSE.minus(z[..., :7], y, xp), H, R, xp=xp)
+    m = x + found.shift
+    return gaussian(pose.unit(m[..., 0:3], m[..., 3:6], m[..., 6:10], found.covariance, xp), xp)
+
+
+# The Euler angles of `ins_ekf_pose`.
+
+ORDER = "zxy"
+
+
+def _angles(rng: np.random.Generator) -> np.ndarray:
+    return np.concatenate([rng.normal(size=3), rng.uniform(-1.0, 1.0, 3), 0.1 * rng.normal(size=9)])
+
+
+def _euler(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    given = Gaussian(mean=x, covariance=P)
+    return euler_ins.predict_extended.step(given, imu_of(z), order=ORDER, noise=NOISE, dt=dt, xp=xp)
+
+
+def _euler_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    def move(s: Array, xp: Any) -> Array:
+        state, noise = s[..., :15], s[..., 15:]
+        turn, push = euler_ins.increments(state, imu_of(z), dt)
+        turn, push = turn + noise[..., :3], push + noise[..., 3:6]
+        after = euler_ins.move(state, turn, push, dt, order=ORDER, xp=xp)
+        return xp.concat([after[..., :9], after[..., 9:] + noise[..., 6:]], axis=-1)
+
+    y, both = in_tangent_space(move, euler_ins.STATE, euler_ins.STATE, x, xp, 12)
+    F, L = both[..., :15], both[..., 15:]
+    Q = xp.asarray(euler_ins.increment_variances(NOISE), dtype=x.dtype) * dt
+    mean = euler_ins.STATE.plus(y, xp.zeros((15,), dtype=x.dtype), xp)
+    return predicted(mean, F, P, 0.0, (L * Q) @ L.mT)
+
+
+def _euler_pose(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    S = xp.asarray(np.zeros((6, 6)), dtype=x.dtype)
+    none = xp.asarray(0.0, dtype=x.dtype)
+    measured = PoseMeasurement(z[..., :3], z[..., 3:7], S, none, none)
+    given = Gaussian(mean=x, covariance=P)
+    settings: dict[str, Any] = {"order": ORDER, "R": SIGMA**2, "lever": LEVER}
+    return euler_ins.update_pose_angles.step(given, measured, **settings, xp=xp)[0]
+
+
+def _euler_pose_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    def see(s: Array, z: Array, xp: Any) -> Array:
+        return xp.concat([euler_ins.seen_place(s, LEVER, order=ORDER, xp=xp), s[..., 3:6]], axis=-1)
+
+    def measured(z: Array, xp: Any) -> Array:
+        e = euler_ins.measured_angles(z[..., 3:7], x[..., 3:6], order=ORDER, xp=xp)
+        return xp.concat([z[..., :3], e], axis=-1)
+
+    R = lambda z: SIGMA**2 * np.eye(6)
+    return corrected(euler_ins.STATE, see, measured, R, euler_ins.POSE_ANGLES)(x, P, z, dt, xp)
+
+
+# The clones of `outdoor_eskf`.
+
+
+def _clone(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    given = Gaussian(mean=x, covariance=P)
+    return outdoor.predict_clone.step(given, imu_of(z), noise=NOISE, dt=dt, xp=xp)
+
+
+def _clone_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    def move(s: Array, xp: Any) -> Array:
+        none = xp.zeros((6,), dtype=x.dtype)
+        after = moved_inertially(xp.concat([s[..., :10], none], axis=-1), imu_of(z), dt, xp)
+        return xp.concat([after[..., :10], s[..., 10:]], axis=-1)
+
+    y, F = in_tangent_space(move, outdoor.OUTDOOR, outdoor.OUTDOOR, x, xp)
+    power = np.repeat([0.0, NOISE.accelerometer**2, NOISE.gyro**2, 0.0, 0.0], 3)
+    Q = xp.asarray(np.diag(power), dtype=x.dtype) * (0.5 * dt)
+    return predicted(y, F, P, Q, Q)
+
+
+def _observed(observe: Callable[..., Any], seen: StateSpace | None, size: int) -> tuple[Step, Step]:
+    """The correction by an observer of `outdoor`, and by its values alone."""
+    tangent = size if seen is None else seen.tangent
+    R = SIGMA**2 * np.eye(tangent)
+
+    def by_hand(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+        given = Gaussian(mean=x, covariance=P)
+        settings: dict[str, Any] = {"space": outdoor.OUTDOOR, "measured_space": seen}
+        return update_extended.step(given, z[..., :size], observe=observe, R=R, **settings, xp=xp)[0]
+
+    values = lambda s, z, xp: observe(s, xp)[0]
+    return by_hand, corrected(outdoor.OUTDOOR, values, lambda z, xp: z[..., :size], lambda z: R, seen)
+
+
+# The commanded attitude of `attitude_mekf`.
+
+
+def _turned_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
+    move = lambda s, xp: multiply(s, from_rotation_vector(z * dt, xp=xp), xp=xp)
+    y, F = in_tangent_space(move, TURN, TURN, x, xp)
+    mean = TURN.plus(y, xp.zeros((3,), dtype=x.dtype), xp)
+    return predicted(mean, F, P, 0.0, xp.eye(3, dtype=x.dtype) * (0.01**2 * dt))
+
+
+_OBSERVED: dict[str, tuple[Callable[..., Any], StateSpace | None, int]] = {
+    "PositionObserver": (outdoor.PositionObserver(LEVER), None, 3),
+    "FieldObserver": (outdoor.FieldObserver((2e-5, 1e-6, -4e-5), 1e-6), None, 3),
+    "observe_distance": (outdoor.observe_distance, None, 1),
+    "observe_flow": (outdoor.observe_flow, outdoor.FLOW, 7),
+}
+
+
+def _aloft(rng: np.random.Generator) -> np.ndarray:
+    """A body that leans by less than half a radian, above the ground."""
+    x = state(rng, outdoor.OUTDOOR)
+    lean = np.asarray(from_rotation_vector(np.append(0.3 * rng.normal(size=2), 0.0).clip(-0.5, 0.5), xp=np))
+    return np.concatenate([x[:2], [5.0], x[3:6], lean, x[10:]])
+
+
+POSE_PAIRS: dict[str, Pair] = {
+    "predict_pose": Pair(("ekf",), PLAIN, imu_reading, _pose_by_hand, _pose_derived, start=_ten),
+    "update_pose": Pair(("ekf",), PLAIN, pose_reading, _captured, _captured_derived, start=_ten),
+    "predict_extended": Pair(
+        ("ins_ekf_pose",), euler_ins.STATE, imu_reading, _euler, _euler_derived, start=_angles
+    ),
+    "update_pose_angles": Pair(
+        ("ins_ekf_pose", "ins_ukf_pose"), euler_ins.STATE, pose_reading, _euler_pose, _euler_pose_derived,
+        start=_angles,
+    ),
+    "predict_clone": Pair(("outdoor_eskf",), outdoor.OUTDOOR, imu_reading, _clone, _clone_derived),
+    **{
+        name: Pair(
+            ("outdoor_eskf",), outdoor.OUTDOOR,
+            (lambda rng: state(rng, outdoor.FLOW)) if seen is outdoor.FLOW else vector(3),
+            *_observed(observe, seen, size), start=_aloft,
+        )
+        for name, (observe, seen, size) in _OBSERVED.items()
+    },
+    "predict_turn": Pair(
+        ("attitude_mekf",), TURN, vector(3),
+        lambda x, P, z, dt, xp: predict_turn.step(
+            Gaussian(mean=x, covariance=P), BodyRate(z), noise=0.01, dt=dt, xp=xp
+        ),
+        _turned_derived,
+    ),
+}  # fmt: skip
