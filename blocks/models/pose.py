@@ -27,6 +27,7 @@ from flowgraph.blocks.geometry.rotations import (
     rotate,
     skew,
 )  # fmt: skip
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.kalman.smoothing import Steps
@@ -44,7 +45,6 @@ __all__ = [
     "predict_pose",
     "quaternion_noise",
     "start_pose",
-    "tangent_jacobian",
     "update_pose",
 ]
 
@@ -201,16 +201,6 @@ def move_jacobian(q: Array, imu: Imu, dt: Any, xp: Any) -> Array:
     return xp.concat([top, low], axis=-2)
 
 
-def tangent_jacobian(q: Array, predicted: Array, imu: Imu, dt: Any, xp: Any) -> Array:
-    """The Jacobian (9, 9) of `move` from the tangent space at q to that at the q' that it predicted.
-
-    `move_jacobian` between T(q') and T(q)^+, where T (9, 10) makes of a small change of (v, p, q) its error
-    in the order of `PoseBelief`, and T^+ (10, 9) of an error the change.
-    """
-    back = _to_tangent(q, xp).mT * xp.asarray([1.0] * 6 + [0.25] * 3)  # T's rows of angles have length 2
-    return _to_tangent(predicted, xp) @ move_jacobian(q, imu, dt, xp) @ back
-
-
 def observe_jacobian(q: Array, lever: Array, xp: Any) -> Array:
     """The Jacobian (6, 10) of what a motion capture measures, in its tangent space, with respect to (v, p,
     q).
@@ -287,18 +277,21 @@ def pose_steps(result: Result) -> Steps:
     prior, posterior = (
         Series(s.time, in_tangent_space(s.values)) for s in (result["prior"], result["posterior"])
     )
-    rows = zip(
-        posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
-        np.diff(posterior.time) * 1e-9, strict=True,
-    )  # fmt: skip
-    jacobians = [tangent_jacobian(q, ahead, control, dt, np) for q, ahead, control, dt in rows]
+    # between the tangent spaces of ten numbers and nine, for all ticks at once
+    drive, dt = result["control"][1:].values, np.diff(posterior.time)[:, None] * 1e-9
+
+    def carried(x: Array, xp: Any) -> Array:
+        v, p, q = move(x[..., 3:6], x[..., 0:3], x[..., 6:], drive, dt, xp)
+        return xp.concat([p, v, q], axis=-1)
+
     space = StateSpace(euclidean(6), quaternion())
+    _, jacobians = linearised(carried, posterior["mean"][:-1], space, np, seen=space)
 
     def named(smoothed: Series) -> Series:
         p, v, q = np.split(smoothed["mean"], (3, 6), axis=-1)
         return Series(smoothed.time, PoseBelief(p, v, q, smoothed["covariance"]), name=smoothed.name)
 
-    return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
+    return Steps(prior, posterior, jacobians, space, named)
 
 
 def in_tangent_space(belief: QuaternionBelief) -> Gaussian:

@@ -20,6 +20,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, PoseNoise, attitude_spread, pose_spread
 from flowgraph.blocks.outdoor.cloud import predict_outdoor
@@ -50,7 +51,6 @@ from flowgraph.graphs.benches.jacobian_pairs import (
     corrected,
     imu_of,
     imu_reading,
-    in_tangent_space,
     predicted,
     state,
     vector,
@@ -112,7 +112,7 @@ def _carried_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian
             [after[..., 3:6], after[..., :3], moved + after[..., :3] - p, after[..., 6:10]], axis=-1
         )
 
-    y, F = in_tangent_space(move, PARTICLE, PARTICLE, x, xp)
+    y, F = linearised(move, x, PARTICLE, xp, seen=PARTICLE)
     still = _particle(x, 0.0 * P, x[9:], xp)  # of noise alone
     Q = _only(predict_outdoor.step(still, imu_of(z), noise=PUSHED, dt=dt, xp=xp), xp).covariance
     turn = xp.asarray(np.diag([0.0] * 9 + [0.5 * NOISE.gyro**2] * 3), dtype=x.dtype) * dt
@@ -230,7 +230,7 @@ def _spread_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         after = moved_inertially(xp.concat([s[..., :10], none], axis=-1), imu_of(z), dt, xp)
         return xp.concat([after[..., :10], s[..., 10:]], axis=-1)
 
-    _, F = in_tangent_space(move, AUGMENTED, AUGMENTED, x, xp)
+    _, F = linearised(move, x, AUGMENTED, xp, seen=AUGMENTED)
     Q = _spread(x, 0.0 * P, z, dt, xp).covariance  # of noise alone
     return predicted(x, F, P, 0.0, Q)
 

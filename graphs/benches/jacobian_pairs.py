@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, jacobian
+from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.filters import correct, moved
 from flowgraph.blocks.models import pose
@@ -36,7 +37,6 @@ __all__ = [
     "gaussian",
     "imu_of",
     "imu_reading",
-    "in_tangent_space",
     "pose_reading",
     "predicted",
     "state",
@@ -77,22 +77,6 @@ class Pair:
     start: Callable[[np.random.Generator], np.ndarray] | None = None
 
 
-def in_tangent_space(
-    f: Callable[[Array, Any], Array], space: StateSpace, seen: StateSpace, x: Array, xp: Any, more: int = 0
-) -> tuple[Array, Array]:
-    """f(x) and its derivative from the tangent space at x to that at f(x); also by `more` numbers, which are
-    zero, that f takes behind x."""
-    t = space.tangent
-    behind = lambda a, xp: a if not more else xp.concat([a, xp.zeros((more,), dtype=x.dtype)], axis=-1)
-    y = f(behind(x, xp), xp)
-
-    def error(d: Array, xp: Any) -> Array:
-        start = space.plus(x, d[..., :t], xp)
-        return seen.minus(f(xp.concat([start, d[..., t:]], axis=-1) if more else start, xp), y, xp)
-
-    return y, jacobian(error, xp.zeros((t + more,), dtype=x.dtype), xp)[1]
-
-
 def drawn(pair: Pair, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A mean, a covariance and a reading to take the step with."""
     x = state(rng, pair.space) if pair.start is None else pair.start(rng)
@@ -106,7 +90,9 @@ def state(rng: np.random.Generator, space: StateSpace) -> np.ndarray:
 
 
 def imu_reading(rng: np.random.Generator) -> np.ndarray:
-    return np.concatenate([rng.normal(size=3), 10.0 * rng.normal(size=3)])
+    """A turn of 1 rad/s about any axis, and a force of about 10 m/s^2 on each."""
+    axis = rng.normal(size=3)
+    return np.concatenate([axis / np.linalg.norm(axis), 10.0 * rng.normal(size=3)])
 
 
 def vector(n: int) -> Callable[[np.random.Generator], np.ndarray]:
@@ -141,7 +127,7 @@ def corrected(
     def step(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         target = measured(z, xp)
         over = StateSpace(euclidean(target.shape[-1])) if seen is None else seen
-        y, H = in_tangent_space(lambda s, xp: h(s, z, xp), space, over, x, xp)
+        y, H = linearised(lambda s, xp: h(s, z, xp), x, space, xp, seen=over)
         noise = xp.asarray(R(z), dtype=x.dtype)
         apart = over.minus(target, y, xp)
         found = correct(P, apart, H, noise, space=space if reset else None, xp=xp)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,8 @@ from flowgraph.blocks.geometry.rotations import (
     multiply,
     rotate,
 )
-from flowgraph.blocks.kalman.filters import correct, update_extended
+from flowgraph.blocks.geometry.tangent import linearised
+from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.models import euler_ins, pose
 from flowgraph.blocks.orientation.commanded import TURN, predict_turn
 from flowgraph.blocks.outdoor import belief as outdoor
@@ -22,7 +22,6 @@ from flowgraph.blocks.signals import (
     BodyRate,
     Gaussian,
     Pose,
-    PoseMeasurement,
     QuaternionBelief,
 )
 from flowgraph.graphs.benches.jacobian_inertial import moved_inertially
@@ -31,15 +30,11 @@ from flowgraph.graphs.benches.jacobian_pairs import (
     NOISE,
     SIGMA,
     Pair,
-    Step,
-    corrected,
     gaussian,
     imu_of,
     imu_reading,
-    in_tangent_space,
     pose_reading,
     predicted,
-    state,
     vector,
 )
 
@@ -88,7 +83,7 @@ def _captured_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussia
         place = s[..., 3:6] + rotate(s[..., 6:10], xp.asarray(LEVER, dtype=x.dtype), xp=xp)
         return xp.concat([place, s[..., 6:10]], axis=-1)
 
-    y, H = in_tangent_space(see, PLAIN, pose.POSE, x, xp)
+    y, H = linearised(see, x, PLAIN, xp, seen=pose.POSE)
     R = xp.asarray(SIGMA**2 * np.eye(6), dtype=x.dtype)
     found = correct(P, pose.POSE.minus(z[..., :7], y, xp), H, R, xp=xp)
     m = x + found.shift
@@ -117,32 +112,11 @@ def _euler_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         after = euler_ins.move(state, turn, push, dt, order=ORDER, xp=xp)
         return xp.concat([after[..., :9], after[..., 9:] + noise[..., 6:]], axis=-1)
 
-    y, both = in_tangent_space(move, euler_ins.STATE, euler_ins.STATE, x, xp, 12)
+    y, both = linearised(move, x, euler_ins.STATE, xp, seen=euler_ins.STATE, more=12)
     F, L = both[..., :15], both[..., 15:]
     Q = xp.asarray(euler_ins.increment_variances(NOISE), dtype=x.dtype) * dt
     mean = euler_ins.STATE.plus(y, xp.zeros((15,), dtype=x.dtype), xp)
     return predicted(mean, F, P, 0.0, (L * Q) @ L.mT)
-
-
-def _euler_pose(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
-    S = xp.asarray(np.zeros((6, 6)), dtype=x.dtype)
-    none = xp.asarray(0.0, dtype=x.dtype)
-    measured = PoseMeasurement(z[..., :3], z[..., 3:7], S, none, none)
-    given = Gaussian(mean=x, covariance=P)
-    settings: dict[str, Any] = {"order": ORDER, "R": SIGMA**2, "lever": LEVER}
-    return euler_ins.update_pose_angles.step(given, measured, **settings, xp=xp)[0]
-
-
-def _euler_pose_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
-    def see(s: Array, z: Array, xp: Any) -> Array:
-        return xp.concat([euler_ins.seen_place(s, LEVER, order=ORDER, xp=xp), s[..., 3:6]], axis=-1)
-
-    def measured(z: Array, xp: Any) -> Array:
-        e = euler_ins.measured_angles(z[..., 3:7], x[..., 3:6], order=ORDER, xp=xp)
-        return xp.concat([z[..., :3], e], axis=-1)
-
-    R = lambda z: SIGMA**2 * np.eye(6)
-    return corrected(euler_ins.STATE, see, measured, R, euler_ins.POSE_ANGLES)(x, P, z, dt, xp)
 
 
 # The clones of `outdoor_eskf`.
@@ -159,24 +133,10 @@ def _clone_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         after = moved_inertially(xp.concat([s[..., :10], none], axis=-1), imu_of(z), dt, xp)
         return xp.concat([after[..., :10], s[..., 10:]], axis=-1)
 
-    y, F = in_tangent_space(move, outdoor.OUTDOOR, outdoor.OUTDOOR, x, xp)
+    y, F = linearised(move, x, outdoor.OUTDOOR, xp, seen=outdoor.OUTDOOR)
     power = np.repeat([0.0, NOISE.accelerometer**2, NOISE.gyro**2, 0.0, 0.0], 3)
     Q = xp.asarray(np.diag(power), dtype=x.dtype) * (0.5 * dt)
     return predicted(y, F, P, Q, Q)
-
-
-def _observed(observe: Callable[..., Any], seen: StateSpace | None, size: int) -> tuple[Step, Step]:
-    """The correction by an observer of `outdoor`, and by its values alone."""
-    tangent = size if seen is None else seen.tangent
-    R = SIGMA**2 * np.eye(tangent)
-
-    def by_hand(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
-        given = Gaussian(mean=x, covariance=P)
-        settings: dict[str, Any] = {"space": outdoor.OUTDOOR, "measured_space": seen}
-        return update_extended.step(given, z[..., :size], observe=observe, R=R, **settings, xp=xp)[0]
-
-    values = lambda s, z, xp: observe(s, xp)[0]
-    return by_hand, corrected(outdoor.OUTDOOR, values, lambda z, xp: z[..., :size], lambda z: R, seen)
 
 
 # The commanded attitude of `attitude_mekf`.
@@ -184,24 +144,9 @@ def _observed(observe: Callable[..., Any], seen: StateSpace | None, size: int) -
 
 def _turned_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
     move = lambda s, xp: multiply(s, from_rotation_vector(z * dt, xp=xp), xp=xp)
-    y, F = in_tangent_space(move, TURN, TURN, x, xp)
+    y, F = linearised(move, x, TURN, xp, seen=TURN)
     mean = TURN.plus(y, xp.zeros((3,), dtype=x.dtype), xp)
     return predicted(mean, F, P, 0.0, xp.eye(3, dtype=x.dtype) * (0.01**2 * dt))
-
-
-_OBSERVED: dict[str, tuple[Callable[..., Any], StateSpace | None, int]] = {
-    "PositionObserver": (outdoor.PositionObserver(LEVER), None, 3),
-    "FieldObserver": (outdoor.FieldObserver((2e-5, 1e-6, -4e-5), 1e-6), None, 3),
-    "observe_distance": (outdoor.observe_distance, None, 1),
-    "observe_flow": (outdoor.observe_flow, outdoor.FLOW, 7),
-}
-
-
-def _aloft(rng: np.random.Generator) -> np.ndarray:
-    """A body that leans by less than half a radian, above the ground."""
-    x = state(rng, outdoor.OUTDOOR)
-    lean = np.asarray(from_rotation_vector(np.append(0.3 * rng.normal(size=2), 0.0).clip(-0.5, 0.5), xp=np))
-    return np.concatenate([x[:2], [5.0], x[3:6], lean, x[10:]])
 
 
 POSE_PAIRS: dict[str, Pair] = {
@@ -210,19 +155,7 @@ POSE_PAIRS: dict[str, Pair] = {
     "predict_extended": Pair(
         ("ins_ekf_pose",), euler_ins.STATE, imu_reading, _euler, _euler_derived, start=_angles
     ),
-    "update_pose_angles": Pair(
-        ("ins_ekf_pose", "ins_ukf_pose"), euler_ins.STATE, pose_reading, _euler_pose, _euler_pose_derived,
-        start=_angles,
-    ),
     "predict_clone": Pair(("outdoor_eskf",), outdoor.OUTDOOR, imu_reading, _clone, _clone_derived),
-    **{
-        name: Pair(
-            ("outdoor_eskf",), outdoor.OUTDOOR,
-            (lambda rng: state(rng, outdoor.FLOW)) if seen is outdoor.FLOW else vector(3),
-            *_observed(observe, seen, size), start=_aloft,
-        )
-        for name, (observe, seen, size) in _OBSERVED.items()
-    },
     "predict_turn": Pair(
         ("attitude_mekf",), TURN, vector(3),
         lambda x, P, z, dt, xp: predict_turn.step(
