@@ -100,13 +100,7 @@ def predict_pose(
     """
     v, p, q = move(belief.velocity, belief.position, belief.attitude, imu, dt, xp, gravity=gravity)
     F = move_jacobian(belief.attitude, imu, dt, xp)
-    push, kind = noise.accelerometer**2 * dt, q.dtype
-    Q_vp = xp.asarray(_VV, dtype=kind) * push + xp.asarray(_VP, dtype=kind) * (push * dt)
-    Q_vp = Q_vp + xp.asarray(_PP, dtype=kind) * (push * dt * dt)
-    Q_q = quaternion_noise(q, noise.gyro, dt, xp)
-    wide = xp.asarray(np.zeros((6, 4)), dtype=kind)
-    Q = xp.concat([xp.concat([Q_vp, wide], axis=-1), xp.concat([wide.mT, Q_q], axis=-1)], axis=-2)
-    P = F @ belief.covariance @ F.mT + Q
+    P = F @ belief.covariance @ F.mT + motion_noise(q, noise, dt, xp)
     return unit(v, p, q, P, xp)
 
 
@@ -229,6 +223,16 @@ def rotated_jacobian(q: Array, v: Array, xp: Any) -> Array:
     along = xp.linalg.vecdot(u, v)[..., None, None] * xp.eye(3, dtype=q.dtype)
     rest = along + uv - uv.mT - w[..., None] * skew(v, xp=xp)
     return 2.0 * xp.concat([column[..., :, None], rest], axis=-1)
+
+
+def motion_noise(q: Array, noise: ImuNoise, dt: Any, xp: Any) -> Array:
+    """Q (10, 10) of `predict_pose`, at the attitude after the step."""
+    push, kind = noise.accelerometer**2 * dt, q.dtype
+    Q_vp = xp.asarray(_VV, dtype=kind) * push + xp.asarray(_VP, dtype=kind) * (push * dt)
+    Q_vp = Q_vp + xp.asarray(_PP, dtype=kind) * (push * dt * dt)
+    Q_q = quaternion_noise(q, noise.gyro, dt, xp)
+    wide = xp.asarray(np.zeros((6, 4)), dtype=kind)
+    return xp.concat([xp.concat([Q_vp, wide], axis=-1), xp.concat([wide.mT, Q_q], axis=-1)], axis=-2)
 
 
 def quaternion_noise(q: Array, density: float, dt: Any, xp: Any) -> Array:

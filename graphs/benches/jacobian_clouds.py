@@ -22,7 +22,13 @@ from flowgraph.blocks.geometry.rotations import (
 )
 from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.orientation.fixed_gain import AttitudeNoise, PoseNoise, attitude_spread, pose_spread
+from flowgraph.blocks.orientation.fixed_gain import (
+    AttitudeNoise,
+    PoseNoise,
+    attitude_spread,
+    motion_noise,
+    pose_spread,
+)
 from flowgraph.blocks.outdoor.cloud import predict_outdoor
 from flowgraph.blocks.outdoor.corrections import (
     correct_distance,
@@ -231,7 +237,7 @@ def _spread_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         return xp.concat([after[..., :10], s[..., 10:]], axis=-1)
 
     _, F = linearised(move, x, AUGMENTED, xp, seen=AUGMENTED)
-    Q = _spread(x, 0.0 * P, z, dt, xp).covariance  # of noise alone
+    Q = motion_noise(NOISE, xp.eye(3, dtype=x.dtype), dt, xp)
     return predicted(x, F, P, 0.0, Q)
 
 
@@ -285,6 +291,6 @@ CLOUD_PAIRS: dict[str, Pair] = {
         ("orientation_complementary",), TURN, vector(3), *_kept("shortest_arc"), start=_upright
     ),
     "pose_spread": Pair(
-        ("augmented_complementary",), AUGMENTED, imu_reading, _spread, _spread_derived, bound=5e-3
+        ("augmented_complementary",), AUGMENTED, imu_reading, _spread, _spread_derived, bound=1e-3
     ),
 }  # fmt: skip

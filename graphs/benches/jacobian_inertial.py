@@ -46,6 +46,7 @@ from flowgraph.graphs.benches.jacobian_pairs import (
     imu_reading,
     pose_reading,
     predicted,
+    state,
     vector,
 )
 
@@ -84,11 +85,16 @@ def predicted_inertially(walks: np.ndarray, space: StateSpace) -> Step:
     return step
 
 
-def _nearly_true(rng: np.random.Generator) -> np.ndarray:
-    """Any state, with scale factors of a percent."""
-    x = state(rng, NAVIGATION)
-    x[19:25] *= 0.01
-    return x
+def _nearly_true(space: StateSpace) -> Callable[[np.random.Generator], np.ndarray]:
+    """Any state, but biases of 0.1 and scale factors of a percent."""
+
+    def start(rng: np.random.Generator) -> np.ndarray:
+        x = state(rng, space)
+        x[7 if space is LEVEL else 10 : 16] *= 0.1
+        x[19:25] *= 0.01
+        return x
+
+    return start
 
 
 def _aided(aid: Callable[..., Any]) -> Step:
@@ -144,7 +150,7 @@ INERTIAL_PAIRS: dict[str, Pair] = {
         lambda x, P, z, dt, xp: gaussian(
             predict.step(belief(x, P), imu_of(z), noise=NOISE, dt=dt, xp=xp), xp
         ),
-        predicted_inertially(np.zeros(0), INERTIAL_BIASED), bound=1e-6,
+        predicted_inertially(np.zeros(0), INERTIAL_BIASED), bound=1e-6, start=_nearly_true(INERTIAL_BIASED),
     ),
     "predict_navigation": Pair(
         ("gnss_ins",), NAVIGATION, imu_reading,
@@ -153,7 +159,8 @@ INERTIAL_PAIRS: dict[str, Pair] = {
                 belief(x, P), imu_of(z), noise=NOISE, gravity=GRAVITY, estimated=ESTIMATED, dt=dt, xp=xp
             ), xp,
         ),
-        predicted_inertially(np.array([0.0] * 10 + [0.05**2]), NAVIGATION), bound=1e-6, start=_nearly_true,
+        predicted_inertially(np.array([0.0] * 10 + [0.05**2]), NAVIGATION),
+        bound=1e-6, start=_nearly_true(NAVIGATION),
     ),
     "aid_position": Pair(
         ("ins_eskf", "ins_particle"), INERTIAL_BIASED, vector(3),
@@ -181,7 +188,7 @@ INERTIAL_PAIRS: dict[str, Pair] = {
         lambda x, P, z, dt, xp: gaussian(
             predict_level.step(level(x, P), imu_of(z), noise=NOISE, gravity=-GRAVITY[2], dt=dt, xp=xp), xp
         ),
-        _level_derived, bound=1e-6,
+        _level_derived, bound=1e-6, start=_nearly_true(LEVEL),
     ),
     "hold_velocity": Pair(("marg",), LEVEL, imu_reading, _held, _held_derived),
 }  # fmt: skip

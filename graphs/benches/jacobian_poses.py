@@ -64,10 +64,8 @@ def _pose_derived(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
         return xp.concat(pose.move(v, p, q, imu_of(z), dt, xp), axis=-1)
 
     y, F = jacobian(move, x, xp)
-    none = _quaternion(x, 0.0 * P)  # of nothing but noise
-    Q = pose.predict_pose.step(none, imu_of(z), noise=NOISE, dt=dt, xp=xp).covariance
-    found = pose.unit(y[..., 0:3], y[..., 3:6], y[..., 6:10], F @ P @ F.mT, xp)
-    return gaussian(found.replace(covariance=found.covariance + Q), xp)
+    P = F @ P @ F.mT + pose.motion_noise(y[..., 6:10], NOISE, dt, xp)
+    return gaussian(pose.unit(y[..., 0:3], y[..., 3:6], y[..., 6:10], P, xp), xp)
 
 
 def _captured(x: Array, P: Array, z: Array, dt: Any, xp: Any) -> Gaussian:
