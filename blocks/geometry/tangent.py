@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from flowgraph import Array, jacobian
 from flowgraph.blocks.geometry.manifold import StateSpace
 
@@ -23,7 +25,6 @@ def linearised(
     *,
     seen: StateSpace | None = None,
     more: int = 0,
-    value: Array | None = None,
 ) -> tuple[Array, Array]:
     """f(x), and its derivative from the tangent space at x to that at f(x).
 
@@ -33,19 +34,22 @@ def linearised(
         space: of x.
         seen: of f(x), where it is no vector.
         more: how many numbers f takes behind those of x, such as noises; they are zero.
-        value: f(x), where it is known.
 
     Returns:
         y, and (..., t, tangent + more), where t is the tangent dimension of y.
+
+    Raises:
+        LoweringError: where a line of f loses the derivative.
     """
-    t = space.tangent
     lead = tuple(x.shape[:-1])
-    start = xp.concat([x, xp.zeros((*lead, more), dtype=x.dtype)], axis=-1) if more else x
-    y = f(start, xp) if value is None else value
-
-    def error(d: Array, xp: Any) -> Array:
-        moved = space.plus(x, d[..., :t], xp)
-        after = f(xp.concat([moved, d[..., t:]], axis=-1) if more else moved, xp)
-        return after - y if seen is None else seen.minus(after, y, xp)
-
-    return y, jacobian(error, xp.zeros((*lead, t + more), dtype=x.dtype), xp)[1]
+    whole = xp.concat([x, xp.zeros((*lead, more), dtype=x.dtype)], axis=-1) if more else x
+    along = space.directions(x, xp)
+    if along is not None and more:
+        size = space.size
+        none = [xp.zeros((*lead, more, d.shape[-1]), dtype=x.dtype) for d in along]
+        along = [xp.concat([d, zero], axis=-2) for d, zero in zip(along, none, strict=True)]
+        for i in range(more):
+            one = xp.asarray(np.eye(size + more, 1, -(size + i)), dtype=x.dtype)
+            along.append(xp.broadcast_to(one, (*lead, size + more, 1)) if lead else one)
+    y, J = jacobian(f, whole, xp, along=along)
+    return y, J if seen is None else seen.errors(y, J, xp)

@@ -244,7 +244,7 @@ def observed(
     if isinstance(found, tuple):
         return found
     space = StateSpace(euclidean(x.shape[-1])) if space is None else space
-    return linearised(observe, x, space, xp, seen=measured_space, value=found)
+    return linearised(observe, x, space, xp, seen=measured_space)
 
 
 def innovate(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:

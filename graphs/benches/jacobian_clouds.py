@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, jacobian
-from flowgraph.blocks.geometry.manifold import Quaternion, StateSpace, euclidean, quaternion
+from flowgraph.blocks.geometry.manifold import Part, Quaternion, StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     between_vectors,
     conjugate,
@@ -67,6 +67,8 @@ __all__ = ["CLOUD_PAIRS"]
 
 class _World(Quaternion):
     """An attitude whose error is a rotation vector in the world: Exp(e) q."""
+
+    directions, errors = Part.directions, Part.errors
 
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         return normalize(multiply(from_rotation_vector(d, xp=xp), x, xp=xp), xp=xp)

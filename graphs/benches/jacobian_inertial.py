@@ -63,16 +63,18 @@ def belief(x: Array, P: Array) -> Any:
     return NavigationBelief(*parts, x[..., 16:], P) if x.shape[-1] > 16 else Belief(*parts, P)
 
 
+_MOTION = inertial_motion(NOISE, space=INERTIAL_BIASED)
+
+
 def moved_inertially(x: Array, imu: Imu, dt: Any, xp: Any) -> Array:
     """The step of `predict` and of `predict_navigation` over a flat Earth, of any number of parameters."""
-    carry = inertial_motion(NOISE, space=INERTIAL_BIASED).carry
     rate, force = imu.gyro, imu.specific_force
     if x.shape[-1] > 16:  # the scale factors
         rate = rate - (rate - x[..., 10:13]) * x[..., 19:22]
         force = force - (force - x[..., 13:16]) * x[..., 22:25]
     row = lambda a: a[..., None, :]
     imu = Imu(gyro=rate, specific_force=force)
-    after = carry(row(x[..., :16]), imu, xp.zeros((1, 12), dtype=x.dtype), dt, xp)[..., 0, :]
+    after = _MOTION.carry(row(x[..., :16]), imu, xp.zeros((1, 12), dtype=x.dtype), dt, xp)[..., 0, :]
     return xp.concat([after, x[..., 16:]], axis=-1)
 
 

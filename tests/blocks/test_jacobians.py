@@ -10,7 +10,8 @@ import pytest
 
 from flowgraph import jacobian
 from flowgraph.blocks.geometry import euler
-from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
+from flowgraph.blocks.geometry.groups import SE, SE_2, SO
+from flowgraph.blocks.geometry.manifold import Part, StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import (
     between_vectors,
     conjugate,
@@ -222,3 +223,37 @@ def test_what_a_step_by_hand_leaves_out_is_of_the_order_that_it_says():
             scale = np.sqrt(np.diag(b))
             off.append(np.abs(a - b) / np.outer(scale, scale))
         assert 3.0 < off[0].max() / off[1].max() < 16.0, name
+
+
+@SEEDS
+def test_how_an_attitude_changes_with_a_small_turn(seed):
+    """The closed form of a quaternion is what is derived of any part."""
+    q, part = attitude(np.random.default_rng(seed)), quaternion()
+    np.testing.assert_allclose(part.directions(q, np), Part.directions(part, q, np), atol=1e-12)
+    np.testing.assert_allclose(part.errors(q, np), Part.errors(part, q, np), atol=1e-12)
+
+
+PARTS = (quaternion(), SO(2), SE(2), SE(3), SE_2(3), SE_2(3, error="world"))
+
+
+@pytest.mark.parametrize("part", PARTS, ids=str)
+def test_a_function_is_linearised_on_any_space(part):
+    """As its lines are, from a small move at x to one at y."""
+    space = StateSpace(euclidean(2), part)
+    rng = np.random.default_rng(3)
+    x, turn = (np.asarray(space.plus(space.rest, rng.normal(size=space.tangent), np)) for _ in range(2))
+    far, size, t = space.minus(turn, space.rest, np), space.size, space.tangent
+
+    def f(s: Any, xp: Any) -> Any:
+        return space.plus(s[..., :size], far * (1.0 + s[..., size:]), xp)
+
+    y, J = linearised(f, x, space, np, seen=space, more=t)
+
+    def error(d: Any, xp: Any) -> Any:
+        start = space.plus(x, d[..., :t], xp)
+        return space.minus(f(xp.concat([start, d[..., t:]], axis=-1), xp), y, xp)
+
+    np.testing.assert_allclose(J, jacobian(error, np.zeros(2 * t), np)[1], atol=1e-12)
+    np.testing.assert_allclose(y, space.plus(x, far, np), atol=1e-14)
+    many = linearised(f, np.stack([x, turn]), space, np, seen=space, more=t)[1]
+    np.testing.assert_allclose(many[0], J, atol=1e-12)
