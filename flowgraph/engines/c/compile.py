@@ -13,6 +13,7 @@ import ctypes
 import functools
 import hashlib
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -22,6 +23,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from flowgraph.data.files import content_of, lock, put
@@ -43,6 +45,7 @@ FLAGS = (
 
 _MARK = b"\nflowgraph library, sha256 "
 _WORK = "work-"
+_NAME = re.compile(r"(?:(.*)-)?[0-9a-f]{40}")
 
 
 class CompileError(FlowgraphError):
@@ -227,7 +230,8 @@ def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
     said = "\0".join(
         [*command, _version(tuple(command)), *flags, *(f"{n}\0{t}" for n, t in sorted(files.items()))]
     )
-    name = f"{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
+    stem = next((n[:-2] for n in files if n.endswith(".c")), "code")
+    name = f"{stem}-{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
     refused: OutputError | None = None
     for folder in _places():
         target = folder / name
@@ -310,6 +314,53 @@ def _workplace(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(work, ignore_errors=True)
         os.close(descriptor)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A compiled filter in the cache.
+
+    Args:
+        file: of the library.
+        filter: whose it is.
+        bytes: its size.
+        made: when, in seconds since 1970.
+    """
+
+    file: Path
+    filter: str
+    bytes: int
+    made: float
+
+
+def kept(folder: Path) -> list[Kept]:
+    """The compiled filters in a cache folder, the newest first."""
+    found = []
+    for file in folder.glob("*.so"):
+        name = _NAME.fullmatch(file.stem)
+        with suppress(OSError):
+            if name:  # not a library of the user's own
+                status = file.stat()
+                found.append(Kept(file, name[1] or "unnamed", status.st_size, status.st_mtime))
+    return sorted(found, key=lambda k: -k.made)
+
+
+def clear(folder: Path) -> int:
+    """Remove what is kept in a cache folder, and nothing else that may lie there; returns the bytes freed.
+
+    A process that has loaded a library keeps it.
+
+    Raises:
+        OutputError: for a library that cannot be removed.
+    """
+    freed = 0
+    if folder.is_dir():
+        _sweep(folder)
+    for one in kept(folder):
+        with writes(one.file):
+            one.file.unlink(missing_ok=True)
+        freed += one.bytes
+    return freed
 
 
 def _sweep(folder: Path) -> None:
