@@ -29,7 +29,7 @@ from flowgraph.cli.options import (
     one_flight,
     with_file,
 )
-from flowgraph.cli.pages import runs_before, watcher_of, write_page
+from flowgraph.cli.pages import recorder_of, runs_before, shown_again, write_page
 from flowgraph.cli.resume import kept_in, resumed
 from flowgraph.cli.terminal import (
     err_console,
@@ -157,13 +157,16 @@ def run(
 
     spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
-    watcher = watcher_of(case, engine) if html is not None and kept is None else None
+    recorder = recorder_of(case) if html is not None else None
+    watcher = recorder if engine == "python" and kept is None else None
     result, row = _measure(
         case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept
     )
     say(case.remarks(result))
-    if html is not None and watcher is None:
-        say((note("info", f"the page has no values on the wires: engine={engine} does not show them"),))
+    if recorder is not None and watcher is None:
+        options = {"dtype": dtype, "seed": seed, "diverged": diverged}
+        recorder, words = shown_again(case, result, recorder, **options)
+        say((words,))
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
@@ -172,7 +175,11 @@ def run(
     if html is not None:
         title = ", ".join([graph, spec, *(settings or ()), f"seed {seed}", engine])
         with writing(html):
-            write_page(html, others, title, case, flight.truth, _recorded(case), result, watcher, report)
+            on_page = write_page(
+                html, others, title, case, flight.truth, _recorded(case), result, recorder, report
+            )
+        say(tuple(on_page))
+        report["notes"] = list(dict.fromkeys((*report["notes"], *on_page)))
     if as_json:
         return print_json(report)
     out_console.print(runs_table([row]))

@@ -15,10 +15,12 @@ import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from flowgraph.data.arrival import LATENCY, delayed_flight
+from flowgraph.data.consistency import far_nis, measured
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
@@ -60,9 +62,11 @@ class Case:
         return str(getattr(self.score, "order", "zyx"))
 
     def remarks(self, result: Result) -> tuple[str, ...]:
-        """All notes on a run: the case's, the result's, and those of the score."""
+        """All notes on a run: the case's, the result's, those of the score, and where a NIS is far from 1."""
         tell = getattr(self.score, "remarks", None)
-        return said((*self.notes, *result.notes, *(tell(result) if tell is not None else ())))
+        told = tell(result) if tell is not None else ()
+        far = (far_nis(measured(name), s) for name, s in result.series.items() if "nis" in s.leaves)
+        return said((*self.notes, *result.notes, *told, *chain.from_iterable(far)))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flowgraph.data.consistency import chi_square
 from flowgraph.data.series import Series
 from flowgraph.drawing.angles import between, turn_between
 from flowgraph.drawing.fields import STATES, find
@@ -101,9 +102,7 @@ def _squared(error: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 def bounds(degrees: float, outside: float = 0.05) -> tuple[float, float]:
     """Between which a chi-squared variable lies but for a share of cases, half of them on each side."""
-    from scipy.special import gammaincinv  # SciPy is slow to import, and only needed here
-
-    low, high = (2.0 * float(gammaincinv(degrees / 2.0, p)) for p in (outside / 2, 1 - outside / 2))
+    low, high = (float(chi_square(p, degrees)) for p in (outside / 2, 1 - outside / 2))
     return low, high
 
 

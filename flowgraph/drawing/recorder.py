@@ -56,12 +56,13 @@ class Recorder:
 
     Args:
         graph: that is run.
-        inputs: what it is fed; of a source that is not recorded nothing is known.
+        inputs: what it is fed; of a source that is not recorded nothing is known. None for a live run, whose
+            events `see` is shown with the rest.
     """
 
-    def __init__(self, graph: Graph, inputs: Inputs) -> None:
+    def __init__(self, graph: Graph, inputs: Inputs | None) -> None:
         self.graph = graph
-        streams: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs
+        streams: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs or {}
         self._sources: dict[int, Series] = {}
         self._types: dict[str, tuple[int, Type]] = {}
         self._feeds: dict[int, tuple[str, Wire]] = {}
@@ -70,6 +71,8 @@ class Recorder:
                 self._types |= {f"{index}.{k}": (index, p.type) for k, p in enumerate(node.outputs)}
             elif isinstance(node, SourceNode) and isinstance(streams.get(node.path), Series):
                 self._sources[index] = streams[node.path]
+                self._types[f"{index}.0"] = index, node.type
+            elif isinstance(node, SourceNode) and inputs is None:
                 self._types[f"{index}.0"] = index, node.type
             elif (
                 isinstance(node, RegisterNode) and node.feed is not None and node.role in ("latest", "delay")

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.consistency import far_nis, measured
 from flowgraph.data.notes import note
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
@@ -149,22 +150,42 @@ class Scopes:
         degrees = np.full(len(series), 1.0) if parts is None else np.asarray(parts[0], dtype=float)
         if parts is None and residual is not None:
             degrees *= residual[0].shape[-1]
+        self.notes += (far := far_nis(measured(name), series))
         yield from self._squared(
-            f"{_words(name)}: NIS", series.time, np.asarray(value[0], float), degrees, dots=True
+            f"{_words(name)}: NIS",
+            series.time,
+            np.asarray(value[0], float),
+            degrees,
+            wrong=bool(far),
+            dots=True,
         )
 
     def _nees(self, estimate: Series, truth: Series) -> Iterator[dict[str, Any]]:
         found = nees(estimate, truth) if len(truth) else None
         if found is not None:
             value, degrees = found
+            known = value[np.isfinite(value)]
+            mean = float(np.mean(known)) / degrees if len(known) else 1.0
+            title = f"{_words(self.name)}: NEES"
+            if wrong := is_far(mean, float(degrees * len(known))):
+                self.notes.append(
+                    note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
+                )
             yield from self._squared(
-                f"{_words(self.name)}: NEES", estimate.time, value, np.full(len(value), float(degrees))
+                title, estimate.time, value, np.full(len(value), float(degrees)), wrong=wrong
             )
 
     def _squared(
-        self, title: str, time: np.ndarray, value: np.ndarray, degrees: np.ndarray, *, dots: bool = False
+        self,
+        title: str,
+        time: np.ndarray,
+        value: np.ndarray,
+        degrees: np.ndarray,
+        *,
+        wrong: bool,
+        dots: bool = False,
     ) -> Iterator[dict[str, Any]]:
-        """A normalised square with what it should be, and a warning where its mean is far from that."""
+        """A normalised square with what it should be, marked where it is far from that."""
         known = np.isfinite(value) & (degrees > 0)
         if not known.any():
             return
@@ -173,11 +194,6 @@ class Scopes:
         low, high = bounds(max(typical, 1))
         inside = float(np.mean((value[known] >= low) & (value[known] <= high)))
         words = f"mean {mean:.3g} of 1 per number, {100 * inside:.0f} % inside (95 % is right)"
-        wrong = is_far(mean, float(degrees[known].sum()))
-        if wrong:
-            self.notes.append(
-                note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
-            )
         lines = {"value": np.where(known, value, np.nan), "expected": degrees}
         panel = self._panel("Consistency", title, "", time, lines, None, dots=dots)
         top = max(2.5 * high, float(np.quantile(value[known], 0.99)))

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from flowgraph.cli.options import case_of
-from flowgraph.cli.pages import watcher_of, write_page
+from flowgraph.cli.pages import recorder_of, write_page
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
@@ -169,8 +169,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Pat
         case, flight = case_of(name, spec, settings, 0)
         diagram, run = folder / f"{name}.html", folder / f"{name}_run.html"
         diagram_page(case.graph, diagram, costs=costs_by_path(case.graph))
-        recorder = watcher_of(case, "python")
-        assert recorder is not None
+        recorder = recorder_of(case)
         result = simulate_watched(case.graph, case.inputs, recorder)
         streams = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
         recorded = {k: s for k, s in streams.items() if isinstance(s, Series)}

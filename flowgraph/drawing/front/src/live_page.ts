@@ -10,8 +10,8 @@ const { Diagram, legend, tools, details, dom, given } = window.flowgraph;
 const { html } = dom;
 const KEPT = 1200, MOST = 6, HEIGHT = 140;
 
-type Message = { t: number; ticks: number; wires: Record<string, [number, (number | null)[]]> }
-  | { ended: true; ticks: number; blocks: Record<string, [number, number]> };
+type Message = { t: number; ticks: number; wires: Record<string, [number, (number | null)[]]>; facts: Record<string, string> }
+  | { ended: true; ticks: number; blocks: Record<string, [number, number]>; facts: Record<string, string> };
 
 const graph = given<Graph>("graph"), parts = given<Record<string, Part[]>>("parts");
 const main = document.querySelector("main")!, footer = document.querySelector("footer")!;
@@ -36,6 +36,17 @@ const diagram = new Diagram(graph, sheet, { down: true, labels: 122, values });
 interface Trace { plot: uPlot; key: string; first: number; size: number }
 const traces: Trace[] = [];
 const scopes = html("div", { class: "scopes", tabindex: "0", role: "region", "aria-label": "Outputs over time" }, html("h3", {}, "Outputs"));
+
+/** What is told beside the wires: of a live run, what became of its events. */
+const facts = html("table", {}), told = html("section", { class: "figures facts" }, html("h3", {}, "Events and times"), facts);
+let shownFacts = "";
+function tell(found: Record<string, string>): void {
+  const words = JSON.stringify(found);
+  if (words === shownFacts) return;
+  shownFacts = words;
+  if (!told.isConnected) scopes.append(told);
+  facts.replaceChildren(html("tbody", {}, ...Object.entries(found).map(([name, value]) => html("tr", {}, html("th", { scope: "row" }, name), html("td", {}, value)))));
+}
 
 /** A plot for each small part of what the graph gives. */
 function plots(): void {
@@ -83,6 +94,7 @@ function draw(): void {
 
 function take(message: Message): void {
   ticks = message.ticks;
+  if (Object.keys(message.facts).length) tell(message.facts);
   if ("ended" in message) {
     state.textContent = `ended at ${t.toFixed(3)} s, ${ticks} ticks`;
     main.dataset.ended = "";
