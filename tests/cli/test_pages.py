@@ -110,10 +110,10 @@ def test_a_run_that_cannot_be_watched_so(more: list[str], words: str) -> None:
 
 
 def test_what_a_page_warns_of_stands_in_the_terminal(tmp_path: Path) -> None:
-    """A filter that is told a fifth of the noise: its NIS is far from 1, on the page and in the notes."""
+    """A filter that is told far too small a noise: its NIS is far from 1, on the page and in the notes."""
     file = tmp_path / "run.html"
-    wrong = ["--set", "position_noise=0.002", "--html", str(file)]
-    done = call("run", "ekf", "--data", "sim", "--set", "duration=4", *wrong, "--json")
+    wrong = ["--set", "position_noise=0.001", "--html", str(file)]
+    done = call("run", "ins_eskf", "--data", "sim", "--set", "duration=3", *wrong, "--json")
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)["notes"]
     (run,) = runs_in(file)
