@@ -176,7 +176,7 @@ def run(
         title = ", ".join([graph, spec, *(settings or ()), f"seed {seed}", engine])
         with writing(html):
             on_page = write_page(
-                html, others, title, case, flight.truth, _recorded(case), result, recorder, report
+                html, others, title, case, flight.truth, case.recorded, result, recorder, report
             )
         say(tuple(on_page))
         report["notes"] = list(dict.fromkeys((*report["notes"], *on_page)))
@@ -253,12 +253,6 @@ def _measure(
     return result, row
 
 
-def _recorded(case: Case) -> dict[str, Series]:
-    """What the graph was fed, by source, where it is recorded."""
-    inputs = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
-    return {name: s for name, s in inputs.items() if isinstance(s, Series) and name in case.graph.sources}
-
-
 def _write_report(
     out: Path, case: Case, flight: Flight, result: Result, report: Mapping[str, Any]
 ) -> list[str]:
@@ -315,7 +309,7 @@ def _pictures(
             found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
     if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
-        seen = next((s for s in _recorded(case).values() if "position" in s.leaves and len(s)), None)
+        seen = next((s for s in case.recorded.values() if "position" in s.leaves and len(s)), None)
         found["navigation.png"] = lambda file: plot_navigation(
             estimate, flight.truth, file, observed=seen, order=case.order
         )

@@ -26,7 +26,7 @@ from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared,
 from flowgraph.data.notes import said
 from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight
+from flowgraph.data.series import Flight, Series
 from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
@@ -60,6 +60,12 @@ class Case:
     def order(self) -> str:
         """The convention in which roll, pitch and yaw are drawn."""
         return str(getattr(self.score, "order", "zyx"))
+
+    @property
+    def recorded(self) -> dict[str, Series]:
+        """What the graph is fed, by source, where it is recorded."""
+        inputs = self.inputs.streams if isinstance(self.inputs, Flight) else self.inputs
+        return {n: s for n, s in inputs.items() if isinstance(s, Series) and n in self.graph.sources}
 
     def remarks(self, result: Result) -> tuple[str, ...]:
         """All notes on a run: the case's, the result's, those of the score, and where a NIS is far from 1."""

@@ -44,6 +44,7 @@ class Scopes:
         truth: or None.
         inputs: the recorded streams that were fed, by source.
         order: convention of roll, pitch and yaw.
+        points: of a line, at most.
     """
 
     def __init__(
@@ -53,8 +54,9 @@ class Scopes:
         truth: Series | None = None,
         inputs: Mapping[str, Series] | None = None,
         order: str = "zyx",
+        points: int = POINTS,
     ) -> None:
-        self.result, self.truth, self.order = result, truth, order
+        self.result, self.truth, self.order, self.points = result, truth, order, points
         self.inputs = dict(inputs or {})
         self.estimate = result.series.get(estimate)
         self.name = estimate
@@ -219,7 +221,7 @@ class Scopes:
         found = find(series, "position")
         if found is None or found[0].ndim != 2 or k >= found[0].shape[1] or not len(series):
             return None
-        some = slice(None, None, -(-len(series) // POINTS))
+        some = slice(None, None, -(-len(series) // self.points))
         return {"name": name, "t": self._seconds(series.time[some]), "y": packed(found[0][some, k])}
 
     def _unit(self, series: Series, field: str) -> tuple[str, float]:
@@ -255,7 +257,7 @@ class Scopes:
         if sigma is not None:
             middle = every["estimate"] if "estimate" in every else np.zeros(len(time))
             ends |= {"low": middle - sigma, "high": middle + sigma}
-        at = extremes(list(ends.values()), POINTS)
+        at = extremes(list(ends.values()), self.points)
         panel: dict[str, Any] = {
             "group": group, "title": title, "unit": unit, "dots": dots, "t": self._stored(time[at]),
             "lines": [{"name": n, "y": packed(v[at])} for n, v in every.items()],
@@ -321,4 +323,4 @@ def extremes(columns: Sequence[np.ndarray], most: int) -> np.ndarray:
     return np.unique(np.concatenate(found))
 
 
-__all__ = ["Scopes", "extremes"]
+__all__ = ["POINTS", "Scopes", "extremes"]
