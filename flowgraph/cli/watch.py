@@ -61,7 +61,9 @@ def watch(
             err_console.print("open this address in a browser on this machine; Ctrl-C ends the run")
             view.wait(True)
         if live:
-            with Live(case.graph, engine=engine, seed=seed, not_finite="keep", watcher=view) as run:
+            with Live(
+                case.graph, engine=engine, seed=seed, lateness="20ms", not_finite="keep", watcher=view
+            ) as run:
                 run.play(case.inputs, speed=speed)
             result = run.result()
         else:

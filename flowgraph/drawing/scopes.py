@@ -280,7 +280,7 @@ def _scale(time: np.ndarray, lines: Sequence[np.ndarray], ends: Sequence[np.ndar
     if late[1] - late[0] > 12 * (own[1] - own[0]) > 0:  # a band so wide that it would hide what it is of
         room = 3 * (own[1] - own[0])
         late = max(late[0], own[0] - room), min(late[1], own[1] + room)
-    room = 0.06 * (late[1] - late[0]) or 1e-3 * max(abs(late[0]), 1e-9)
+    room = 0.06 * (late[1] - late[0]) or 0.1 * abs(late[0]) or 1.0
     low, high = late[0] - room, late[1] + room
     if low <= begun[0] and begun[1] <= high:
         return {"range": [low, high]}

@@ -310,6 +310,10 @@ def test_run(name, scheme, page, pages) -> None:
     wires = page.texts("text.value")
     assert len(wires) > 5
     assert all(w for w in wires)
+    wide = "return [...document.querySelectorAll('text.value')].map(t => t.getBBox().width)"
+    for share in (0.1, 0.4, 0.6):
+        page.slide(share)
+        assert max(page.ask(wide)) <= 120.0  # the room that is left beside a wire
     imu = page.ask("const d = diagram.options.values(0, 0); return [d.short, d.lines[0], d.lines[1]]")
     stamp = float(imu[1].split()[1])
     streams = case.inputs["imu"]

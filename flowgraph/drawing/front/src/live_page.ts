@@ -4,7 +4,7 @@ import uPlot from "uplot";
 import type { Shown } from "./diagram";
 import type { Graph, Part } from "./model";
 import { colour } from "./numbers";
-import { lines as linesOf, shortOf } from "./watch";
+import { lines as linesOf, ROOM, shortOf } from "./watch";
 
 const { Diagram, legend, tools, details, dom, given } = window.flowgraph;
 const { html } = dom;
@@ -31,7 +31,7 @@ const values = (from: number, out: number): Shown | undefined => {
 };
 
 const sheet = html("div", { class: "sheet" });
-const diagram = new Diagram(graph, sheet, { down: true, labels: 122, values });
+const diagram = new Diagram(graph, sheet, { down: true, labels: ROOM, values });
 
 interface Trace { plot: uPlot; key: string; first: number; size: number }
 const traces: Trace[] = [];
@@ -74,11 +74,18 @@ function plot(host: HTMLElement, size: number): uPlot {
   const series: uPlot.Series[] = [{}], paths = uPlot.paths.stepped!({ align: 1 }); // a value holds until the next
   for (let k = 0; k < size; k++) series.push({ stroke: () => colour(`clock-${k}`), width: 1.2, paths, points: { show: false } });
   const made = new uPlot({
-    width: Math.max(host.clientWidth, 300), height: HEIGHT, series, legend: { show: false }, scales: { x: { time: false } },
+    width: Math.max(host.clientWidth, 300), height: HEIGHT, series, legend: { show: false }, scales: { x: { time: false }, y: { range: (_, low, high) => span(low, high) } },
     axes: [{ ...axis, size: 26 }, { ...axis, size: 56, space: 26 }], cursor: { show: false },
   }, [[], ...Array.from({ length: size }, () => [])] as uPlot.AlignedData, host);
   new ResizeObserver(() => made.setSize({ width: Math.max(host.clientWidth, 120), height: HEIGHT })).observe(host);
   return made;
+}
+
+/** What a plot shows of values from `low` to `high`; of one that stays, something around it. */
+function span(low: number | null, high: number | null): [number, number] {
+  if (low === null || high === null) return [0, 1];
+  const room = 0.08 * (high - low) || 0.1 * Math.abs(low) || 1;
+  return [low - room, high + room];
 }
 
 function draw(): void {

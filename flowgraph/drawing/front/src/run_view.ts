@@ -5,7 +5,7 @@ import { Plan } from "./map";
 import { short } from "./numbers";
 import { Scope } from "./scopes";
 import { Space } from "./space";
-import { Watched } from "./watch";
+import { ROOM, Watched } from "./watch";
 
 const { Diagram, legend, tools, details, dom } = window.flowgraph;
 const { html, button } = dom;
@@ -88,7 +88,7 @@ export class RunView {
     const beside = second === run ? undefined : second;
     const watched = new Watched(run), moved: At[] = [];
     const sheet = html("div", { class: "sheet" });
-    const diagram = new Diagram(run.graph, sheet, { down: true, labels: run.watch ? 122 : 0, values: run.watch ? watched.values : undefined });
+    const diagram = new Diagram(run.graph, sheet, { down: true, labels: run.watch ? ROOM : 0, values: run.watch ? watched.values : undefined });
     const panel = details(diagram, (node) => {
       const path = node === undefined ? undefined : run.graph.nodes[node]?.path;
       const took = path === undefined ? undefined : run.blocks[path];
