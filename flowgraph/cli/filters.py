@@ -308,12 +308,14 @@ def _pictures(
         if residuals:
             found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
-    if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
+    if "position" in estimate.leaves and estimate["position"].shape[-1] in (2, 3):
         seen = next((s for s in case.recorded.values() if "position" in s.leaves and len(s)), None)
         found["navigation.png"] = lambda file: plot_navigation(
             estimate, flight.truth, file, observed=seen, order=case.order
         )
-        if seen is not None:
+        if estimate["position"].shape[-1] == 2:
+            found["outputs.png"] = lambda file: plot_result(result, file)
+        elif seen is not None:
             found["trajectory.png"] = lambda file: plot_space(estimate, flight.truth, seen, file)
     elif "attitude" in estimate.leaves:
         found["orientation.png"] = lambda file: plot_orientation(estimate, flight.truth, file)
