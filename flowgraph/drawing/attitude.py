@@ -100,7 +100,8 @@ def plot_comparison(
             axis.plot((series.time - start) * 1e-9, _broken(angle), label=name, **look)
     for k, axis in enumerate(axes):
         _name(axis, NAMES[k], "[deg]")
-    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), loc="upper right")
+    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), **place)
     axes[-1].set_xlabel("time since the start [s]")
     return canvas.save(figure, file)
 

@@ -21,7 +21,7 @@ from flowgraph.drawing.report_page import axis, chart, figure, report_page, safe
 from flowgraph.drawing.run_page import describe_run
 from flowgraph.engines.watched import simulate_watched
 
-__all__ = ["draw", "write_page"]
+__all__ = ["draw", "drawn", "write_page"]
 
 PANELS = (
     ("position_rmse_m", None, "position RMSE [m]"),
@@ -36,22 +36,27 @@ _TITLE = "Filters on the thesis's flights (motion capture, accelerometer, gyrosc
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Bars of the errors with their intervals and the bound, and the thesis's metric beside its figures."""
+    drawn(rows).savefig(path, dpi=110)
+
+
+def drawn(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """The figure of `draw`."""
     from matplotlib.figure import Figure  # slow to import, and only a picture needs it
 
-    drawn = Figure(figsize=(13, 8), layout="constrained")
-    for ax, panel in zip(drawn.subplots(2, 2).flat, PANELS, strict=True):
+    made = Figure(figsize=(13, 8), layout="constrained")
+    for ax, panel in zip(made.subplots(2, 2).flat, PANELS, strict=True):
         _panel(ax, rows, *panel)
-    drawn.suptitle(_TITLE)
-    drawn.savefig(path, dpi=110)
+    made.suptitle(_TITLE)
+    return made
 
 
 def _png(rows: Sequence[Mapping[str, Any]], panel: tuple[str, str | None, str]) -> bytes:
     from matplotlib.figure import Figure  # slow to import, and only a picture needs it
 
-    drawn = Figure(figsize=(9, 4.5), layout="constrained")
-    _panel(drawn.subplots(), rows, *panel)
+    made = Figure(figsize=(9, 4.5), layout="constrained")
+    _panel(made.subplots(), rows, *panel)
     sink = io.BytesIO()
-    drawn.savefig(sink, format="png", dpi=110)
+    made.savefig(sink, format="png", dpi=110)
     return sink.getvalue()
 
 
