@@ -18,6 +18,7 @@ from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
 from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
+from flowgraph.data.consistency import measured
 from flowgraph.drawing.states import Quantity, seconds_of
 from flowgraph.types import leaves_of
 
@@ -111,7 +112,7 @@ class Scorer:
             found += truth_remarks(result[self.estimate], self.truth, self.settle)
         for name, series in result.series.items():
             if self._sums_up(series.leaves):
-                found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+                found += nis_remarks(measured(name), series)
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
