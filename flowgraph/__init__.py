@@ -45,6 +45,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight, Series
+    from flowgraph.drawing.live import LiveView
     from flowgraph.engines.live import Live
     from flowgraph.engines.many import simulate_many
     from flowgraph.engines.options import Checkpoint
@@ -77,6 +78,7 @@ _LATER = {
     "Result": "flowgraph.data.result",
     "Flight": "flowgraph.data.series",
     "Series": "flowgraph.data.series",
+    "LiveView": "flowgraph.drawing.live",
     "simulate_many": "flowgraph.engines.many",
     "Live": "flowgraph.engines.live",
     "Checkpoint": "flowgraph.engines.options",
@@ -138,6 +140,7 @@ __all__ = [
     "Graph",
     "Held",
     "Live",
+    "LiveView",
     "LoweringError",
     "MissingDependencyError",
     "OutputError",

@@ -21,6 +21,7 @@ from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.metrics.running import nis_score, pose_score
 from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
+from flowgraph.data.consistency import measured
 from flowgraph.drawing.states import Quantity, seconds_of
 from flowgraph.types import leaves_of
 
@@ -143,7 +144,7 @@ class Scorer:
             found += truth_remarks(result[self.estimate], self.truth, self.settle)
         for name, series in result.series.items():
             if self._sums_up(series.leaves):
-                found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+                found += nis_remarks(measured(name), series)
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)

@@ -17,9 +17,6 @@ from flowgraph.engines.c.source import every_pattern
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
-_FLAGS = tuple(f for f in FLAGS if not f.startswith("--param=max-completely-peeled"))
-"""Loops of vectors are worth writing out: a third faster."""
-
 
 class Lanes(Outputs):
     """A pipeline compiled for several runs at once, in double precision.
@@ -37,7 +34,7 @@ class Lanes(Outputs):
     def __init__(self, pipeline: Pipeline, keys: Sequence[int], passes: tuple[str, ...]) -> None:
         source = generate_lanes(pipeline, keys, lambda program: optimise(program, passes))
         super().__init__(pipeline, np.float64, source)
-        self._library = load({f"{source.names.module}_lanes.c": source.text}, _FLAGS)
+        self._library = load({f"{source.names.module}_lanes.c": source.text}, FLAGS)
         self._library.fg_play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 6]
         self._library.fg_play.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
