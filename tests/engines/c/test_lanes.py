@@ -193,7 +193,7 @@ def test_only_what_is_kept_is_written(built):
 
 @block
 def looked_up(a: Three, *, draw, xp) -> Three:
-    """Draws, and an entry of a table and one of what was computed, by an index that the lanes do not share."""
+    """Draws, and entries of a table and of what was computed, at places that the lanes do not share."""
     table = xp.asarray(np.linspace(-1.0, 1.0, 11))
     drawn = draw.normal("noise", (3,)) + draw.uniform("even", (3,))
     place = xp.astype(xp.clip(10.0 * xp.abs(a.value), 0.0, 10.0), xp.int64)
