@@ -35,14 +35,15 @@ def figures(row: dict[str, Any]) -> dict[str, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("graph", ["ekf", "ins_eskf"])
+@pytest.mark.parametrize("graph", ["ekf", "rbpf_indoor"])
 def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
     graph: str, tmp_path, monkeypatch
 ) -> None:
-    found = run_study(study(graph), tmp_path / "whole").rows
+    more = {"particles": 20} if graph == "rbpf_indoor" else {}
+    found = run_study(study(graph, parameters=more), tmp_path / "whole").rows
     assert [row["load_s"] for row in found] == [0.0] * 4, "no flight was written down"
     monkeypatch.setattr(tasks, "_whole", lambda run: None)
-    recorded = run_study(study(graph), tmp_path / "recorded").rows
+    recorded = run_study(study(graph, parameters=more), tmp_path / "recorded").rows
     assert all(row["load_s"] > 0.0 for row in recorded)
     for one, other in zip(found, recorded, strict=True):
         want = figures(other)
@@ -52,6 +53,7 @@ def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
     assert len({row["position_rmse_m"] for row in found}) == 4, "seeds choose the flight"
 
 
+@pytest.mark.slow
 def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> None:
     first = run_study(study(seeds=3), tmp_path)
     again = run_study(study(seeds=6), tmp_path)
@@ -60,6 +62,7 @@ def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> Non
     assert [figures(row) for row in again.rows] == [figures(row) for row in alone.rows]
 
 
+@pytest.mark.slow
 def test_a_setting_that_a_program_cannot_take_is_an_error_of_its_rows_alone(tmp_path) -> None:
     rows = run_study(study(seeds=2, parameters={"position_noise": [0.01, -1.0]}), tmp_path).rows
     assert [row["error"] is None for row in rows] == [True, True, False, False]
