@@ -13,6 +13,7 @@ import ctypes
 import functools
 import hashlib
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -29,11 +30,9 @@ from pathlib import Path
 from flowgraph.data.files import content_of, lock, put
 from flowgraph.errors import FlowgraphError, MissingDependencyError, OutputError, writes
 
-FLAGS = (
+_COMMON = (
     "-std=c99",
     "-O3",
-    "-fno-tree-slp-vectorize",  # gcc 12.2 with AVX-512 puts elements of one row into the next by it
-    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -41,7 +40,21 @@ FLAGS = (
     "-fopenmp-simd",
     "-DFLOWGRAPH_SIMD",
 )
-"""What `engine="c"` compiles with; none of them changes what NaN or infinity mean."""
+_NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AMD64") else ()
+
+FLAGS = (*_COMMON, *_NARROW)
+"""What `engine="c"` compiles with; none of them changes what NaN or infinity mean.
+
+Straight code is packed into vectors, of half the length where a processor has AVX-512: with whole ones
+gcc 12.2 puts elements of one row into the next.
+"""
+
+LOOPS = (
+    *_COMMON,
+    "-fno-tree-slp-vectorize",  # so loops may have whole vectors, see above
+    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
+)
+"""The flags for a filter whose time goes into long loops, as over particles."""
 
 _MARK = b"\nflowgraph library, sha256 "
 _WORK = "work-"
