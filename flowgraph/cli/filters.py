@@ -18,6 +18,7 @@ from flowgraph.cli.options import (
     SEED_HELP,
     AsJson,
     DataOrNone,
+    Formats,
     Name,
     NameOrNone,
     Seed,
@@ -111,7 +112,9 @@ def run(
     data: DataOrNone = None,
     truth: Truth = None,
     engine: Annotated[str | None, typer.Option(help=", ".join(engine_names()), show_default="python")] = None,
-    dtype: Annotated[str | None, typer.Option(help="float64 or float32", show_default="float64")] = None,
+    dtype: Annotated[
+        str | None, typer.Option(help="float64, float32 or fixed", show_default="float64")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
     settings_file: SettingsFile = None,
@@ -135,6 +138,7 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Go on from a checkpoint; what is left out is as it was."),
     ] = None,
+    formats: Formats = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
@@ -160,8 +164,10 @@ def run(
     recorder = recorder_of(case) if html is not None else None
     watcher = recorder if engine == "python" and kept is None else None
     result, row = _measure(
-        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept
-    )
+        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept,
+        formats=formats,
+    )  # fmt: skip
+    say(result.notes)
     say(case.remarks(result))
     if recorder is not None and watcher is None:
         options = {"dtype": dtype, "seed": seed, "diverged": diverged}
@@ -225,6 +231,7 @@ def _measure(
     diverged: str = "raise",
     watcher: Watcher | None = None,
     kept: Checkpoint | None = None,
+    formats: Path | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -235,7 +242,9 @@ def _measure(
     ):
         options: dict[str, Any] = {"dtype": dtype, "seed": seed, "progress": meter, "diverged": diverged}
         if watcher is None:
-            result = simulate(case.graph, case.inputs, engine=engine, checkpoint=kept, **options)
+            result = simulate(
+                case.graph, case.inputs, engine=engine, checkpoint=kept, formats=formats, **options
+            )
         else:
             result = simulate_watched(case.graph, case.inputs, watcher, **options)
     total = perf_counter() - start

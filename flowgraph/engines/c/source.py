@@ -52,6 +52,7 @@ class Source:
         patterns: the keys that have a reaction of their own, or None where one serves all.
         presence: by key, or None for all, the outputs that are present for certain and those that can be, a
             bit each.
+        longest: turns of the longest loop.
     """
 
     names: Names
@@ -60,6 +61,7 @@ class Source:
     source: str
     patterns: tuple[int, ...] | None
     presence: Mapping[int | None, tuple[int, int]]
+    longest: int
 
     def presence_of(self, key: int) -> tuple[int, int]:
         """The outputs that are present for certain in a tick of this pattern, and those that can be."""
@@ -100,7 +102,7 @@ def generate(
     if chosen is not None and len(chosen) > MOST_PATTERNS:
         chosen = None
     real = "double" if dtype == "float64" else "float"
-    return _File(pipeline, real, chosen, tidy, checked).source()
+    return File(pipeline, real, chosen, tidy, checked).source()
 
 
 def every_pattern(pipeline: Pipeline) -> list[int] | None:
@@ -116,7 +118,15 @@ def every_pattern(pipeline: Pipeline) -> list[int] | None:
     return sorted(found)[1:]
 
 
-class _File:
+class File:
+    """One file of C: reactions, and what they need.
+
+    Args:
+        pipeline, real, patterns, tidy, checked: as for `generate`.
+    """
+
+    writer: type[Writer] = Writer
+
     def __init__(
         self, pipeline: Pipeline, real: str, patterns: list[int] | None, tidy: Any, checked: bool
     ) -> None:
@@ -127,6 +137,7 @@ class _File:
         self.constants: dict[Any, tuple[str, Buffer]] = {}
         self.pool: dict[str, list[int]] = {}
         self.presence: dict[int | None, tuple[int, int]] = {}
+        self.longest = 0
 
     def source(self) -> Source:
         m = self.names.module
@@ -157,6 +168,7 @@ class _File:
             text,
             None if self.patterns is None else tuple(self.patterns),
             self.presence,
+            self.longest,
         )
 
     # -- one reaction --------------------------------------------------------------------------------
@@ -196,21 +208,27 @@ class _File:
                 roots += self._write(expander, self.state[name], values[n])
         plan = schedule(tape, roots)
         work, local = self._memory(plan.span)
-        writer = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
+        writer = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
         body = writer.body()
-        body += ["    uint64_t made = 0;"]
+        self.longest = max(self.longest, *(math.prod(space) for _, space in writer.groups), 0)
         must = may = 0
         for k, present in flags:
-            bit = f"made |= UINT64_C({1 << k}); /* {comment(pipeline.outputs[k].name)} */"
-            text = writer.ref(present)
-            body.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
-            must, may = must | (text == "true") << k, may | 1 << k
+            must, may = must | (writer.ref(present) == "true") << k, may | 1 << k
         self.presence[key] = must, may
-        body.append("    return made;")
+        body += self.told(writer, flags)
         all_text = re.sub(r"/\*.*?\*/", "", "\n".join(body))
         unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
         head = [f"    (void){n};" for n in unused]
         return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
+
+    def told(self, writer: Writer, flags: list[tuple[int, Node]]) -> list[str]:
+        """The end of a reaction: which outputs are there."""
+        lines = ["    uint64_t made = 0;"]
+        for k, present in flags:
+            bit = f"made |= UINT64_C({1 << k}); /* {comment(self.pipeline.outputs[k].name)} */"
+            text = writer.ref(present)
+            lines.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
+        return [*lines, "    return made;"]
 
     def _in_place(self, program: Program) -> dict[int, Buffer]:
         """The replays that can make a register anew where it lies, with its memory: nobody else reads it."""
@@ -369,7 +387,8 @@ class _File:
             size = _BYTES.get(buffer.dtype, 8 if self.real == "double" else 4) * buffer.size
             if size <= _LOCAL_BYTES:
                 names[buffer] = f"w{len(local)}"
-                local.append(f"    {ctype(buffer.dtype, self.real)} w{len(local)}[{max(buffer.size, 1)}];")
+                kept = self.expressions.ctype(buffer.dtype)
+                local.append(f"    {kept} w{len(local)}[{max(buffer.size, 1)}];")
                 continue
             kind = whose + buffer.dtype
             slots, busy = pool.setdefault(kind, []), ends.setdefault(kind, [])
