@@ -25,6 +25,7 @@ from flowgraph.language.declare import delay, graph
 from flowgraph.language.graph import Graph
 from flowgraph.language.joins import collect, every, latest, merge, sink
 from flowgraph.language.late import absent_for, label_data, resample_at, zip_last
+from flowgraph.language.moore import moore
 from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.language.stamps import stamp_of
@@ -168,6 +169,7 @@ __all__ = [
     "clocks_of",
     "collect",
     "delay",
+    "moore",
     "delayed",
     "delta_time",
     "drop",

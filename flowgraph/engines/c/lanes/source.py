@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from flowgraph.engines.c.entry import reaction_name
+from flowgraph.engines.c.file import File
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.lanes.expressions import TYPES, LaneExpressions, no_lanes
 from flowgraph.engines.c.lanes.writer import LaneWriter
 from flowgraph.engines.c.names import Names, given, made
 from flowgraph.engines.c.nodes import Node, Tape
 from flowgraph.engines.c.preamble import MACROS, REFUSED
-from flowgraph.engines.c.source import MOST_PATTERNS, File, every_pattern
+from flowgraph.engines.c.source import MOST_PATTERNS, every_pattern
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.values import Value
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
