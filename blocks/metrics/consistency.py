@@ -71,17 +71,32 @@ FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
 """By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
 whole run; how many innovations such a mean is of at least; how rarely an honest filter has as large a one."""
 
+ALIKE, RUN_ALIKE, SIGMAS = 1.0, 0.3, 7.0
+"""From which product of one innovation and the next on, a number and in their deviations, they are alike over
+`FEW` and over a whole run; and how many deviations of chance that must be, too."""
 
-def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
-    """Notes where a gate refused `IN_A_ROW` measurements or more in a row, and where the NIS is far from 1.
+
+def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[str, ...]:
+    """Notes where a gate refused too many measurements, the NIS is far from 1, or innovations are alike.
+
+    A gate refused too many where `IN_A_ROW` or more come in a row, or where chance hardly refuses as many.
 
     A NIS is far from 1 whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and more
     than chance allows; or, over all of them, if these are `FEW` or more, above `APART` or below 1 / `FAR`.
 
+    Innovations of an honest filter know nothing of each other (R. Mehra, "On the identification of variances
+    and adaptive Kalman filtering", IEEE TAC 15(2), 1970). Where what is left of one is left of the next too,
+    something lasts that the filter does not know, though each alone may be small: a clock that is off, a
+    start that was too sure, a lever.
+
     Args:
         name: of what was measured; empty where there is one kind.
+        loose: whether the filter is one that expects larger innovations than honest ones, so that small ones
+            say nothing.
     """
-    return (*_refused(name, innovation), *_far(name, innovation))
+    far = _far(name, innovation, loose)
+    alike = () if far or loose else _alike(name, innovation)
+    return (*(_refused(name, innovation) or _too_often(name, innovation)), *far, *alike)
 
 
 def _refused(name: str, innovation: Series) -> tuple[str, ...]:
@@ -101,10 +116,71 @@ def _refused(name: str, innovation: Series) -> tuple[str, ...]:
     return (note("refused", said),)
 
 
-def _far(name: str, innovation: Series) -> tuple[str, ...]:
+def _too_often(name: str, innovation: Series) -> tuple[str, ...]:
+    if "accepted" not in innovation.leaves or innovation["accepted"].all():
+        return ()
+    from scipy.special import gammainc, gammaincc  # slow to import, and only scores need them
+
+    values, parts, judged = _judged(innovation)
+    refused = judged & ~innovation["accepted"]
+    if not refused.any():
+        return ()
+    rare = float(gammaincc(0.5 * parts[refused], 0.5 * values[refused]).max())
+    count, usual = int(refused.sum()), rare * float(judged.sum())
+    if gammainc(count, usual) >= CHANCE:  # the chance of as many, where so many are usual
+        return ()
+    front = f"{name}: " if name else ""
+    return (
+        note(
+            "refused", f"{front}{count} of {judged.sum()} measurements, of which chance refuses {usual:.2g}"
+        ),
+    )
+
+
+def _judged(innovation: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nis and the number of parts of each, and which say anything."""
     values, width = innovation["nis"], float(innovation["residual"].shape[-1])
     parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), width)
-    taken = np.isfinite(values) & (parts > 0.0)
+    return values, parts, np.isfinite(values) & (parts > 0.0)
+
+
+def _alike(name: str, innovation: Series) -> tuple[str, ...]:
+    if "covariance" not in innovation.leaves:
+        return ()
+    _, parts, taken = _judged(innovation)
+    if "accepted" in innovation.leaves:
+        taken &= innovation["accepted"]
+    if taken.sum() <= FEW:
+        return ()
+    parts, time = parts[taken], innovation.time[taken]
+    size, axes = np.linalg.eigh(innovation["covariance"][taken])
+    along = (np.swapaxes(axes, -1, -2) @ innovation["residual"][taken][..., None])[..., 0]
+    known = size > 1e-12 * size[:, -1:]
+    white = (axes @ np.where(known, along / np.sqrt(np.where(known, size, 1.0)), 0.0)[..., None])[..., 0]
+    products = np.sum(white[1:] * white[:-1], axis=-1)
+    numbers = np.sqrt(parts[1:] * parts[:-1])
+    front = f"{name}: " if name else ""
+    whole, total = float(products.sum() / numbers.sum()), float(numbers.sum())
+    window = min(FEW, len(products))
+    sums, of = (np.convolve(x, np.ones(window), "valid") for x in (products, numbers))
+    here = np.flatnonzero(sums / of > np.maximum(ALIKE, SIGMAS / np.sqrt(of)))
+    why = "something lasts that the filter does not know: a clock that is off, too sure a start, a lever"
+    if len(here):
+        since = (int(time[here[0]]) - int(innovation.time[0])) * 1e-9
+        said = f"one innovation is like the next, from {since:.3g} s after the first on"
+        return (note("warning", f"{front}{said}: {(sums / of).max():.2g} a number, where 0 is right; {why}"),)
+    if whole > max(RUN_ALIKE, SIGMAS / np.sqrt(total)):
+        return (
+            note(
+                "warning",
+                f"{front}one innovation is like the next: {whole:.2g} a number, where 0 is right; {why}",
+            ),
+        )
+    return ()
+
+
+def _far(name: str, innovation: Series, loose: bool) -> tuple[str, ...]:
+    values, parts, taken = _judged(innovation)
     if "accepted" in innovation.leaves:
         taken &= innovation["accepted"]
     values, parts, time = values[taken], parts[taken], innovation.time[taken]
@@ -127,7 +203,7 @@ def _far(name: str, innovation: Series) -> tuple[str, ...]:
     if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
         why = "the noise is told too small, or a clock is off"
         return (note("warning", f"{front}the NIS is far from 1: {mean:.3g} a number; {why}"),)
-    if mean < 1.0 / FAR and len(values) >= FEW:
+    if mean < 1.0 / FAR and len(values) >= FEW and not loose:
         said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
         return (note("warning", said),)
     return ()

@@ -49,7 +49,8 @@ class Scorer:
         errors: such as `pose_errors`, `point_errors` or `attitude_errors`.
         estimate: the stream that is compared.
         settle: seconds at the start that the errors leave out.
-        innovations: whether those that a run collects are summed up too.
+        innovations: whether those that a run collects are summed up too; where not, the filter expects larger
+            ones than honest ones, and only those beyond that are a note.
         steps: what a smoother needs of a result.
         smooth: "rts" smooths the whole run, "batch" takes the most likely trajectory of the recording, "none"
             does neither.
@@ -110,8 +111,9 @@ class Scorer:
         if self.truth is not None and self.estimate in result.series:
             found += truth_remarks(result[self.estimate], self.truth, self.settle)
         for name, series in result.series.items():
-            if self._sums_up(series.leaves):
-                found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+            if "nis" in series.leaves:
+                what = name.removesuffix("innovation").rstrip("_")
+                found += nis_remarks(what, series, loose=not self.innovations)
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
