@@ -18,6 +18,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
@@ -39,6 +40,7 @@ def async_kalman(
     control: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     held: Held | None = None,
 ):
     """Kalman filter of position and velocity whose control and measurements keep clocks of their own.
@@ -55,7 +57,12 @@ def async_kalman(
     prior = predict_linear(belief, mean, model=point_model(noise))
     prior = bridged(belief, prior, acceleration, held=held, position=0, velocity=3)
     posterior, innovation = update_linear(
-        prior, position.map(lambda z: z.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
+        prior,
+        position.map(lambda z: z.position),
+        H=np.eye(3, 6),
+        R=np.eye(3) * position_noise**2,
+        gate=gate,
+        robust=robust,
     )
     collect(innovation, "position_innovation")
     if gate is not None:
@@ -63,7 +70,7 @@ def async_kalman(
     if velocity is not None:
         posterior, innovation = update_linear(
             posterior, velocity.map(lambda z: z.velocity),
-            H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate,
+            H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate, robust=robust,
         )  # fmt: skip
         collect(innovation, "velocity_innovation")
         if gate is not None:

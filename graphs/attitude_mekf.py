@@ -23,6 +23,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.commanded import (
     TURN,
@@ -33,7 +34,7 @@ from flowgraph.blocks.orientation.commanded import (
     see_attitude,
     start_turn,
 )
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Scored, Weighed, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, BodyRate, Gaussian
@@ -52,6 +53,7 @@ def attitude_mekf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     held: Held | None = None,
 ):
     """Multiplicative extended Kalman filter: commanded body rate, corrected by measured attitudes.
@@ -76,6 +78,7 @@ def attitude_mekf(
         space=TURN,
         measured_space=TURN,
         gate=gate,
+        robust=robust,
         name="update",
     )
     if gate is not None:
@@ -97,7 +100,7 @@ def for_flight(
     rate_noise: Positive | None = None,
     attitude_noise: Positive | None = None,
     control: HeldControl,
-    gated: Gated,
+    gated: Weighed,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight with commanded body rates and measured attitudes, at the first of these.

@@ -28,6 +28,7 @@ from flowgraph.blocks.inertial.outdoors import (
 )
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
@@ -72,6 +73,7 @@ def gnss_ins(
     held: Held | None = None,
     invariant: bool = False,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     smoothing: bool = False,
 ):
     """Error-state Kalman filter of 15 states and more, aided by whichever of its sensors there are.
@@ -107,30 +109,60 @@ def gnss_ins(
 
     if gnss is not None:
         aided = aid_gnss_position(
-            now, gnss, antenna=antenna, estimated=estimated, gate=gate, invariant=invariant, name="fuse_gnss"
+            now,
+            gnss,
+            antenna=antenna,
+            estimated=estimated,
+            gate=gate,
+            robust=robust,
+            invariant=invariant,
+            name="fuse_gnss",
         )
         now = told(aided, "gnss")
     if gnss_velocity is not None:
         aided = aid_gnss_velocity(
-            now, gnss_velocity, control, antenna=antenna, estimated=estimated, gate=gate, invariant=invariant,
-            name="fuse_gnss_velocity",
+            now, gnss_velocity, control, antenna=antenna, estimated=estimated, gate=gate, robust=robust,
+            invariant=invariant, name="fuse_gnss_velocity",
         )  # fmt: skip
         now = told(aided, "gnss_velocity")
     if heading is not None:
-        now = told(aid_antennas(now, heading, baseline=baseline, gate=gate, name="fuse_heading"), "heading")
+        now = told(
+            aid_antennas(now, heading, baseline=baseline, gate=gate, robust=robust, name="fuse_heading"),
+            "heading",
+        )
     if magnetometer is not None:
         aided = aid_compass(
-            now, magnetometer, north=north, noise=compass_noise, gate=gate, name="fuse_magnetometer"
+            now,
+            magnetometer,
+            north=north,
+            noise=compass_noise,
+            gate=gate,
+            robust=robust,
+            name="fuse_magnetometer",
         )
         now = told(aided, "magnetometer")
     if barometer is not None:
         aided = aid_height(
-            now, barometer, noise=height_noise, estimated=estimated, gate=gate, name="fuse_barometer"
+            now,
+            barometer,
+            noise=height_noise,
+            estimated=estimated,
+            gate=gate,
+            robust=robust,
+            name="fuse_barometer",
         )
         now = told(aided, "barometer")
     if wheels is not None:
         aided = aid_wheels(
-            now, wheels, control, noise=speed_noise, slip=slip, axle=axle, gate=gate, name="fuse_wheels"
+            now,
+            wheels,
+            control,
+            noise=speed_noise,
+            slip=slip,
+            axle=axle,
+            gate=gate,
+            robust=robust,
+            name="fuse_wheels",
         )
         now = told(aided, "wheels")
     if resting is not None:

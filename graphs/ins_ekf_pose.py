@@ -15,6 +15,7 @@ from typing import Any
 from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.euler_ins import extended_crossing, predict_extended, update_pose_angles
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
@@ -39,6 +40,7 @@ def ins_ekf_pose(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -55,7 +57,7 @@ def ins_ekf_pose(
             belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
         update=lambda prior, _: update_pose_angles(
-            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
+            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust, name="update"
         ),
     )  # fmt: skip
 

@@ -19,6 +19,7 @@ from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.belief import (
@@ -38,7 +39,7 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Smoothed, Weighed, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -57,6 +58,7 @@ def outdoor_eskf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -97,16 +99,17 @@ def outdoor_eskf(
     for name, (seen, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
         now, innovation = update_extended(
-            now, seen, observe=observe, R=R, space=OUTDOOR, gate=gate, name=f"fuse_{name}"
+            now, seen, observe=observe, R=R, space=OUTDOOR, gate=gate, robust=robust, name=f"fuse_{name}"
         )
         now = told(now, innovation, name)
     now, innovation = update_extended(
         now, altimeter.map(lambda z: z.distance[..., None]),
-        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, gate=gate, name="fuse_altimeter",
+        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, gate=gate, robust=robust,
+        name="fuse_altimeter",
     )  # fmt: skip
     now = told(now, innovation, "altimeter")
     now, innovation = update_extended(
-        now, optical_flow.map(flow_vector), observe=observe_flow, gate=gate, name="fuse_flow",
+        now, optical_flow.map(flow_vector), observe=observe_flow, gate=gate, robust=robust, name="fuse_flow",
         R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
     )  # fmt: skip
     now = told(now, innovation, "optical_flow")
@@ -120,7 +123,7 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Smoothed) -> Case:
+def for_flight(on: OnFlight, *, gated: Weighed, control: HeldControl, scored: Smoothed) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
     Args:

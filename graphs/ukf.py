@@ -27,6 +27,7 @@ from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import POSE, driving
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -68,6 +69,7 @@ def ukf(
     points: SigmaPoints = GAUSSIAN,
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -93,6 +95,7 @@ def ukf(
         measured_space=POSE,
         points=points,
         gate=gate,
+        robust=robust,
     )
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6)

@@ -19,6 +19,7 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.aiding import correct_belief
 from flowgraph.blocks.inertial.navigation import PARAMETERS, places
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -64,6 +65,7 @@ def aid_gnss_position(
     antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -76,7 +78,7 @@ def aid_gnss_position(
         fix: the position, m, and its covariance, m^2; or absent.
         antenna: what is known of it; `lever` and `time_offset` count as known unless they are estimated.
         estimated: names of `PARAMETERS`.
-        gate, invariant: as in `aid_position`.
+        gate, robust, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a fix.
@@ -92,7 +94,7 @@ def aid_gnss_position(
     parts = {"lever": R, "time_offset": -prior.velocity[..., None]}
     H = [one, -late[..., None] * one, -R @ skew(arm, xp=xp), zero, zero, *_more(estimated, parts, zero)]
     apart, H = fix.position - place, xp.concat(H, axis=-1)
-    return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp)
+    return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp, robust)
 
 
 @block
@@ -104,6 +106,7 @@ def aid_gnss_velocity(
     antenna: Antenna | None = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -115,7 +118,7 @@ def aid_gnss_velocity(
     Args:
         imu: the last reading.
         antenna: what is known of it; None where it is the unit itself of which the velocity is known.
-        prior, fix, estimated, gate, invariant: as in `aid_gnss_position`.
+        prior, fix, estimated, gate, robust, invariant: as in `aid_gnss_position`.
     """
     if fix is None:
         return prior, None
@@ -131,7 +134,7 @@ def aid_gnss_velocity(
     parts = {} if antenna is None else {"lever": R @ skew(rate, xp=xp)}
     H = [zero, one, -R @ skew(swing, xp=xp), R @ skew(arm, xp=xp), zero, *_more(estimated, parts, zero)]
     apart = fix.velocity - prior.velocity - (R @ swing[..., None])[..., 0]
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp)
+    return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp, robust)
 
 
 @block
@@ -142,13 +145,14 @@ def aid_height(
     noise: float,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with a height: z = p_up + height_offset + noise.
 
     Args:
         noise: standard deviation, m.
-        prior, estimated, gate: as in `aid_gnss_position`.
+        prior, estimated, gate, robust: as in `aid_gnss_position`.
     """
     if height is None:
         return prior, None
@@ -163,7 +167,7 @@ def aid_height(
         H[0, 15 + where["height_offset"].start] = 1.0
     apart = (height.height - prior.position[..., 2] - level)[..., None]
     return correct_belief(
-        prior, apart, xp.asarray(H, dtype=kind), xp.asarray([[noise**2]], dtype=kind), gate, False, xp
+        prior, apart, xp.asarray(H, dtype=kind), xp.asarray([[noise**2]], dtype=kind), gate, False, xp, robust
     )
 
 
@@ -175,6 +179,7 @@ def aid_compass(
     north: float,
     noise: float,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction of the magnetic field over the ground.
@@ -186,13 +191,13 @@ def aid_compass(
     Args:
         magnetometer: z, of the body's axes and without their bias; or absent.
         noise: standard deviation, rad.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust: as in `aid_gnss_position`.
     """
     if magnetometer is None:
         return prior, None
     across = xp.asarray([-math.sin(north), math.cos(north), 0.0], dtype=prior.position.dtype)
     along = xp.asarray([math.cos(north), math.sin(north), 0.0], dtype=prior.position.dtype)
-    return _directed(prior, magnetometer.field, across, along, noise**2, gate, xp)
+    return _directed(prior, magnetometer.field, across, along, noise**2, gate, xp, robust)
 
 
 @block
@@ -202,6 +207,7 @@ def aid_antennas(
     *,
     baseline: tuple[float, float, float] = (1.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction over the ground from one antenna to another.
@@ -209,7 +215,7 @@ def aid_antennas(
     Args:
         heading: the angle and its deviation; or absent.
         baseline: from the one to the other, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust: as in `aid_gnss_position`.
     """
     if heading is None:
         return prior, None
@@ -217,7 +223,7 @@ def aid_antennas(
     s, c = xp.sin(heading.angle)[..., None], xp.cos(heading.angle)[..., None]
     across, along = xp.concat([-s, c, 0.0 * s], axis=-1), xp.concat([c, s, 0.0 * s], axis=-1)
     b = xp.asarray(baseline, dtype=kind)
-    return _directed(prior, b, across, along, heading.deviation**2, gate, xp)
+    return _directed(prior, b, across, along, heading.deviation**2, gate, xp, robust)
 
 
 @block
@@ -230,6 +236,7 @@ def aid_wheels(
     slip: float,
     axle: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with how a vehicle rolls: its speed by the wheels, and that it moves along its x axis.
@@ -240,7 +247,7 @@ def aid_wheels(
         imu: the last reading.
         noise: standard deviation of the speed, m/s. slip: of what is across, m/s.
         axle: the point that moves along x, such as the middle of the rear axle, m, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust: as in `aid_gnss_position`.
     """
     if wheels is None:
         return prior, None
@@ -257,7 +264,7 @@ def aid_wheels(
     seen = xp.concat([wheels.speed[..., None], still, still], axis=-1)
     apart = seen - speed - (skew(rate, xp=xp) @ arm[..., None])[..., 0]
     S = xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind)
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), S, gate, False, xp)
+    return correct_belief(prior, apart, xp.concat(H, axis=-1), S, gate, False, xp, robust)
 
 
 class Resting(NamedTuple):
@@ -312,7 +319,14 @@ def _moving(*_: Any, **__: Any) -> dict[str, Any]:
 
 
 def _directed(
-    prior: Any, seen: Array, across: Array, along: Array, variance: Any, gate: float | None, xp: Any
+    prior: Any,
+    seen: Array,
+    across: Array,
+    along: Array,
+    variance: Any,
+    gate: float | None,
+    xp: Any,
+    robust: Robust | None,
 ) -> tuple[Any, KalmanInnovation]:
     """The correction by a vector of the body (3) that points `along` the ground, and has nothing `across`."""
     kind = prior.position.dtype
@@ -328,7 +342,7 @@ def _directed(
     if prior.covariance.shape[-1] > 15:
         H.append(xp.zeros((*zero.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
     S = (variance + 0.0 * size)[..., None, None]
-    return correct_belief(prior, -angle[..., None], xp.concat(H, axis=-1), S, gate, False, xp)
+    return correct_belief(prior, -angle[..., None], xp.concat(H, axis=-1), S, gate, False, xp, robust)
 
 
 def _antenna(

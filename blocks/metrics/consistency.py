@@ -75,6 +75,10 @@ ALIKE, RUN_ALIKE, SIGMAS = 1.0, 0.3, 7.0
 """From which product of one innovation and the next on, a number and in their deviations, they are alike over
 `FEW` and over a whole run; and how many deviations of chance that must be, too."""
 
+MANY, LEANING, RARELY = 40, 0.6, 1e-9
+"""Over how many innovations their mean is looked at; from how many of their deviations on it is not 0; and
+how rarely an honest filter has so large a one."""
+
 
 def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[str, ...]:
     """Notes where a gate refused too many measurements, the NIS is far from 1, or innovations are alike.
@@ -144,6 +148,15 @@ def _judged(innovation: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return values, parts, np.isfinite(values) & (parts > 0.0)
 
 
+def _whitened(innovation: Series) -> np.ndarray:
+    """The residuals (n, m) in their own deviations, S^(-1/2) r; 0 where nothing was measured."""
+    size, axes = np.linalg.eigh(innovation["covariance"])
+    along = (np.swapaxes(axes, -1, -2) @ innovation["residual"][..., None])[..., 0]
+    known = size > 1e-12 * size[:, -1:]
+    scaled = np.where(known, along / np.sqrt(np.where(known, size, 1.0)), 0.0)
+    return np.asarray((axes @ scaled[..., None])[..., 0])
+
+
 def _alike(name: str, innovation: Series) -> tuple[str, ...]:
     if "covariance" not in innovation.leaves:
         return ()
@@ -152,30 +165,34 @@ def _alike(name: str, innovation: Series) -> tuple[str, ...]:
         taken &= innovation["accepted"]
     if taken.sum() <= FEW:
         return ()
-    parts, time = parts[taken], innovation.time[taken]
-    size, axes = np.linalg.eigh(innovation["covariance"][taken])
-    along = (np.swapaxes(axes, -1, -2) @ innovation["residual"][taken][..., None])[..., 0]
-    known = size > 1e-12 * size[:, -1:]
-    white = (axes @ np.where(known, along / np.sqrt(np.where(known, size, 1.0)), 0.0)[..., None])[..., 0]
-    products = np.sum(white[1:] * white[:-1], axis=-1)
-    numbers = np.sqrt(parts[1:] * parts[:-1])
+    parts, time, white = parts[taken], innovation.time[taken], _whitened(innovation[taken])
     front = f"{name}: " if name else ""
-    whole, total = float(products.sum() / numbers.sum()), float(numbers.sum())
-    window = min(FEW, len(products))
-    sums, of = (np.convolve(x, np.ones(window), "valid") for x in (products, numbers))
-    here = np.flatnonzero(sums / of > np.maximum(ALIKE, SIGMAS / np.sqrt(of)))
     why = "something lasts that the filter does not know: a clock that is off, too sure a start, a lever"
-    if len(here):
-        since = (int(time[here[0]]) - int(innovation.time[0])) * 1e-9
-        said = f"one innovation is like the next, from {since:.3g} s after the first on"
-        return (note("warning", f"{front}{said}: {(sums / of).max():.2g} a number, where 0 is right; {why}"),)
-    if whole > max(RUN_ALIKE, SIGMAS / np.sqrt(total)):
-        return (
-            note(
-                "warning",
-                f"{front}one innovation is like the next: {whole:.2g} a number, where 0 is right; {why}",
-            ),
+
+    def said(what: str, row: int | None, size: float) -> tuple[str, ...]:
+        since = (
+            ""
+            if row is None
+            else f", from {(time[row] - innovation.time[0]) * 1e-9:.3g} s after the first on"
         )
+        return (note("warning", f"{front}{what}{since}: {size:.2g} a number, where 0 is right; {why}"),)
+
+    products, numbers = np.sum(white[1:] * white[:-1], axis=-1), np.sqrt(parts[1:] * parts[:-1])
+    sums, of = (np.convolve(x, np.ones(FEW), "valid") for x in (products, numbers))
+    here = np.flatnonzero(sums / of > np.maximum(ALIKE, SIGMAS / np.sqrt(of)))
+    if len(here):
+        return said("one innovation is like the next", int(here[0]), float((sums / of).max()))
+    whole, total = float(products.sum() / numbers.sum()), float(numbers.sum())
+    if whole > max(RUN_ALIKE, SIGMAS / np.sqrt(total)):
+        return said("one innovation is like the next", None, whole)
+    if len(white) >= MANY:
+        leaning = np.apply_along_axis(np.convolve, 0, white, np.ones(MANY), "valid")
+        most = np.convolve(parts, np.ones(MANY) / MANY, "valid")
+        square = np.sum(leaning**2, axis=-1) / MANY
+        here = np.flatnonzero(square > np.maximum(LEANING**2 * MANY * most, chi_square(1.0 - RARELY, most)))
+        if len(here):
+            size = float(np.sqrt(square / most / MANY).max())
+            return said(f"the mean of {MANY} innovations is not 0", int(here[0]), size)
     return ()
 
 

@@ -42,6 +42,7 @@ from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import Correction, correct
 from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
@@ -244,6 +245,7 @@ def update_pose_angles(
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with a measured pose, z = (p + R(e) lever, e) + noise; without one the prior passes through.
@@ -258,7 +260,7 @@ def update_pose_angles(
         R: covariance (6, 6) of (position, angles), m and rad, its diagonal (6), or one variance.
         factor: on the measurement's own covariance, which is added to R.
         lever: the point in the body whose position is measured, m.
-        gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
+        gate, robust: as in `update_linear` (for six numbers a nis of 22.5 is 99.9 %).
     """
     if pose is None:
         return prior, None
@@ -268,7 +270,7 @@ def update_pose_angles(
     residual = _POSE.minus(z, expected, xp)
     H = sees_pose(e, lever, order=order, xp=xp)
     noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
-    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, xp=xp), xp)
+    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, robust=robust, xp=xp), xp)
 
 
 def moved_by(prior: Gaussian, found: Correction, xp: Any) -> tuple[Gaussian, KalmanInnovation]:

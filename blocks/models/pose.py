@@ -29,6 +29,7 @@ from flowgraph.blocks.geometry.rotations import (
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, PoseBelief, QuaternionBelief
 
@@ -119,6 +120,7 @@ def update_pose(
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[QuaternionBelief, KalmanInnovation | None]:
     """Correct with a measured pose, where there is one; without one the prior passes through.
@@ -132,7 +134,7 @@ def update_pose(
         pose: z; or absent.
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
-        gate: when given, a measurement that is too far off changes nothing; see `update_linear`.
+        gate, robust: as in `update_linear`.
 
     An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
     the attitude with it.
@@ -148,7 +150,7 @@ def update_pose(
     H = observe_jacobian(prior.attitude, arm, xp)
     R = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
     R = xp.asarray(R, dtype=kind)
-    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, xp=xp)
+    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, robust=robust, xp=xp)
     d = found.shift
     posterior = _unit(
         prior.velocity + d[..., 0:3],

@@ -23,6 +23,7 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
@@ -79,6 +80,7 @@ def update_camera_velocity(
     rate: str = "gyro",
     points: SigmaPoints | None = None,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with a camera's velocity, where there is one; without one the prior passes through.
@@ -99,8 +101,7 @@ def update_camera_velocity(
         rate_noise: of the rate that is taken, rad/s.
         rate: "gyro" or "camera".
         points: the set of sigma points; sqrt(3) deviations away if left out.
-        gate: when given, a measurement with a nis above it changes nothing (for three numbers 16.3 is
-            99.9 %).
+        gate, robust: as in `update_linear` (for three numbers a nis of 16.3 is 99.9 %).
 
     Raises:
         UnknownNameError: for another source of the rate.
@@ -130,7 +131,7 @@ def update_camera_velocity(
     known = xp.eye(n, dtype=kind) * xp.astype(S == 0.0, kind)
     H = xp.linalg.solve((S + known).mT, slope.mT).mT
     residual = motion.velocity - cluster.mean
-    found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, xp=xp)
+    found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, robust=robust, xp=xp)
     return moved_by(prior, found, xp)
 
 

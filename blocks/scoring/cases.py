@@ -24,6 +24,7 @@ from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import ROBUST
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
@@ -49,6 +50,7 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
+    "Weighed",
     "on_flight",
 ]
 
@@ -302,6 +304,22 @@ class Gated(Settings):
 
 
 @dataclass(frozen=True)
+class Weighed(Gated):
+    """How far a measurement is believed that is far off.
+
+    Args:
+        robust: none, and it counts as its noise is told; huber or student_t, and for less, by its distance
+            from what is left after the correction (`robust`).
+    """
+
+    robust: Annotated[str, one_of(*ROBUST)] = "none"
+
+    def gating(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {**super().gating(), "robust": ROBUST[self.robust]()}
+
+
+@dataclass(frozen=True)
 class HeldControl(Settings):
     """What the age of a control does.
 
@@ -375,7 +393,7 @@ class PoseAided(Factors, PoseNoises, Scored, Started):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, HeldControl, Gated):
+class PoseFilter(PoseAided, HeldControl, Weighed):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 

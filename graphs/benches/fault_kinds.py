@@ -15,7 +15,7 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.scoring.readings import CONTROLS, MEASURED
+from flowgraph.blocks.scoring.readings import AIDS, CONTROLS
 from flowgraph.blocks.signals import MagneticField
 from flowgraph.types import StructType, unflatten
 
@@ -25,8 +25,12 @@ HOUR = 3600.0
 SPIKES = {"gyro": 20.0, "rate": 20.0, "specific_force": 150.0, "force": 150.0, "acceleration": 150.0}
 """What a spike adds to each axis of a control, rad/s and m/s^2; a measurement's are below."""
 
-FAR, TURNED = 10.0, 1.0
-"""By how much a spike of a measurement is off: m (or what its unit is), and rad."""
+FAR, TURNED, METRE = 10.0, 1.0, 1.6e-7
+"""By how much a spike of a measurement is off: m (or what its unit is), and rad; how much of a latitude one
+metre is, rad."""
+
+TOLD = ("covariance", "deviation", "interval")
+"""What a reading tells of itself, which no fault changes."""
 
 Make = Callable[[Flight, float], Flight]
 
@@ -51,7 +55,7 @@ class Fault:
 def faults_of(flight: Flight) -> Iterator[Fault]:
     """All faults that the streams of a flight can have."""
     controls = {n for n, s in flight.streams.items() if _class(s) in CONTROLS}
-    measured = {n for n, s in flight.streams.items() if _class(s) in MEASURED}
+    measured = {n for n, s in flight.streams.items() if _class(s) in AIDS}
     for name in (*sorted(controls), *sorted(measured)):
         for length in (1.0, 10.0, 30.0):
             yield Fault(f"dropout {name} {length:g} s", _of(name, _gap, length), length)
@@ -118,10 +122,10 @@ def _spikes(series: Series, t: np.ndarray, begins: float) -> Series:
         if name == "attitude":
             turn = from_rotation_vector(np.array([0.0, 0.0, TURNED]), xp=np)
             array[rows] = multiply(array[rows], np.broadcast_to(turn, array[rows].shape), xp=np)
-        elif array.dtype.kind == "f":
-            array[rows] += SPIKES.get(
-                name, max(FAR, 3.0 * float(np.abs(array).max()) if name == "field" else FAR)
-            )
+        elif name == "field":
+            array[rows] += 3.0 * float(np.abs(array).max())
+        elif array.dtype.kind == "f" and name not in TOLD:
+            array[rows] += SPIKES.get(name, FAR) * (METRE if name in ("latitude", "longitude") else 1.0)
     return _with(series, leaves=leaves)
 
 
@@ -146,7 +150,7 @@ def _noisy(series: Series, t: np.ndarray, begins: float) -> Series:
     leaves = {n: np.array(a) for n, a in series.leaves.items()}
     there = t >= begins
     for name, array in leaves.items():
-        if array.dtype.kind != "f" or len(array) < 4:
+        if array.dtype.kind != "f" or len(array) < 4 or name in TOLD:
             continue
         spread = np.sqrt(99.0) * np.median(np.abs(np.diff(array, 2, axis=0)), axis=0) / 0.6745 / np.sqrt(6.0)
         if name == "attitude":
