@@ -41,6 +41,7 @@ def ins_ekf_pose(
     gate: float | None = None,
     patience: int = PATIENCE,
     robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -51,13 +52,15 @@ def ins_ekf_pose(
     a smoother needs too.
     """
     return euler_loop(
-        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, adaptive=adaptive,
+        held=held,
         gravity=gravity, crossing=extended_crossing(order) if smoothing else None,
         predict=lambda belief, drive: predict_extended(
             belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
-        update=lambda prior, _: update_pose_angles(
-            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust, name="update"
+        update=lambda prior, _, scale: update_pose_angles(
+            prior, pose, scale, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust,
+            name="update",
         ),
     )  # fmt: skip
 

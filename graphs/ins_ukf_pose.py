@@ -51,6 +51,7 @@ def ins_ukf_pose(
     gate: float | None = None,
     patience: int = PATIENCE,
     robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -63,11 +64,13 @@ def ins_ukf_pose(
     moving: dict[str, Any] = {"move": carried(order, gravity), "noise": np.diag(increment_variances(noise))}
     moving |= {"space": STATE, "points": points}
     return euler_loop(
-        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, adaptive=adaptive,
+        held=held,
         gravity=gravity, crossing=unscented_crossing(**moving) if smoothing else None,
         predict=lambda belief, drive: predict_unscented(belief, drive, name="predict", **moving),
-        update=lambda prior, _: update_pose_angles(
-            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust, name="update"
+        update=lambda prior, _, scale: update_pose_angles(
+            prior, pose, scale, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust,
+            name="update",
         ),
     )  # fmt: skip
 

@@ -59,6 +59,7 @@ def ins_ukf_velocity(
     gate: float | None = None,
     patience: int = PATIENCE,
     robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
@@ -71,11 +72,11 @@ def ins_ukf_velocity(
         points=points[0], name="predict",
     )  # fmt: skip
     return euler_loop(
-        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
-        gravity=gravity,
+        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience,
+        adaptive=adaptive, held=held, gravity=gravity,
         predict=predict,
-        update=lambda prior, control: update_camera_velocity(
-            prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
+        update=lambda prior, control, scale: update_camera_velocity(
+            prior, motion, control, scale, order=order, mount=mount, velocity_noise=velocity_noise,
             rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, robust=robust, name="update",
         ),
     )  # fmt: skip

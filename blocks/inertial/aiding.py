@@ -29,7 +29,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
@@ -50,6 +50,7 @@ STATE = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quater
 def aid_position(
     prior: Belief,
     position: Position | None,
+    scale: Any = None,
     *,
     noise: Spread,
     lever: tuple[float, float, float] = ORIGIN,
@@ -70,6 +71,7 @@ def aid_position(
         gate: when given, a measurement that is too far off changes nothing; see `update_linear`. (For three
             axes a nis of 16.3 is 99.9 %.)
         robust: when given, one that is far off counts for less; see `update_linear`.
+        scale: on the variance, where it is learned (`learned_scale`).
         invariant: take the error as one of the group SE_2(3), in which that of an attitude may be large, as
             that of a start of which the heading is not known; see the head of this module.
 
@@ -84,13 +86,15 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp, robust)
+    noises = scaled(_variance(noise, kind, xp), scale, xp)
+    return correct_belief(prior, apart, H, noises, gate, invariant, xp, robust)
 
 
 @block
 def aid_attitude(
     prior: Belief,
     attitude: Attitude | None,
+    scale: Any = None,
     *,
     noise: Spread,
     mount: tuple[float, float, float, float] = ALIGNED,
@@ -119,7 +123,8 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp, robust)
+    noises = scaled(_variance(noise, kind, xp), scale, xp)
+    return correct_belief(prior, apart, H, noises, gate, invariant, xp, robust)
 
 
 def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.aiding import correct_belief
 from flowgraph.blocks.inertial.navigation import PARAMETERS, places
+from flowgraph.blocks.kalman.filters import scaled
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import (
     GnssHeading,
@@ -61,6 +62,7 @@ AT_UNIT = Antenna()
 def aid_gnss_position(
     prior: Any,
     fix: GnssPosition | None,
+    scale: Any = None,
     *,
     antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
@@ -78,7 +80,7 @@ def aid_gnss_position(
         fix: the position, m, and its covariance, m^2; or absent.
         antenna: what is known of it; `lever` and `time_offset` count as known unless they are estimated.
         estimated: names of `PARAMETERS`.
-        gate, robust, invariant: as in `aid_position`.
+        gate, robust, scale, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a fix.
@@ -94,7 +96,7 @@ def aid_gnss_position(
     parts = {"lever": R, "time_offset": -prior.velocity[..., None]}
     H = [one, -late[..., None] * one, -R @ skew(arm, xp=xp), zero, zero, *_more(estimated, parts, zero)]
     apart, H = fix.position - place, xp.concat(H, axis=-1)
-    return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp, robust)
+    return correct_belief(prior, apart, H, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
 
 @block
@@ -102,6 +104,7 @@ def aid_gnss_velocity(
     prior: Any,
     fix: GnssVelocity | None,
     imu: Imu,
+    scale: Any = None,
     *,
     antenna: Antenna | None = AT_UNIT,
     estimated: tuple[str, ...] = (),
@@ -118,7 +121,7 @@ def aid_gnss_velocity(
     Args:
         imu: the last reading.
         antenna: what is known of it; None where it is the unit itself of which the velocity is known.
-        prior, fix, estimated, gate, robust, invariant: as in `aid_gnss_position`.
+        prior, fix, estimated, gate, robust, scale, invariant: as in `aid_gnss_position`.
     """
     if fix is None:
         return prior, None
@@ -134,13 +137,16 @@ def aid_gnss_velocity(
     parts = {} if antenna is None else {"lever": R @ skew(rate, xp=xp)}
     H = [zero, one, -R @ skew(swing, xp=xp), R @ skew(arm, xp=xp), zero, *_more(estimated, parts, zero)]
     apart = fix.velocity - prior.velocity - (R @ swing[..., None])[..., 0]
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp, robust)
+    return correct_belief(
+        prior, apart, xp.concat(H, axis=-1), scaled(fix.covariance, scale, xp), gate, invariant, xp, robust
+    )
 
 
 @block
 def aid_height(
     prior: Any,
     height: Height | None,
+    scale: Any = None,
     *,
     noise: float,
     estimated: tuple[str, ...] = (),
@@ -152,7 +158,7 @@ def aid_height(
 
     Args:
         noise: standard deviation, m.
-        prior, estimated, gate, robust: as in `aid_gnss_position`.
+        prior, estimated, gate, robust, scale: as in `aid_gnss_position`.
     """
     if height is None:
         return prior, None
@@ -167,7 +173,14 @@ def aid_height(
         H[0, 15 + where["height_offset"].start] = 1.0
     apart = (height.height - prior.position[..., 2] - level)[..., None]
     return correct_belief(
-        prior, apart, xp.asarray(H, dtype=kind), xp.asarray([[noise**2]], dtype=kind), gate, False, xp, robust
+        prior,
+        apart,
+        xp.asarray(H, dtype=kind),
+        scaled(xp.asarray([[noise**2]], dtype=kind), scale),
+        gate,
+        False,
+        xp,
+        robust,
     )
 
 
@@ -175,6 +188,7 @@ def aid_height(
 def aid_compass(
     prior: Any,
     magnetometer: MagneticField | None,
+    scale: Any = None,
     *,
     north: float,
     noise: float,
@@ -191,19 +205,20 @@ def aid_compass(
     Args:
         magnetometer: z, of the body's axes and without their bias; or absent.
         noise: standard deviation, rad.
-        prior, gate, robust: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if magnetometer is None:
         return prior, None
     across = xp.asarray([-math.sin(north), math.cos(north), 0.0], dtype=prior.position.dtype)
     along = xp.asarray([math.cos(north), math.sin(north), 0.0], dtype=prior.position.dtype)
-    return _directed(prior, magnetometer.field, across, along, noise**2, gate, xp, robust)
+    return _directed(prior, magnetometer.field, across, along, noise**2, scale, gate, xp, robust)
 
 
 @block
 def aid_antennas(
     prior: Any,
     heading: GnssHeading | None,
+    scale: Any = None,
     *,
     baseline: tuple[float, float, float] = (1.0, 0.0, 0.0),
     gate: float | None = None,
@@ -215,7 +230,7 @@ def aid_antennas(
     Args:
         heading: the angle and its deviation; or absent.
         baseline: from the one to the other, body.
-        prior, gate, robust: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if heading is None:
         return prior, None
@@ -223,7 +238,7 @@ def aid_antennas(
     s, c = xp.sin(heading.angle)[..., None], xp.cos(heading.angle)[..., None]
     across, along = xp.concat([-s, c, 0.0 * s], axis=-1), xp.concat([c, s, 0.0 * s], axis=-1)
     b = xp.asarray(baseline, dtype=kind)
-    return _directed(prior, b, across, along, heading.deviation**2, gate, xp, robust)
+    return _directed(prior, b, across, along, heading.deviation**2, scale, gate, xp, robust)
 
 
 @block
@@ -231,6 +246,7 @@ def aid_wheels(
     prior: Any,
     wheels: WheelSpeed | None,
     imu: Imu,
+    scale: Any = None,
     *,
     noise: float,
     slip: float,
@@ -247,7 +263,7 @@ def aid_wheels(
         imu: the last reading.
         noise: standard deviation of the speed, m/s. slip: of what is across, m/s.
         axle: the point that moves along x, such as the middle of the rear axle, m, body.
-        prior, gate, robust: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if wheels is None:
         return prior, None
@@ -263,7 +279,7 @@ def aid_wheels(
     still = 0.0 * speed[..., :1]
     seen = xp.concat([wheels.speed[..., None], still, still], axis=-1)
     apart = seen - speed - (skew(rate, xp=xp) @ arm[..., None])[..., 0]
-    S = xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind)
+    S = scaled(xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind), scale, xp)
     return correct_belief(prior, apart, xp.concat(H, axis=-1), S, gate, False, xp, robust)
 
 
@@ -324,6 +340,7 @@ def _directed(
     across: Array,
     along: Array,
     variance: Any,
+    scale: Any,
     gate: float | None,
     xp: Any,
     robust: Robust | None,
@@ -341,7 +358,7 @@ def _directed(
     H = [zero, zero, row, zero, zero]
     if prior.covariance.shape[-1] > 15:
         H.append(xp.zeros((*zero.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
-    S = (variance + 0.0 * size)[..., None, None]
+    S = scaled((variance + 0.0 * size)[..., None, None], scale, xp)
     return correct_belief(prior, -angle[..., None], xp.concat(H, axis=-1), S, gate, False, xp, robust)
 
 

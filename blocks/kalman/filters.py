@@ -79,6 +79,7 @@ def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt:
 def update_linear(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     H: npt.ArrayLike,
     R: npt.ArrayLike,
@@ -109,6 +110,7 @@ def update_linear(
             as `chi_square_gate` gives it, and where entries are missing one of the same probability
             (`gate_table`).
         robust: when given, `huber()` or `student_t()`, a measurement counts for less that is far off.
+        scale: on R, where it is learned (`learned_scale`).
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -124,13 +126,14 @@ def update_linear(
     m, n = measured.shape[-1], prior.mean.shape[-1]
     H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, scale, xp)
 
 
 @block
 def update_extended(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     observe: Callable[..., tuple[Array, Array]],
     R: npt.ArrayLike,
@@ -147,14 +150,14 @@ def update_extended(
             tangent vectors of `space` and `measured_space`, at x.
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z, of any parts.
-        prior, measured, gate, robust: as in `update_linear`.
+        prior, measured, gate, robust, scale: as in `update_linear`.
 
     Source: Bar-Shalom et al. sec. 10.3.3; on manifolds Hertzberg et al. 2013, sec. 4.
     """
     if measured is None:
         return prior, None
     predicted, H = observe(prior.mean, xp)
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
+    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, scale, xp)
 
 
 def correct(
@@ -217,15 +220,20 @@ def correct(
 def _update(
     prior: Gaussian, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None,
-    robust: Robust | None, xp: Any,
+    robust: Robust | None, scale: Any, xp: Any,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
     residual, present = innovate(measured, predicted, measured_space, xp)
-    noise = noise_matrix(R, residual.shape[-1], "R", kind=prior.mean.dtype, xp=xp)
+    noise = scaled(noise_matrix(R, residual.shape[-1], "R", kind=prior.mean.dtype, xp=xp), scale, xp)
     found = correct(
         prior.covariance, residual, H, noise, present=present, gate=gate, space=space, robust=robust, xp=xp
     )
     mean = moved(prior.mean, found.shift, space, xp)
     return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+
+
+def scaled(R: Array, scale: Any, xp: Any) -> Array:
+    """The covariance of a noise, times its scale (...), where it has one."""
+    return R if scale is None else R * xp.asarray(scale, dtype=R.dtype)[..., None, None]
 
 
 def innovate(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:

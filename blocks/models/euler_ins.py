@@ -40,7 +40,7 @@ from flowgraph.blocks.geometry.euler import (
 from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Correction, correct
+from flowgraph.blocks.kalman.filters import Correction, correct, scaled
 from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
@@ -239,6 +239,7 @@ def sees_pose(e: Array, lever: tuple[float, float, float], *, order: str, xp: An
 def update_pose_angles(
     prior: Gaussian,
     pose: PoseMeasurement | None,
+    scale: Any = None,
     *,
     order: str,
     R: npt.ArrayLike,
@@ -260,7 +261,7 @@ def update_pose_angles(
         R: covariance (6, 6) of (position, angles), m and rad, its diagonal (6), or one variance.
         factor: on the measurement's own covariance, which is added to R.
         lever: the point in the body whose position is measured, m.
-        gate, robust: as in `update_linear` (for six numbers a nis of 22.5 is 99.9 %).
+        gate, robust, scale: as in `update_linear` (for six numbers a nis of 22.5 is 99.9 %).
     """
     if pose is None:
         return prior, None
@@ -269,7 +270,7 @@ def update_pose_angles(
     expected = xp.concat([seen_place(prior.mean, lever, order=order, xp=xp), e], axis=-1)
     residual = _POSE.minus(z, expected, xp)
     H = sees_pose(e, lever, order=order, xp=xp)
-    noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
+    noise = scaled(pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp), scale, xp)
     return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, robust=robust, xp=xp), xp)
 
 

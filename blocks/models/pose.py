@@ -28,7 +28,7 @@ from flowgraph.blocks.geometry.rotations import (
     skew,
 )  # fmt: skip
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, PoseBelief, QuaternionBelief
@@ -115,6 +115,7 @@ def predict_pose(
 def update_pose(
     prior: QuaternionBelief,
     pose: Pose | None,
+    scale: Any = None,
     *,
     position_noise: float,
     attitude_noise: float,
@@ -134,7 +135,7 @@ def update_pose(
         pose: z; or absent.
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
-        gate, robust: as in `update_linear`.
+        gate, robust, scale: as in `update_linear`.
 
     An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
     the attitude with it.
@@ -149,7 +150,7 @@ def update_pose(
     residual = xp.where(present, residual, 0.0)
     H = observe_jacobian(prior.attitude, arm, xp)
     R = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
-    R = xp.asarray(R, dtype=kind)
+    R = scaled(xp.asarray(R, dtype=kind), scale, xp)
     found = correct(prior.covariance, residual, H, R, present=present, gate=gate, robust=robust, xp=xp)
     d = found.shift
     posterior = _unit(

@@ -22,7 +22,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
@@ -72,6 +72,7 @@ def update_camera_velocity(
     prior: Gaussian,
     motion: CameraMotion | None,
     imu: Imu,
+    scale: Any = None,
     *,
     order: str,
     mount: Mount,
@@ -101,7 +102,7 @@ def update_camera_velocity(
         rate_noise: of the rate that is taken, rad/s.
         rate: "gyro" or "camera".
         points: the set of sigma points; sqrt(3) deviations away if left out.
-        gate, robust: as in `update_linear` (for three numbers a nis of 16.3 is 99.9 %).
+        gate, robust, scale: as in `update_linear` (for three numbers a nis of 16.3 is 99.9 %).
 
     Raises:
         UnknownNameError: for another source of the rate.
@@ -131,7 +132,8 @@ def update_camera_velocity(
     known = xp.eye(n, dtype=kind) * xp.astype(S == 0.0, kind)
     H = xp.linalg.solve((S + known).mT, slope.mT).mT
     residual = motion.velocity - cluster.mean
-    found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, robust=robust, xp=xp)
+    rest = scaled(0.5 * (rest + rest.mT), scale, xp)
+    found = correct(prior.covariance, residual, H, rest, gate=gate, robust=robust, xp=xp)
     return moved_by(prior, found, xp)
 
 

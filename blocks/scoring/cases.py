@@ -30,7 +30,15 @@ from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
-from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
+from flowgraph.blocks.scoring.settings import (
+    NotNegative,
+    Positive,
+    Settings,
+    above_one,
+    count,
+    one_of,
+    spliced,
+)
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import GRAVITY
@@ -39,6 +47,7 @@ from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
 
 __all__ = [
+    "Adapted",
     "Factors",
     "Gated",
     "HeldControl",
@@ -320,6 +329,22 @@ class Weighed(Gated):
 
 
 @dataclass(frozen=True)
+class Adapted(Weighed):
+    """How large the noise of a measurement is.
+
+    Args:
+        adaptive: over about how many measurements the size of each sensor's noise is learned; it is as told
+            if left out (`learned_scale`).
+    """
+
+    adaptive: Annotated[float | None, above_one] = None
+
+    def gating(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {**super().gating(), "adaptive": self.adaptive}
+
+
+@dataclass(frozen=True)
 class HeldControl(Settings):
     """What the age of a control does.
 
@@ -393,7 +418,7 @@ class PoseAided(Factors, PoseNoises, Scored, Started):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, HeldControl, Weighed):
+class PoseFilter(PoseAided, HeldControl, Adapted):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 

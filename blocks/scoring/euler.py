@@ -27,13 +27,13 @@ from flowgraph.blocks.models.euler_ins import (
 from flowgraph.blocks.models.recordings import euler_recording
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
+    Adapted,
     Factors,
     HeldControl,
     OnFlight,
     PoseAided,
     Scored,
     SmoothedPoseFilter,
-    Weighed,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.scorer import Scorer
@@ -134,7 +134,7 @@ class EulerModel(ScaledFactors, Scored):
 
 
 @dataclass(frozen=True)
-class EulerKalman(EulerModel, HeldControl, Weighed):
+class EulerKalman(EulerModel, HeldControl, Adapted):
     """What is set of every Kalman filter with Euler angles."""
 
     def case(

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
+from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, scaled, where_any
 from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.blocks.kalman.robust import Robust, reweighted
 from flowgraph.blocks.kalman.triangles import covariance_root, semidefinite_root
@@ -159,6 +159,7 @@ def _shaken(noise: npt.ArrayLike, dt: Any, kind: Any, xp: Any) -> Array:
 def update_unscented(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     observe: Callable[..., Array],
     R: npt.ArrayLike,
@@ -184,7 +185,7 @@ def update_unscented(
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z; without one it is a vector.
         points: the set of sigma points.
-        gate, robust: as in `update_linear`.
+        gate, robust, scale: as in `update_linear`.
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -192,7 +193,8 @@ def update_unscented(
     if measured is None:
         return prior, None
     seen = lambda x, v: observe(x, xp)
-    noise = lambda m: noise_matrix(R, m, "update_unscented.R", kind=prior.mean.dtype, xp=xp)
+    kind = prior.mean.dtype
+    noise = lambda m: scaled(noise_matrix(R, m, "update_unscented.R", kind=kind, xp=xp), scale, xp)
     return through_observation(
         prior, measured, seen, noise, None,
         space=space, measured_space=measured_space, points=points, gate=gate, robust=robust,
