@@ -172,16 +172,8 @@ def aid_height(
     if "height_offset" in where:
         H[0, 15 + where["height_offset"].start] = 1.0
     apart = (height.height - prior.position[..., 2] - level)[..., None]
-    return correct_belief(
-        prior,
-        apart,
-        xp.asarray(H, dtype=kind),
-        scaled(xp.asarray([[noise**2]], dtype=kind), scale),
-        gate,
-        False,
-        xp,
-        robust,
-    )
+    S = scaled(xp.asarray([[noise**2]], dtype=kind), scale, xp)
+    return correct_belief(prior, apart, xp.asarray(H, dtype=kind), S, gate, False, xp, robust)
 
 
 @block

@@ -113,10 +113,10 @@ def update_camera_velocity(
         return prior, None
     x, kind = prior.mean, prior.mean.dtype
     n, points = x.shape[-1], far_points(6) if points is None else points
-    scale = points.scale(n + 6)
+    reach = points.scale(n + 6)
     S = covariance_root(prior.covariance, xp=xp)
     deviations = xp.asarray(np.diag(np.repeat([velocity_noise, rate_noise], 3)), dtype=kind)
-    apart, shakes = points.around(S, scale, xp), points.around(deviations, scale, xp)
+    apart, shakes = points.around(S, reach, xp), points.around(deviations, reach, xp)
     X = STATE.plus(x[None, :], xp.concat([0.0 * apart[:1], apart, 0.0 * apart[:12]], axis=0), xp)
     w = xp.concat([xp.zeros((1 + 2 * n, 6), dtype=kind), shakes], axis=0)
     if rate == "gyro":
@@ -125,9 +125,9 @@ def update_camera_velocity(
         turning = motion.rate @ xp.asarray(mount.rotation, dtype=kind) + 0.0 * X[:, 9:12]
     R = matrix_from_angles(X[:, 3:6], order=order, xp=xp)
     seen = camera_velocity(X[:, 6:9], R, turning - w[:, 3:6], mount=mount, xp=xp) + w[:, 0:3]
-    cluster = points.cluster(seen, None, scale, xp)
-    slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * scale)  # H S
-    rest = points.covariance(cluster, cluster, scale) - slope @ slope.mT
+    cluster = points.cluster(seen, None, reach, xp)
+    slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * reach)  # H S
+    rest = points.covariance(cluster, cluster, reach) - slope @ slope.mT
     # a direction that is known exactly has a column of zeros, and nothing to learn: any H there will do
     known = xp.eye(n, dtype=kind) * xp.astype(S == 0.0, kind)
     H = xp.linalg.solve((S + known).mT, slope.mT).mT
