@@ -17,6 +17,7 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from flowgraph import Array, block
@@ -29,6 +30,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.kalman.filters import correct, scaled
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
@@ -86,8 +88,9 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    noises = scaled(_variance(noise, kind, xp), scale, xp)
-    return correct_belief(prior, apart, H, noises, gate, invariant, xp, robust)
+    return correct_belief(
+        prior, apart, H, scaled(_variance(noise, kind, xp), scale, xp), gate, invariant, xp, robust
+    )
 
 
 @block
@@ -112,7 +115,7 @@ def aid_attitude(
         attitude: z, a unit quaternion, sensor to world; or absent.
         noise: standard deviation about the body axes, rad.
         mount: the sensor's attitude in the body, a unit quaternion.
-        gate, robust, invariant: as in `aid_position`.
+        gate, robust, scale, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (rad, body) where there was a measurement.
@@ -123,8 +126,9 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    noises = scaled(_variance(noise, kind, xp), scale, xp)
-    return correct_belief(prior, apart, H, noises, gate, invariant, xp, robust)
+    return correct_belief(
+        prior, apart, H, scaled(_variance(noise, kind, xp), scale, xp), gate, invariant, xp, robust
+    )
 
 
 def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:
@@ -217,6 +221,32 @@ def correct_belief(
     if more:
         values["parameters"] = prior.parameters + d[..., 15:]
     return type(prior)(**values), found.innovation
+
+
+def aided(
+    prior: Any,
+    measured: Array,
+    see: Callable[[Any, Any], Array],
+    R: Array,
+    gate: float | None,
+    invariant: bool,
+    xp: Any,
+    robust: Robust | None = None,
+) -> tuple[Any, KalmanInnovation]:
+    """`correct_belief` with z = see(x) + noise, whose Jacobian is derived.
+
+    Args:
+        prior, R, gate, robust, invariant: as there.
+        measured: z (m).
+        see: `see(x, xp)` (..., m), of states one a row with the parts of `STATE`; behind the six biases are
+            the parameters of a `NavigationBelief`.
+    """
+    more = prior.covariance.shape[-1] - 15
+    parts = [prior.position, prior.velocity, prior.attitude, prior.gyro_bias, prior.accelerometer_bias]
+    x = xp.concat([*parts, prior.parameters] if more else parts, axis=-1)
+    space = _space(more)
+    y, H = linearised(lambda x, xp: see(space.view(x, xp), xp), x, space, xp)
+    return correct_belief(prior, measured - y, H, R, gate, invariant, xp, robust)
 
 
 def _space(more: int) -> StateSpace:

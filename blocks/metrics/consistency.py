@@ -18,6 +18,7 @@ from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
 from flowgraph.blocks.metrics.truth import interpolate, within_truth
+from flowgraph.data.consistency import CHANCE, FEW, IN_A_ROW, far_nis
 from flowgraph.data.notes import note
 
 __all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
@@ -63,14 +64,6 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     return found
 
 
-IN_A_ROW = 5
-"""Refusals in a row from which on a gate may be shut upon an honest sensor."""
-
-
-FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
-"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
-whole run; how many innovations such a mean is of at least; how rarely an honest filter has as large a one."""
-
 ALIKE, RUN_ALIKE, SIGMAS = 1.0, 0.3, 7.0
 """From which product of one innovation and the next on, a number and in their deviations, they are alike over
 `FEW` and over a whole run; and how many deviations of chance that must be, too."""
@@ -85,8 +78,7 @@ def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[
 
     A gate refused too many where `IN_A_ROW` or more come in a row, or where chance hardly refuses as many.
 
-    A NIS is far from 1 whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and more
-    than chance allows; or, over all of them, if these are `FEW` or more, above `APART` or below 1 / `FAR`.
+    What is far from 1 is said in `flowgraph.data.consistency`.
 
     Innovations of an honest filter know nothing of each other (R. Mehra, "On the identification of variances
     and adaptive Kalman filtering", IEEE TAC 15(2), 1970). Where what is left of one is left of the next too,
@@ -95,10 +87,9 @@ def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[
 
     Args:
         name: of what was measured; empty where there is one kind.
-        loose: whether the filter is one that expects larger innovations than honest ones, so that small ones
-            say nothing.
+        loose: whether the filter is one that expects larger innovations than honest ones, which may be alike.
     """
-    far = _far(name, innovation, loose)
+    far = far_nis(name, innovation)
     alike = () if far or loose else _alike(name, innovation)
     return (*(_refused(name, innovation) or _too_often(name, innovation)), *far, *alike)
 
@@ -193,36 +184,6 @@ def _alike(name: str, innovation: Series) -> tuple[str, ...]:
         if len(here):
             size = float(np.sqrt(square / most / MANY).max())
             return said(f"the mean of {MANY} innovations is not 0", int(here[0]), size)
-    return ()
-
-
-def _far(name: str, innovation: Series, loose: bool) -> tuple[str, ...]:
-    values, parts, taken = _judged(innovation)
-    if "accepted" in innovation.leaves:
-        taken &= innovation["accepted"]
-    values, parts, time = values[taken], parts[taken], innovation.time[taken]
-    if not len(values):
-        return ()
-    front = f"{name}: " if name else ""
-    mean = float(values.sum() / parts.sum())
-    size = min(IN_A_ROW, len(values))
-    sums, numbers = (np.convolve(x, np.ones(size), "valid") for x in (values, parts))
-    beyond = np.flatnonzero(sums > np.maximum(FAR * numbers, chi_square(1.0 - CHANCE, numbers)))
-    if len(beyond):
-        since = (int(time[beyond[0]]) - int(innovation.time[0])) * 1e-9
-        said = (
-            f"{front}the NIS is far from 1, from {since:.3g} s after the first on: up to"
-            f" {(sums / numbers).max():.3g} a number over {size} innovations, {mean:.3g} over all;"
-            " the noise, the clock, the start or the sensor is not as told"
-        )
-        return (note("warning", said),)
-    total = float(parts.sum())
-    if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
-        why = "the noise is told too small, or a clock is off"
-        return (note("warning", f"{front}the NIS is far from 1: {mean:.3g} a number; {why}"),)
-    if mean < 1.0 / FAR and len(values) >= FEW and not loose:
-        said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
-        return (note("warning", said),)
     return ()
 
 
