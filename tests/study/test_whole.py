@@ -16,11 +16,11 @@ pytest.importorskip("pyarrow")
 SHORT: dict[str, Any] = {"duration": 2.0, "imu.rate": 50, "start": "truth"}
 
 
-def study(graph: str = "ekf", **more: Any) -> Study:
+def study(**more: Any) -> Study:
     parameters = {**SHORT, **more.pop("parameters", {})}
     return Study(
         **{
-            "graphs": [graph],
+            "graphs": ["ekf"],
             "data": ["sim:figure"],
             "seeds": 4,
             "engine": "c",
@@ -35,15 +35,11 @@ def figures(row: dict[str, Any]) -> dict[str, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("graph", ["ekf", "rbpf_indoor"])
-def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
-    graph: str, tmp_path, monkeypatch
-) -> None:
-    more = {"particles": 20} if graph == "rbpf_indoor" else {}
-    found = run_study(study(graph, parameters=more), tmp_path / "whole").rows
+def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(tmp_path, monkeypatch) -> None:
+    found = run_study(study(), tmp_path / "whole").rows
     assert [row["load_s"] for row in found] == [0.0] * 4, "no flight was written down"
     monkeypatch.setattr(tasks, "_whole", lambda run: None)
-    recorded = run_study(study(graph, parameters=more), tmp_path / "recorded").rows
+    recorded = run_study(study(), tmp_path / "recorded").rows
     assert all(row["load_s"] > 0.0 for row in recorded)
     for one, other in zip(found, recorded, strict=True):
         want = figures(other)
