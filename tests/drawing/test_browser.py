@@ -470,7 +470,7 @@ def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:
         assert server.wait(True, 30.0)
         simulate_watched(case.graph, case.inputs, Sender(server, case.graph, case.inputs, speed=2.0))
         page.until("return document.querySelector('[data-ended]') !== null")
-        assert page.find("output").text.startswith("ended at 2.9")
+        assert page.find("output").text.startswith("ended at 3.000 s")
         assert len(page.texts("text.value")) > 5
         assert all(page.texts("text.value"))
         assert any(words.startswith("belief: position [m]") for words in page.texts(".scope h4"))
