@@ -131,7 +131,7 @@ def update_linear(
     m, n = measured.shape[-1], prior.mean.shape[-1]
     H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
-    noise = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
+    noise = noise_matrix(R, m, "R", kind=prior.mean.dtype, xp=xp)
     return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp, scale)
 
 

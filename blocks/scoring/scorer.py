@@ -23,7 +23,7 @@ from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
 from flowgraph.data.consistency import measured
 from flowgraph.drawing.states import Quantity, seconds_of
-from flowgraph.types import leaves_of
+from flowgraph.types import ArrayType, leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
 
@@ -116,12 +116,14 @@ class Scorer:
             The streams of its figures, at `end`, and what makes the figures of a result with those streams;
             None where there are no blocks for it, as for one that smooths.
         """
-        if self.truth is None or self.errors is not pose_errors or self.smoothing:
+        estimate = streams.get(self.estimate)
+        if estimate is None or self.errors is not pose_errors or self.smoothing:
             return None
-        settle = round(self.settle * 1e9)
-        made: dict[str, Any] = {
-            self.estimate: pose_score(streams[self.estimate], truth, end=end, settle=settle)
-        }
+        leaves = dict(leaves_of(estimate.type))
+        if not {"position", "velocity", "attitude"} <= set(leaves) or not _whole(leaves.get("covariance")):
+            return None
+        settle, name = round(self.settle * 1e9), f"{self.estimate}_score"
+        made: dict[str, Any] = {self.estimate: pose_score(estimate, truth, end=end, settle=settle, name=name)}
         for name, stream in streams.items():
             if self._sums_up(dict(leaves_of(stream.type))):
                 made[name] = nis_score(stream, end=end, name=f"{name}_score")
@@ -165,3 +167,9 @@ class Scorer:
 
     def _compared(self, series: Series) -> dict[str, float]:
         return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)
+
+
+def _whole(covariance: ArrayType | None) -> bool:
+    """Whether a covariance has the nine numbers of a pose."""
+    size = 0 if covariance is None else covariance.shape[-1]
+    return isinstance(size, int) and size >= 9

@@ -85,7 +85,7 @@ def _composed(experiment: Experiment, case: Case) -> Case | None:
     build = Builder(case.graph.name)
     with building(build):
         sources = {name: _source(build, series) for name, series in inputs.items()}
-        told = {name: sources[name] for name in experiment.ticks}
+        told: dict[str, Any] = {name: sources[name] for name in experiment.ticks}
         made = experiment.world(**told, **experiment.settings)
         streams = inlined(build, case.graph, {name: made[name] for name in case.graph.sources})
         wired = in_graph(streams, made["truth"], sources[END])

@@ -16,11 +16,11 @@ pytest.importorskip("pyarrow")
 SHORT: dict[str, Any] = {"duration": 2.0, "imu.rate": 50, "start": "truth"}
 
 
-def study(graph: str = "ekf", **more: Any) -> Study:
+def study(**more: Any) -> Study:
     parameters = {**SHORT, **more.pop("parameters", {})}
     return Study(
         **{
-            "graphs": [graph],
+            "graphs": ["ekf"],
             "data": ["sim:figure"],
             "seeds": 4,
             "engine": "c",
@@ -35,14 +35,11 @@ def figures(row: dict[str, Any]) -> dict[str, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("graph", ["ekf", "ins_eskf"])
-def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
-    graph: str, tmp_path, monkeypatch
-) -> None:
-    found = run_study(study(graph), tmp_path / "whole").rows
+def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(tmp_path, monkeypatch) -> None:
+    found = run_study(study(), tmp_path / "whole").rows
     assert [row["load_s"] for row in found] == [0.0] * 4, "no flight was written down"
     monkeypatch.setattr(tasks, "_whole", lambda run: None)
-    recorded = run_study(study(graph), tmp_path / "recorded").rows
+    recorded = run_study(study(), tmp_path / "recorded").rows
     assert all(row["load_s"] > 0.0 for row in recorded)
     for one, other in zip(found, recorded, strict=True):
         want = figures(other)
@@ -52,6 +49,7 @@ def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(
     assert len({row["position_rmse_m"] for row in found}) == 4, "seeds choose the flight"
 
 
+@pytest.mark.slow
 def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> None:
     first = run_study(study(seeds=3), tmp_path)
     again = run_study(study(seeds=6), tmp_path)
@@ -60,6 +58,7 @@ def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> Non
     assert [figures(row) for row in again.rows] == [figures(row) for row in alone.rows]
 
 
+@pytest.mark.slow
 def test_a_setting_that_a_program_cannot_take_is_an_error_of_its_rows_alone(tmp_path) -> None:
     rows = run_study(study(seeds=2, parameters={"position_noise": [0.01, -1.0]}), tmp_path).rows
     assert [row["error"] is None for row in rows] == [True, True, False, False]

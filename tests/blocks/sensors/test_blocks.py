@@ -78,6 +78,7 @@ def test_the_motion_of_a_tick_is_that_of_all_times_at_once() -> None:
             np.testing.assert_allclose(getattr(one, name), whole[name][k], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_biases_and_noise_are_as_large_as_told() -> None:
     flights = [
         load_flight(
