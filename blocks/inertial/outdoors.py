@@ -19,6 +19,8 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import conjugate, rotate, skew
 from flowgraph.blocks.inertial.aiding import aided, correct_belief
 from flowgraph.blocks.inertial.navigation import places
+from flowgraph.blocks.kalman.filters import scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -60,10 +62,12 @@ AT_UNIT = Antenna()
 def aid_gnss_position(
     prior: Any,
     fix: GnssPosition | None,
+    scale: Any = None,
     *,
     antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -76,7 +80,7 @@ def aid_gnss_position(
         fix: the position, m, and its covariance, m^2; or absent.
         antenna: what is known of it; `lever` and `time_offset` count as known unless they are estimated.
         estimated: names of `PARAMETERS`.
-        gate, invariant: as in `aid_position`.
+        gate, robust, scale, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a fix.
@@ -88,7 +92,7 @@ def aid_gnss_position(
         arm, late = _antenna(x, antenna, estimated, xp)
         return x.position + rotate(x.attitude, arm, xp=xp) - x.velocity * late
 
-    return aided(prior, fix.position, see, fix.covariance, gate, invariant, xp)
+    return aided(prior, fix.position, see, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
 
 @block
@@ -96,10 +100,12 @@ def aid_gnss_velocity(
     prior: Any,
     fix: GnssVelocity | None,
     imu: Imu,
+    scale: Any = None,
     *,
     antenna: Antenna | None = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -111,38 +117,40 @@ def aid_gnss_velocity(
     Args:
         imu: the last reading.
         antenna: what is known of it; None where it is the unit itself of which the velocity is known.
-        prior, fix, estimated, gate, invariant: as in `aid_gnss_position`.
+        prior, fix, estimated, gate, robust, scale, invariant: as in `aid_gnss_position`.
     """
     if fix is None:
         return prior, None
     if antenna is None:
         H = np.eye(3, prior.covariance.shape[-1], 3)
         apart, H = fix.velocity - prior.velocity, xp.asarray(H, dtype=prior.velocity.dtype)
-        return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp)
+        return correct_belief(prior, apart, H, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
     def see(x: Any, xp: Any) -> Array:
         arm, _ = _antenna(x, antenna, estimated, xp)
         swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
         return x.velocity + rotate(x.attitude, swing[..., 0], xp=xp)
 
-    return aided(prior, fix.velocity, see, fix.covariance, gate, invariant, xp)
+    return aided(prior, fix.velocity, see, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
 
 @block
 def aid_height(
     prior: Any,
     height: Height | None,
+    scale: Any = None,
     *,
     noise: float,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with a height: z = p_up + height_offset + noise.
 
     Args:
         noise: standard deviation, m.
-        prior, estimated, gate: as in `aid_gnss_position`.
+        prior, estimated, gate, robust, scale: as in `aid_gnss_position`.
     """
     if height is None:
         return prior, None
@@ -156,19 +164,20 @@ def aid_height(
     if "height_offset" in where:
         H[0, 15 + where["height_offset"].start] = 1.0
     apart = (height.height - prior.position[..., 2] - level)[..., None]
-    return correct_belief(
-        prior, apart, xp.asarray(H, dtype=kind), xp.asarray([[noise**2]], dtype=kind), gate, False, xp
-    )
+    S = scaled(xp.asarray([[noise**2]], dtype=kind), scale, xp)
+    return correct_belief(prior, apart, xp.asarray(H, dtype=kind), S, gate, False, xp, robust)
 
 
 @block
 def aid_compass(
     prior: Any,
     magnetometer: MagneticField | None,
+    scale: Any = None,
     *,
     north: float,
     noise: float,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction of the magnetic field over the ground.
@@ -180,22 +189,24 @@ def aid_compass(
     Args:
         magnetometer: z, of the body's axes and without their bias; or absent.
         noise: standard deviation, rad.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if magnetometer is None:
         return prior, None
     across = xp.asarray([-math.sin(north), math.cos(north), 0.0], dtype=prior.position.dtype)
     along = xp.asarray([math.cos(north), math.sin(north), 0.0], dtype=prior.position.dtype)
-    return _directed(prior, magnetometer.field, across, along, noise**2, gate, xp)
+    return _directed(prior, magnetometer.field, across, along, noise**2, scale, gate, xp, robust)
 
 
 @block
 def aid_antennas(
     prior: Any,
     heading: GnssHeading | None,
+    scale: Any = None,
     *,
     baseline: tuple[float, float, float] = (1.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction over the ground from one antenna to another.
@@ -203,7 +214,7 @@ def aid_antennas(
     Args:
         heading: the angle and its deviation; or absent.
         baseline: from the one to the other, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if heading is None:
         return prior, None
@@ -211,7 +222,7 @@ def aid_antennas(
     s, c = xp.sin(heading.angle)[..., None], xp.cos(heading.angle)[..., None]
     across, along = xp.concat([-s, c, 0.0 * s], axis=-1), xp.concat([c, s, 0.0 * s], axis=-1)
     b = xp.asarray(baseline, dtype=kind)
-    return _directed(prior, b, across, along, heading.deviation**2, gate, xp)
+    return _directed(prior, b, across, along, heading.deviation**2, scale, gate, xp, robust)
 
 
 @block
@@ -219,11 +230,13 @@ def aid_wheels(
     prior: Any,
     wheels: WheelSpeed | None,
     imu: Imu,
+    scale: Any = None,
     *,
     noise: float,
     slip: float,
     axle: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with how a vehicle rolls: its speed by the wheels, and that it moves along its x axis.
@@ -234,7 +247,7 @@ def aid_wheels(
         imu: the last reading.
         noise: standard deviation of the speed, m/s. slip: of what is across, m/s.
         axle: the point that moves along x, such as the middle of the rear axle, m, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if wheels is None:
         return prior, None
@@ -247,8 +260,8 @@ def aid_wheels(
         swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
         return rotate(conjugate(x.attitude, xp=xp), x.velocity, xp=xp) + swing[..., 0]
 
-    S = xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind)
-    return aided(prior, seen, see, S, gate, False, xp)
+    S = scaled(xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind), scale, xp)
+    return aided(prior, seen, see, S, gate, False, xp, robust)
 
 
 class Resting(NamedTuple):
@@ -303,7 +316,15 @@ def _moving(*_: Any, **__: Any) -> dict[str, Any]:
 
 
 def _directed(
-    prior: Any, seen: Array, across: Array, along: Array, variance: Any, gate: float | None, xp: Any
+    prior: Any,
+    seen: Array,
+    across: Array,
+    along: Array,
+    variance: Any,
+    scale: Any,
+    gate: float | None,
+    xp: Any,
+    robust: Robust | None,
 ) -> tuple[Any, KalmanInnovation]:
     """The correction by a vector of the body (3) that points `along` the ground, and has nothing `across`."""
 
@@ -312,7 +333,8 @@ def _directed(
         return xp.atan2(xp.linalg.vecdot(across, m), xp.linalg.vecdot(along, m))[..., None]
 
     nothing = 0.0 * prior.position[..., :1]
-    return aided(prior, nothing, see, (variance + 0.0 * nothing)[..., None], gate, False, xp)
+    S = scaled((variance + 0.0 * nothing)[..., None], scale, xp)
+    return aided(prior, nothing, see, S, gate, False, xp, robust)
 
 
 def _antenna(x: Any, antenna: Antenna, estimated: tuple[str, ...], xp: Any) -> tuple[Array, Any]:

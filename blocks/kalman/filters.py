@@ -84,6 +84,7 @@ def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt:
 def update_linear(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     H: npt.ArrayLike,
     R: npt.ArrayLike,
@@ -114,6 +115,7 @@ def update_linear(
             as `chi_square_gate` gives it, and where entries are missing one of the same probability
             (`gate_table`).
         robust: when given, `huber()` or `student_t()`, a measurement counts for less that is far off.
+        scale: on R, where it is learned (`learned_scale`).
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -129,14 +131,15 @@ def update_linear(
     m, n = measured.shape[-1], prior.mean.shape[-1]
     H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
-    noise = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
-    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp)
+    noise = noise_matrix(R, m, "R", kind=prior.mean.dtype, xp=xp)
+    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp, scale)
 
 
 @block
 def update_extended(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     observe: Observe,
     R: npt.ArrayLike,
@@ -154,7 +157,7 @@ def update_extended(
             vectors of `space` and `measured_space`, at x.
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z, of any parts.
-        prior, measured, gate, robust: as in `update_linear`.
+        prior, measured, gate, robust, scale: as in `update_linear`.
 
     Source: Bar-Shalom et al. sec. 10.3.3; on manifolds Hertzberg et al. 2013, sec. 4.
     """
@@ -162,7 +165,7 @@ def update_extended(
         return prior, None
     predicted, H = observed(observe, prior.mean, space, measured_space, xp)
     noise = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
-    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp)
+    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp, scale)
 
 
 def correct(
@@ -225,15 +228,21 @@ def correct(
 def updated(
     prior: Gaussian, measured: Array, predicted: Array, H: Array, R: Array,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None,
-    robust: Robust | None, xp: Any,
+    robust: Robust | None, xp: Any, scale: Any = None,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
     """The posterior and the innovation, of what was measured and predicted, with noise R (m, m)."""
     residual, present = innovate(measured, predicted, measured_space, xp)
+    R = scaled(R, scale, xp)
     found = correct(
         prior.covariance, residual, H, R, present=present, gate=gate, space=space, robust=robust, xp=xp
     )
     mean = moved(prior.mean, found.shift, space, xp)
     return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+
+
+def scaled(R: Array, scale: Any, xp: Any) -> Array:
+    """The covariance of a noise, times its scale (...), where it has one."""
+    return R if scale is None else R * xp.asarray(scale, dtype=R.dtype)[..., None, None]
 
 
 def observed(

@@ -18,7 +18,7 @@ from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
 from flowgraph.blocks.metrics.truth import interpolate, within_truth
-from flowgraph.data.consistency import IN_A_ROW, far_nis
+from flowgraph.data.consistency import CHANCE, FEW, IN_A_ROW, far_nis
 from flowgraph.data.notes import note
 
 __all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
@@ -64,15 +64,34 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     return found
 
 
-def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
-    """Notes where a gate refused `IN_A_ROW` measurements or more in a row, and where the NIS is far from 1.
+ALIKE, RUN_ALIKE, SIGMAS = 1.0, 0.3, 7.0
+"""From which product of one innovation and the next on, a number and in their deviations, they are alike over
+`FEW` and over a whole run; and how many deviations of chance that must be, too."""
+
+MANY, LEANING, RARELY = 40, 0.6, 1e-9
+"""Over how many innovations their mean is looked at; from how many of their deviations on it is not 0; and
+how rarely an honest filter has so large a one."""
+
+
+def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[str, ...]:
+    """Notes where a gate refused too many measurements, the NIS is far from 1, or innovations are alike.
+
+    A gate refused too many where `IN_A_ROW` or more come in a row, or where chance hardly refuses as many.
 
     What is far from 1 is said in `flowgraph.data.consistency`.
 
+    Innovations of an honest filter know nothing of each other (R. Mehra, "On the identification of variances
+    and adaptive Kalman filtering", IEEE TAC 15(2), 1970). Where what is left of one is left of the next too,
+    something lasts that the filter does not know, though each alone may be small: a clock that is off, a
+    start that was too sure, a lever.
+
     Args:
         name: of what was measured; empty where there is one kind.
+        loose: whether the filter is one that expects larger innovations than honest ones, which may be alike.
     """
-    return (*_refused(name, innovation), *far_nis(name, innovation))
+    far = far_nis(name, innovation)
+    alike = () if far or loose else _alike(name, innovation)
+    return (*(_refused(name, innovation) or _too_often(name, innovation)), *far, *alike)
 
 
 def _refused(name: str, innovation: Series) -> tuple[str, ...]:
@@ -90,6 +109,79 @@ def _refused(name: str, innovation: Series) -> tuple[str, ...]:
         f"{what}{rows[k]} measurements in a row, from {seconds:.3g} s after the first on; {rows.sum()} in all"
     )
     return (note("refused", said),)
+
+
+def _too_often(name: str, innovation: Series) -> tuple[str, ...]:
+    if "accepted" not in innovation.leaves or innovation["accepted"].all():
+        return ()
+    from scipy.special import gammainc, gammaincc  # slow to import, and only scores need them
+
+    values, parts, judged = _judged(innovation)
+    refused = judged & ~innovation["accepted"]
+    if not refused.any():
+        return ()
+    rare = float(gammaincc(0.5 * parts[refused], 0.5 * values[refused]).max())
+    count, usual = int(refused.sum()), rare * float(judged.sum())
+    if gammainc(count, usual) >= CHANCE:  # the chance of as many, where so many are usual
+        return ()
+    front = f"{name}: " if name else ""
+    said = f"{front}{count} of {judged.sum()} measurements; chance has {usual:.2g} as far off"
+    return (note("refused", said),)
+
+
+def _judged(innovation: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nis and the number of parts of each, and which say anything."""
+    values, width = innovation["nis"], float(innovation["residual"].shape[-1])
+    parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), width)
+    return values, parts, np.isfinite(values) & (parts > 0.0)
+
+
+def _whitened(innovation: Series) -> np.ndarray:
+    """The residuals (n, m) in their own deviations, S^(-1/2) r; 0 where nothing was measured."""
+    size, axes = np.linalg.eigh(innovation["covariance"])
+    along = (np.swapaxes(axes, -1, -2) @ innovation["residual"][..., None])[..., 0]
+    known = size > 1e-12 * size[:, -1:]
+    scaled = np.where(known, along / np.sqrt(np.where(known, size, 1.0)), 0.0)
+    return np.asarray((axes @ scaled[..., None])[..., 0])
+
+
+def _alike(name: str, innovation: Series) -> tuple[str, ...]:
+    if "covariance" not in innovation.leaves:
+        return ()
+    _, parts, taken = _judged(innovation)
+    if "accepted" in innovation.leaves:
+        taken &= innovation["accepted"]
+    if taken.sum() <= FEW:
+        return ()
+    parts, time, white = parts[taken], innovation.time[taken], _whitened(innovation[taken])
+    front = f"{name}: " if name else ""
+    why = "something lasts that the filter does not know: a clock that is off, too sure a start, a lever"
+
+    def said(what: str, row: int | None, size: float) -> tuple[str, ...]:
+        since = (
+            ""
+            if row is None
+            else f", from {(time[row] - innovation.time[0]) * 1e-9:.3g} s after the first on"
+        )
+        return (note("warning", f"{front}{what}{since}: {size:.2g} a number, where 0 is right; {why}"),)
+
+    products, numbers = np.sum(white[1:] * white[:-1], axis=-1), np.sqrt(parts[1:] * parts[:-1])
+    sums, of = (np.convolve(x, np.ones(FEW), "valid") for x in (products, numbers))
+    here = np.flatnonzero(sums / of > np.maximum(ALIKE, SIGMAS / np.sqrt(of)))
+    if len(here):
+        return said("one innovation is like the next", int(here[0]), float((sums / of).max()))
+    whole, total = float(products.sum() / numbers.sum()), float(numbers.sum())
+    if whole > max(RUN_ALIKE, SIGMAS / np.sqrt(total)):
+        return said("one innovation is like the next", None, whole)
+    if len(white) >= MANY:
+        leaning = np.apply_along_axis(np.convolve, 0, white, np.ones(MANY), "valid")
+        most = np.convolve(parts, np.ones(MANY) / MANY, "valid")
+        square = np.sum(leaning**2, axis=-1) / MANY
+        here = np.flatnonzero(square > np.maximum(LEANING**2 * MANY * most, chi_square(1.0 - RARELY, most)))
+        if len(here):
+            size = float(np.sqrt(square / most / MANY).max())
+            return said(f"the mean of {MANY} innovations is not 0", int(here[0]), size)
+    return ()
 
 
 def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:

@@ -41,8 +41,9 @@ from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
 from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Correction, correct
+from flowgraph.blocks.kalman.filters import Correction, correct, scaled
 from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
@@ -236,12 +237,14 @@ def see_pose_angles(lever: tuple[float, float, float], *, order: str) -> Callabl
 def update_pose_angles(
     prior: Gaussian,
     pose: PoseMeasurement | None,
+    scale: Any = None,
     *,
     order: str,
     R: npt.ArrayLike,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with a measured pose, z = (p + R(e) lever, e) + noise; without one the prior passes through.
@@ -256,7 +259,7 @@ def update_pose_angles(
         R: covariance (6, 6) of (position, angles), m and rad, its diagonal (6), or one variance.
         factor: on the measurement's own covariance, which is added to R.
         lever: the point in the body whose position is measured, m.
-        gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
+        gate, robust, scale: as in `update_linear` (for six numbers a nis of 22.5 is 99.9 %).
     """
     if pose is None:
         return prior, None
@@ -264,8 +267,8 @@ def update_pose_angles(
     z = xp.concat([pose.position, measured_angles(pose.attitude, e, order=order, xp=xp)], axis=-1)
     expected, H = linearised(see_pose_angles(lever, order=order), prior.mean, STATE, xp, seen=POSE_ANGLES)
     residual = POSE_ANGLES.minus(z, expected, xp)
-    noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
-    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, xp=xp), xp)
+    noise = scaled(pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp), scale, xp)
+    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, robust=robust, xp=xp), xp)
 
 
 def moved_by(prior: Gaussian, found: Correction, xp: Any) -> tuple[Gaussian, KalmanInnovation]:

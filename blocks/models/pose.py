@@ -29,7 +29,8 @@ from flowgraph.blocks.geometry.rotations import (
 )  # fmt: skip
 from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, PoseBelief, QuaternionBelief
 
@@ -108,11 +109,13 @@ def predict_pose(
 def update_pose(
     prior: QuaternionBelief,
     pose: Pose | None,
+    scale: Any = None,
     *,
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[QuaternionBelief, KalmanInnovation | None]:
     """Correct with a measured pose, where there is one; without one the prior passes through.
@@ -126,7 +129,7 @@ def update_pose(
         pose: z; or absent.
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
-        gate: when given, a measurement that is too far off changes nothing; see `update_linear`.
+        gate, robust, scale: as in `update_linear`.
 
     An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
     the attitude with it.
@@ -141,8 +144,8 @@ def update_pose(
     residual = xp.where(present, residual, 0.0)
     H = observe_jacobian(prior.attitude, arm, xp)
     R = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
-    R = xp.asarray(R, dtype=kind)
-    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, xp=xp)
+    R = scaled(xp.asarray(R, dtype=kind), scale, xp)
+    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, robust=robust, xp=xp)
     d = found.shift
     posterior = unit(
         prior.velocity + d[..., 0:3],

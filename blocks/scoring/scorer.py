@@ -53,7 +53,8 @@ class Scorer:
         errors: such as `pose_errors`, `point_errors` or `attitude_errors`.
         estimate: the stream that is compared.
         settle: seconds at the start that the errors leave out.
-        innovations: whether those that a run collects are summed up too.
+        innovations: whether those that a run collects are summed up too; where not, the filter expects larger
+            ones than honest ones, and those may be alike.
         steps: what a smoother needs of a result.
         smooth: "rts" smooths the whole run, "batch" takes the most likely trajectory of the recording, "none"
             does neither.
@@ -145,8 +146,9 @@ class Scorer:
         if self.truth is not None and self.estimate in result.series:
             found += truth_remarks(result[self.estimate], self.truth, self.settle)
         for name, series in result.series.items():
-            if self._sums_up(series.leaves):
-                found += nis_remarks(measured(name), series)
+            if "nis" in series.leaves:
+                what = measured(name)
+                found += nis_remarks(what, series, loose=not self.innovations)
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)

@@ -111,7 +111,7 @@ def figure(number: int, title: str, png: bytes) -> str:
 
 def shown_runs(words: str) -> str:
     """The place of the runs that are in a page."""
-    return f'<section class="shown-runs"><h2>Runs</h2><p>{safe(words)}</p></section>'
+    return f'<section class="shown-runs" id="shown"><h2>Runs</h2><p>{safe(words)}</p></section>'
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
