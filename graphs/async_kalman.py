@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.point import between, point_belief, point_model
@@ -69,7 +69,7 @@ def async_kalman(
         scale=scale,
     )
     collect(innovation, "position_innovation")
-    learn(scale, innovation, adaptive, "position")
+    feed_scale(scale, innovation, adaptive, "position")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=6)
     if velocity is not None:
@@ -79,7 +79,7 @@ def async_kalman(
             H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate, robust=robust,
             scale=scale,
         )  # fmt: skip
-        learn(scale, innovation, adaptive, "velocity")
+        feed_scale(scale, innovation, adaptive, "velocity")
         collect(innovation, "velocity_innovation")
         if gate is not None:
             posterior = find_back(

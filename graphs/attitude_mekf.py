@@ -22,7 +22,7 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import attitude_errors
@@ -85,7 +85,7 @@ def attitude_mekf(
         scale=scale,
         name="update",
     )
-    learn(scale, innovation, adaptive, "attitude")
+    feed_scale(scale, innovation, adaptive, "attitude")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=3, attitude=0)
     belief.feed(posterior)

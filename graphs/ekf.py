@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import (
@@ -80,7 +80,7 @@ def ekf(
         robust=robust,
         scale=scale,
     )
-    learn(scale, innovation, adaptive, "vicon")
+    feed_scale(scale, innovation, adaptive, "vicon")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=10, attitude=6)
     belief.feed(posterior)

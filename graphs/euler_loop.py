@@ -14,7 +14,7 @@ from typing import Any
 from flowgraph import collect, delay, latest
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.kalman.backward import Crossing, collect_steps
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
@@ -63,7 +63,7 @@ def euler_loop(
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
     scale = scale_of(adaptive, "measured")
     posterior, innovation = update(prior, control, scale)
-    learn(scale, innovation, adaptive, "measured")
+    feed_scale(scale, innovation, adaptive, "measured")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=3)
     belief.feed(posterior)

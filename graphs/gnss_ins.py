@@ -27,7 +27,7 @@ from flowgraph.blocks.inertial.outdoors import (
     standing,
 )
 from flowgraph.blocks.kalman.backward import collect_steps
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
@@ -110,7 +110,7 @@ def gnss_ins(
 
     def told(corrected: tuple[Any, Any], name: str) -> Any:
         posterior, innovation = corrected
-        learn(scales[name], innovation, adaptive, name)
+        feed_scale(scales[name], innovation, adaptive, name)
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return posterior

@@ -16,7 +16,7 @@ from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.kalman.backward import collect_steps
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import pose_errors
@@ -88,7 +88,7 @@ def ins_eskf(
         invariant=invariant,
     )
     collect(innovation, "position_innovation")
-    learn(scale, innovation, adaptive, "position")
+    feed_scale(scale, innovation, adaptive, "position")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6, shown=False)
     if attitude is not None:
@@ -96,7 +96,7 @@ def ins_eskf(
         posterior, turn = aid_attitude(
             posterior, attitude, scale, noise=attitude_noise, gate=gate, robust=robust, invariant=invariant
         )
-        learn(scale, turn, adaptive, "attitude")
+        feed_scale(scale, turn, adaptive, "attitude")
         collect(turn, "attitude_innovation")
         if gate is not None:
             posterior = find_back(

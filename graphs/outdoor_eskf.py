@@ -18,7 +18,7 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.filters import update_extended
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import pose_errors
@@ -89,7 +89,7 @@ def outdoor_eskf(
         return {"gate": gate, "robust": robust, "scale": scales[name]}
 
     def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
-        learn(scales[name], innovation, adaptive, name)
+        feed_scale(scales[name], innovation, adaptive, name)
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return now

@@ -26,7 +26,7 @@ import numpy as np
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.backward import collect_steps
-from flowgraph.blocks.kalman.learned import learn, scale_of
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import POSE, driving
@@ -101,7 +101,7 @@ def ukf(
         robust=robust,
         scale=scale,
     )
-    learn(scale, innovation, adaptive, "vicon")
+    feed_scale(scale, innovation, adaptive, "vicon")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6)
     belief.feed(posterior)

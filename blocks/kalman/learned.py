@@ -14,7 +14,7 @@ correction:
 
     scale = scale_of(memory, "position")
     posterior, innovation = aid_position(prior, position, scale, noise=...)
-    learn(scale, innovation, memory, "position")
+    feed_scale(scale, innovation, memory, "position")
 
 Sources: A. Mohamed and K. Schwarz, "Adaptive Kalman filtering for INS/GPS", J. Geodesy 73, 1999; C.
 Hide, T. Moore, M. Smith, "Adaptive Kalman filtering for low-cost INS/GPS", J. Navigation 56(1), 2003.
@@ -32,7 +32,7 @@ from flowgraph.blocks.kalman.filters import Observe, Vector, observed, updated
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
-__all__ = ["LEAST", "learn", "learned_noise", "learned_scale", "scale_of", "update_learned"]
+__all__ = ["LEAST", "feed_scale", "learned_noise", "learned_scale", "scale_of", "update_learned"]
 
 LEAST = 1e-4
 """Of the noise that was told, at least so much of its variance is believed to be there."""
@@ -105,7 +105,7 @@ def scale_of(memory: float | None, name: str) -> Any:
     return None if memory is None else delay(np.float64(1.0), name=f"{name}_scale")
 
 
-def learn(scale: Any, innovation: Any, memory: float | None, name: str) -> None:
+def feed_scale(scale: Any, innovation: Any, memory: float | None, name: str) -> None:
     """Feed a scale of `scale_of` with what an innovation teaches; nothing without a memory."""
     if memory is not None:
         scale.feed(learned_scale(scale, innovation, memory=memory, name=f"learn_{name}"))

@@ -125,11 +125,8 @@ def _too_often(name: str, innovation: Series) -> tuple[str, ...]:
     if gammainc(count, usual) >= CHANCE:  # the chance of as many, where so many are usual
         return ()
     front = f"{name}: " if name else ""
-    return (
-        note(
-            "refused", f"{front}{count} of {judged.sum()} measurements, of which chance refuses {usual:.2g}"
-        ),
-    )
+    said = f"{front}{count} of {judged.sum()} measurements; chance has {usual:.2g} as far off"
+    return (note("refused", said),)
 
 
 def _judged(innovation: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
