@@ -24,7 +24,7 @@ from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
-from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.kalman.smoothing import Smoothing
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
@@ -239,7 +239,7 @@ class Scored(Settings):
         *,
         estimate: str = "belief",
         innovations: bool = True,
-        steps: Callable[[Result], Steps] | None = None,
+        steps: Callable[[Result], Smoothing] | None = None,
         recording: Recording | None = None,
     ) -> Scorer:
         """The score of a run on that flight; see `Scorer`."""
