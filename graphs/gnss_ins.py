@@ -178,6 +178,10 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
         "gravity": world.gravity,
         "earth": world.earth,
         "held": filter.held(on, inputs["imu"], inputs),
+        "north": filter.north(on, world) if "magnetometer" in inputs else 0.0,
+        "compass_noise": filter.compass_noise,
+        "speed_noise": filter.speed_noise,
+        "slip": filter.slip,
     }
     return on.case(
         filter.score(
@@ -187,10 +191,6 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
             recording=navigation_recording(inputs, reading=reading_of(on.flight), **known),
         ),
         inputs=inputs,
-        north=filter.north(on, world) if "magnetometer" in inputs else 0.0,
-        compass_noise=filter.compass_noise,
-        speed_noise=filter.speed_noise,
-        slip=filter.slip,
         resting=filter.resting(),
         invariant=invariant,
         smoothing=filter.smoothed,

@@ -65,7 +65,8 @@ def outdoor_eskf(
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
-    Of the sensors beside the IMU any are there. A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
+    Of the sensors beside the IMU any are there. A `reading` of the IMU is of an "instant", or the "mean" over
+    the time since the one before (`driving`).
     Collected: `belief` at every tick, and the innovation of each sensor where there was a reading;
     with `smoothing` what a smoother needs too.
     """
@@ -108,9 +109,10 @@ def outdoor_eskf(
         seen, R = altimeter.map(lambda z: z.distance[..., None]), [[s.noise("altimeter") ** 2]]
         now = fused(now, seen, "altimeter", "fuse_altimeter", observe=observe_distance, R=R)
     if optical_flow is not None:
+        R = np.diag(np.repeat(np.square([s.noise("displacement"), s.noise("turn")]), 3))
         now = fused(
-            now, optical_flow.map(flow_vector), "optical_flow", "fuse_flow", observe=observe_flow,
-            R=np.diag(np.repeat(np.square([s.noise("displacement"), s.noise("turn")]), 3)), measured_space=FLOW,
+            now, optical_flow.map(flow_vector), "optical_flow", "fuse_flow", observe=observe_flow, R=R,
+            measured_space=FLOW,
         )  # fmt: skip
     if smoothing:  # what is smoothed has the clone that its readings were measured from
         collect(now, "posterior")

@@ -132,7 +132,12 @@ def rbpf_outdoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_outdoor)
+_UNSMOOTHED = (
+    "each particle has a Kalman filter of its own, and particles that are resampled take their past with them"
+)
+
+
+@on_flight(rbpf_outdoor, unsmoothed=_UNSMOOTHED)
 def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 

@@ -1,8 +1,8 @@
 """Outdoors: which sensors a vehicle carries there, how good they are, and how a filter starts on them.
 
-An inertial unit, and any of a magnetometer, two GPS receivers, an altimeter and optical flow, each keep a clock
-of their own. What a filter must know of them beforehand is one object, so that two filters on the same streams can be
-given the very same knowledge, and be compared.
+An inertial unit, and any of a magnetometer, two GPS receivers, an altimeter and optical flow, each keep a
+clock of their own. What a filter must know of them beforehand is one object, so that two filters on the same
+streams can be given the very same knowledge, and be compared.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
+from flowgraph.data.settings import need_settings_taken
 from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
 
@@ -168,6 +169,7 @@ def on_flight(
     told: Callable[[Flight], Flight] | None = None,
     measured: Collection[str] | None = (),
     ranged: bool = True,
+    unsmoothed: str | None = None,
 ) -> Callable[[Callable[..., Case]], Callable[..., Case]]:
     """Decorator: registers `function(on, *, settings) -> Case` as that which makes a case of a flight.
 
@@ -181,6 +183,7 @@ def on_flight(
         measured: streams of controls that the graph takes as measurements, which correct by their finite
             entries; None where it takes whole measurements only.
         ranged: whether it takes what inertial sensors read, so that it has the settings of `Ranges`.
+        unsmoothed: why its runs cannot be smoothed, where they cannot.
 
     Raises:
         DataError: by what is registered, where a stream is missing or empty.
@@ -194,6 +197,7 @@ def on_flight(
 
         @functools.wraps(function)
         def prepare(*args: Any, **keywords: Any) -> Case:
+            need_settings_taken(prepare, keywords, graph.name)
             try:
                 bound = signature.bind(*args, **keywords)
             except TypeError as error:
@@ -213,6 +217,10 @@ def on_flight(
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
         prepare.__doc__ = known.documentation
         prepare.scoring = known.scoring  # type: ignore[attr-defined]
+        if unsmoothed is not None:
+            prepare.refused = dict.fromkeys(  # type: ignore[attr-defined]
+                ("smooth", "lag"), f"the runs of this graph cannot be smoothed: {unsmoothed}"
+            )
         return graph.on_flight(prepare)
 
     return register
@@ -240,14 +248,15 @@ class Scored(Settings):
         estimate: str = "belief",
         innovations: bool = True,
         steps: Callable[[Result], Smoothing] | None = None,
-        recording: Recording | None = None,
+        recording: Recording | str | None = None,
     ) -> Scorer:
-        """The score of a run on that flight; see `Scorer`."""
+        """The score of a run on that flight; see `Scorer`. In place of a recording it may be said why
+        there is no batch estimate."""
         truth = on.flight.truth
         more = self._smoother(on, recording)
         return Scorer(truth, errors, estimate, self.settle, innovations, steps, *more)
 
-    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
+    def _smoother(self, on: OnFlight, recording: Recording | str | None) -> tuple[Any, ...]:
         return ()
 
 
@@ -272,15 +281,16 @@ class Smoothed(Scored):
         """Whether a graph is to collect what a smoother needs."""
         return self.smooth != "none" or self.lag is not None
 
-    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
-        if self.smooth == "batch" and recording is None:
+    def _smoother(self, on: OnFlight, recording: Recording | str | None) -> tuple[Any, ...]:
+        if self.smooth == "batch" and not isinstance(recording, Recording):
             raise DeclarationError(
-                "this graph has no batch estimate",
+                "this graph has no batch estimate" + (f": {recording}" if recording else ""),
                 path=f"{on.name}.smooth",
                 expected="rts",
                 got="batch",
                 fix="write smooth=rts",
             )
+        recording = recording if isinstance(recording, Recording) else None
         return self.smooth, self.lag, recording, loss_of(self.loss)
 
 

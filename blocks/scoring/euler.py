@@ -207,7 +207,17 @@ class EulerVelocity(EulerKalman, Smoothed):
     ) -> EulerScore:
         """The score of a run, and of the smoothed one."""
         steps = partial(euler_steps, order=self.order)
-        told = ("noise", "order", "reading", "gravity", "held", "mount", "rate", "rate_noise", "velocity_noise")
+        told = (
+            "noise",
+            "order",
+            "reading",
+            "gravity",
+            "held",
+            "mount",
+            "rate",
+            "rate_noise",
+            "velocity_noise",
+        )
         recording = velocity_recording(inputs, start=start, **{name: known[name] for name in told})
         return EulerScore(self.score(on, pose_errors, steps=steps, recording=recording), self.order)
 
@@ -283,6 +293,11 @@ class EulerScore:
 
     usual: Scorer
     order: str
+
+    @property
+    def smoothing(self) -> bool:
+        """Whether the smoothed runs are compared too."""
+        return self.usual.smoothing
 
     def __call__(self, result: Result) -> dict[str, float]:
         cosine = result["angles"]["cosine"]

@@ -32,6 +32,8 @@ SMOOTHED = (
     "attitude_rmse_deg",
     "tilt_rmse_deg",
     "heading_rmse_deg",
+    "inclination_rmse_deg",
+    "total_rmse_deg",
     "nees_mean",
     "nees_inside",
 )
