@@ -149,7 +149,13 @@ def test_the_batch_of_a_linear_filter_is_its_smoother(name):
     assert rts["smoothed_position_rmse_m"] < 0.95 * rts["position_rmse_m"]
 
 
-@pytest.mark.parametrize("name", ["attitude_mekf", "ins_ukf_velocity", "particle", "imm", "particles"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "attitude_mekf", pytest.param("ins_ukf_velocity", marks=pytest.mark.slow), "particle", "imm",
+        pytest.param("particles", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_others_are_smoothed_too(name):
     """On average over a few flights: better than the filter, and with `lag` in between or near."""
     figure = {"attitude_mekf": "attitude_rmse_deg", "ins_ukf_velocity": "attitude_rmse_deg"}.get(
