@@ -30,6 +30,7 @@ from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
+from flowgraph.blocks.outdoor.tracks import track_files
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.outdoors import Outdoors
 from flowgraph.blocks.scoring.tuning import reading_of, with_imu
@@ -191,6 +192,7 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
             recording=navigation_recording(inputs, reading=reading_of(on.flight), **known),
         ),
         inputs=inputs,
+        files=track_files(world.origin, on.flight.name, on.flight.truth),
         resting=filter.resting(),
         invariant=invariant,
         smoothing=filter.smoothed,

@@ -15,6 +15,7 @@ import functools
 import inspect
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -139,6 +140,7 @@ class OnFlight:
         inputs: Mapping[str, Series] | None = None,
         estimate: str | None = None,
         sizes: Mapping[str, int] | None = None,
+        files: Mapping[str, Callable[[Result, Path], None]] | None = None,
         **settings: Any,
     ) -> Case:
         """The graph, built on the clocks of its inputs.
@@ -148,6 +150,7 @@ class OnFlight:
             inputs: by source; those that were needed if left out.
             estimate: the collected stream that it is of; the one that is scored if left out.
             sizes, settings: as for `build`.
+            files: as for `Case`.
         """
         inputs = dict(self.inputs if inputs is None else inputs)
         noted = ["imu"] if "imu" in inputs else []
@@ -157,9 +160,8 @@ class OnFlight:
         smoothed = getattr(score, "smoothing", False)
         built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
         self.notes.extend(said_of_late)
-        return Case(
-            built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
-        )
+        named = given(estimate, getattr(score, "estimate", "belief"))
+        return Case(built, inputs, score, named, said(self.notes), given(files, {}))
 
 
 def on_flight(
