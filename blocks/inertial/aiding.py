@@ -17,6 +17,7 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from flowgraph import Array, block
@@ -29,6 +30,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
@@ -201,6 +203,31 @@ def correct_belief(
     if more:
         values["parameters"] = prior.parameters + d[..., 15:]
     return type(prior)(**values), found.innovation
+
+
+def aided(
+    prior: Any,
+    measured: Array,
+    see: Callable[[Any, Any], Array],
+    R: Array,
+    gate: float | None,
+    invariant: bool,
+    xp: Any,
+) -> tuple[Any, KalmanInnovation]:
+    """`correct_belief` with z = see(x) + noise, whose Jacobian is derived.
+
+    Args:
+        prior, R, gate, invariant: as there.
+        measured: z (m).
+        see: `see(x, xp)` (..., m), of states one a row with the parts of `STATE`; behind the six biases are
+            the parameters of a `NavigationBelief`.
+    """
+    more = prior.covariance.shape[-1] - 15
+    parts = [prior.position, prior.velocity, prior.attitude, prior.gyro_bias, prior.accelerometer_bias]
+    x = xp.concat([*parts, prior.parameters] if more else parts, axis=-1)
+    space = _space(more)
+    y, H = linearised(lambda x, xp: see(space.view(x, xp), xp), x, space, xp)
+    return correct_belief(prior, measured - y, H, R, gate, invariant, xp)
 
 
 def _space(more: int) -> StateSpace:

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph import Array, block
-from flowgraph.blocks.geometry.rotations import skew, to_matrix
-from flowgraph.blocks.inertial.aiding import correct_belief
-from flowgraph.blocks.inertial.navigation import PARAMETERS, places
+from flowgraph.blocks.geometry.rotations import conjugate, rotate, skew
+from flowgraph.blocks.inertial.aiding import aided, correct_belief
+from flowgraph.blocks.inertial.navigation import places
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -83,16 +83,12 @@ def aid_gnss_position(
     """
     if fix is None:
         return prior, None
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    arm, late = _antenna(prior, antenna, estimated, kind, xp)
-    place = prior.position + (R @ arm[..., None])[..., 0] - prior.velocity * late
-    zero = 0.0 * R
-    one = zero + xp.eye(3, dtype=kind)
-    parts = {"lever": R, "time_offset": -prior.velocity[..., None]}
-    H = [one, -late[..., None] * one, -R @ skew(arm, xp=xp), zero, zero, *_more(estimated, parts, zero)]
-    apart, H = fix.position - place, xp.concat(H, axis=-1)
-    return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        arm, late = _antenna(x, antenna, estimated, xp)
+        return x.position + rotate(x.attitude, arm, xp=xp) - x.velocity * late
+
+    return aided(prior, fix.position, see, fix.covariance, gate, invariant, xp)
 
 
 @block
@@ -119,19 +115,17 @@ def aid_gnss_velocity(
     """
     if fix is None:
         return prior, None
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    arm, _ = _antenna(prior, antenna or Antenna(), estimated, kind, xp)
     if antenna is None:
-        arm = 0.0 * arm
-    rate = imu.gyro - prior.gyro_bias
-    swing = (skew(rate, xp=xp) @ arm[..., None])[..., 0]
-    zero = 0.0 * R
-    one = zero + xp.eye(3, dtype=kind)
-    parts = {} if antenna is None else {"lever": R @ skew(rate, xp=xp)}
-    H = [zero, one, -R @ skew(swing, xp=xp), R @ skew(arm, xp=xp), zero, *_more(estimated, parts, zero)]
-    apart = fix.velocity - prior.velocity - (R @ swing[..., None])[..., 0]
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp)
+        H = np.eye(3, prior.covariance.shape[-1], 3)
+        apart, H = fix.velocity - prior.velocity, xp.asarray(H, dtype=prior.velocity.dtype)
+        return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        arm, _ = _antenna(x, antenna, estimated, xp)
+        swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
+        return x.velocity + rotate(x.attitude, swing[..., 0], xp=xp)
+
+    return aided(prior, fix.velocity, see, fix.covariance, gate, invariant, xp)
 
 
 @block
@@ -245,19 +239,16 @@ def aid_wheels(
     if wheels is None:
         return prior, None
     kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
     arm = xp.asarray(axle, dtype=kind)
-    speed = (R.mT @ prior.velocity[..., None])[..., 0]
-    rate = imu.gyro - prior.gyro_bias
-    zero = 0.0 * R
-    H = [zero, R.mT, skew(speed, xp=xp), zero + skew(arm, xp=xp), zero]
-    if prior.covariance.shape[-1] > 15:
-        H.append(xp.zeros((*R.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
-    still = 0.0 * speed[..., :1]
+    still = 0.0 * prior.velocity[..., :1]
     seen = xp.concat([wheels.speed[..., None], still, still], axis=-1)
-    apart = seen - speed - (skew(rate, xp=xp) @ arm[..., None])[..., 0]
+
+    def see(x: Any, xp: Any) -> Array:
+        swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
+        return rotate(conjugate(x.attitude, xp=xp), x.velocity, xp=xp) + swing[..., 0]
+
     S = xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind)
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), S, gate, False, xp)
+    return aided(prior, seen, see, S, gate, False, xp)
 
 
 class Resting(NamedTuple):
@@ -315,33 +306,18 @@ def _directed(
     prior: Any, seen: Array, across: Array, along: Array, variance: Any, gate: float | None, xp: Any
 ) -> tuple[Any, KalmanInnovation]:
     """The correction by a vector of the body (3) that points `along` the ground, and has nothing `across`."""
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    m = (R @ seen[..., None])[..., 0]
-    size = xp.sqrt(m[..., 0] ** 2 + m[..., 1] ** 2)
-    angle = xp.atan2(xp.linalg.vecdot(across, m), xp.linalg.vecdot(along, m))
-    # the direction over the ground turns by (n x dR) where the body does
-    n = xp.concat([-m[..., 1:2], m[..., 0:1], 0.0 * m[..., 0:1]], axis=-1) / (size * size)[..., None]
-    row = -(n[..., None, :] @ R @ skew(seen, xp=xp))
-    zero = 0.0 * row
-    H = [zero, zero, row, zero, zero]
-    if prior.covariance.shape[-1] > 15:
-        H.append(xp.zeros((*zero.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
-    S = (variance + 0.0 * size)[..., None, None]
-    return correct_belief(prior, -angle[..., None], xp.concat(H, axis=-1), S, gate, False, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        m = rotate(x.attitude, seen, xp=xp)
+        return xp.atan2(xp.linalg.vecdot(across, m), xp.linalg.vecdot(along, m))[..., None]
+
+    nothing = 0.0 * prior.position[..., :1]
+    return aided(prior, nothing, see, (variance + 0.0 * nothing)[..., None], gate, False, xp)
 
 
-def _antenna(
-    prior: Any, antenna: Antenna, estimated: tuple[str, ...], kind: Any, xp: Any
-) -> tuple[Array, Array]:
-    """Its lever (3) and by how much it is late (1), estimated or known."""
-    where = places(estimated)
-    arm = prior.parameters[..., where["lever"]] if "lever" in where else xp.asarray(antenna.lever, dtype=kind)
-    if "time_offset" in where:
-        return arm, prior.parameters[..., where["time_offset"]]
-    return arm, xp.asarray([antenna.late], dtype=kind)
-
-
-def _more(estimated: tuple[str, ...], parts: dict[str, Array], zero: Array) -> list[Array]:
-    """The columns of a Jacobian of three rows for what is estimated beside the fifteen."""
-    return [parts.get(name, zero[..., :, : PARAMETERS[name].size]) for name in estimated]
+def _antenna(x: Any, antenna: Antenna, estimated: tuple[str, ...], xp: Any) -> tuple[Array, Any]:
+    """Its lever (3) and by how much it is late, of a state; estimated or known."""
+    where, parameters = places(estimated), x.biases[..., 6:]
+    arm = parameters[..., where["lever"]] if "lever" in where else None
+    arm = xp.asarray(antenna.lever, dtype=x.position.dtype) if arm is None else arm
+    return arm, parameters[..., where["time_offset"]] if "time_offset" in where else antenna.late

@@ -14,12 +14,11 @@ Source: A. Mohamed and K. Schwarz, "Adaptive Kalman filtering for INS/GPS", J. G
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
-from flowgraph import Array, block, real
+from flowgraph import block, real
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import Vector, correct, innovate, moved, where_any
+from flowgraph.blocks.kalman.filters import Observe, Vector, observed, updated
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
@@ -35,7 +34,7 @@ def update_learned(
     measured: Vector | None,
     noise: Noise,
     *,
-    observe: Callable[..., tuple[Array, Array]],
+    observe: Observe,
     space: StateSpace | None = None,
     measured_space: StateSpace | None = None,
     gate: float | None = None,
@@ -50,13 +49,8 @@ def update_learned(
     """
     if measured is None:
         return prior, None
-    predicted, H = observe(prior.mean, xp)
-    residual, present = innovate(measured, predicted, measured_space, xp)
-    found = correct(
-        prior.covariance, residual, H, noise, present=present, gate=gate, space=space, robust=robust, xp=xp
-    )
-    mean = moved(prior.mean, found.shift, space, xp)
-    return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+    predicted, H = observed(observe, prior.mean, space, measured_space, xp)
+    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp)
 
 
 @block

@@ -18,6 +18,7 @@ from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
 from flowgraph.blocks.metrics.truth import interpolate, within_truth
+from flowgraph.data.consistency import IN_A_ROW, far_nis
 from flowgraph.data.notes import note
 
 __all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
@@ -63,25 +64,15 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     return found
 
 
-IN_A_ROW = 5
-"""Refusals in a row from which on a gate may be shut upon an honest sensor."""
-
-
-FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
-"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
-whole run; how many innovations such a mean is of at least; how rarely an honest filter has as large a one."""
-
-
 def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
     """Notes where a gate refused `IN_A_ROW` measurements or more in a row, and where the NIS is far from 1.
 
-    A NIS is far from 1 whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and more
-    than chance allows; or, over all of them, if these are `FEW` or more, above `APART` or below 1 / `FAR`.
+    What is far from 1 is said in `flowgraph.data.consistency`.
 
     Args:
         name: of what was measured; empty where there is one kind.
     """
-    return (*_refused(name, innovation), *_far(name, innovation))
+    return (*_refused(name, innovation), *far_nis(name, innovation))
 
 
 def _refused(name: str, innovation: Series) -> tuple[str, ...]:
@@ -99,38 +90,6 @@ def _refused(name: str, innovation: Series) -> tuple[str, ...]:
         f"{what}{rows[k]} measurements in a row, from {seconds:.3g} s after the first on; {rows.sum()} in all"
     )
     return (note("refused", said),)
-
-
-def _far(name: str, innovation: Series) -> tuple[str, ...]:
-    values, width = innovation["nis"], float(innovation["residual"].shape[-1])
-    parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), width)
-    taken = np.isfinite(values) & (parts > 0.0)
-    if "accepted" in innovation.leaves:
-        taken &= innovation["accepted"]
-    values, parts, time = values[taken], parts[taken], innovation.time[taken]
-    if not len(values):
-        return ()
-    front = f"{name}: " if name else ""
-    mean = float(values.sum() / parts.sum())
-    size = min(IN_A_ROW, len(values))
-    sums, numbers = (np.convolve(x, np.ones(size), "valid") for x in (values, parts))
-    beyond = np.flatnonzero(sums > np.maximum(FAR * numbers, chi_square(1.0 - CHANCE, numbers)))
-    if len(beyond):
-        since = (int(time[beyond[0]]) - int(innovation.time[0])) * 1e-9
-        said = (
-            f"{front}the NIS is far from 1, from {since:.3g} s after the first on: up to"
-            f" {(sums / numbers).max():.3g} a number over {size} innovations, {mean:.3g} over all;"
-            " the noise, the clock, the start or the sensor is not as told"
-        )
-        return (note("warning", said),)
-    total = float(parts.sum())
-    if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
-        why = "the noise is told too small, or a clock is off"
-        return (note("warning", f"{front}the NIS is far from 1: {mean:.3g} a number; {why}"),)
-    if mean < 1.0 / FAR and len(values) >= FEW:
-        said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
-        return (note("warning", said),)
-    return ()
 
 
 def point_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:

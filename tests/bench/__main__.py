@@ -20,6 +20,7 @@ from tests.bench import (
     generated_c,
     imports,
     inertial,
+    lanes,
     many,
     pages,
     particles,
@@ -48,6 +49,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "resampling": (particles.resampling, {"sizes": (100,), "repeats": 1}),
     "normals-xla": (random.in_xla, {"ticks": 20, "repeats": 1}),
     "normals-python": (random.in_numpy, {"ticks": 5, "repeats": 1}),
+    "lanes-c": (lanes.rows, {"duration": 2.0, "repeats": 1}),
     "many-runs": (many.rows, {"runs": 16, "duration": 2.0}),
     "study-seeds": (
         studies.seeds_of_ekf,

@@ -57,7 +57,7 @@ def test_each_pass_can_be_left_out(name, left_out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("alone", REWRITING)
-@pytest.mark.parametrize("name", LIBRARY)
+@pytest.mark.parametrize("name", VARIED)
 def test_each_pass_does_alone(name, alone):
     agrees(name, (alone,))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from flowgraph.engines.c.nodes import Node
+from flowgraph.engines.c.nodes import Buffer, Node
 from flowgraph.engines.c.syntax import ctype, number
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import FUNCTIONS
@@ -25,7 +25,7 @@ _INFIX = {
     "bitwise_xor": "^",
 }
 _LIBM = FUNCTIONS | {"floor", "ceil", "trunc"}
-_IN_LANES = ("exp", "log", "sin", "cos", "atan2")
+IN_LANES = ("exp", "log", "sin", "cos", "atan2")
 """Functions that have a form without branches, which vectorises: see `vector_math`."""
 _ARITHMETIC = {"add": "+", "subtract": "-", "multiply": "*"}
 
@@ -42,6 +42,22 @@ class Expressions:
         self.real, self.turn = real, turn
         self.helpers: set[str] = set()
         self.functions: dict[Any, tuple[str, str]] = {}
+
+    def ctype(self, dtype: str) -> str:
+        """The type of what a tick computes."""
+        return ctype(dtype, self.real)
+
+    def kind(self, buffer: Buffer) -> str:
+        """The type of the elements of a buffer."""
+        return self.ctype(buffer.dtype)
+
+    def const(self, value: Any, dtype: str) -> str:
+        """A known number as what a tick computes."""
+        return number(value, dtype, self.real)
+
+    def pick(self, dtype: str, mask: str, yes: str, no: str) -> str:
+        """One of two, by a truth."""
+        return f"{mask} ? {yes} : {no}"
 
     def helper(self, name: str) -> str:
         self.helpers.add(name)
@@ -93,7 +109,7 @@ class Expressions:
                 return args[0]
             return f"{args[0]} < 0 ? {self._arithmetic('subtract', dtype, ('0', args[0]))} : {args[0]}"
         if op in _LIBM and dtype == "real":
-            if node.space and op in _IN_LANES:
+            if node.space and op in IN_LANES:
                 return f"{self.helper('fg_' + op)}({', '.join(args)})"
             return f"{self.libm(op)}({', '.join(args)})"
         if op in ("floor", "ceil", "trunc", "round"):

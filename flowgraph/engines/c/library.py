@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, load
+from flowgraph.engines.c.compile import FLAGS, LOOPS, load
 from flowgraph.engines.c.loop import loop_text
 from flowgraph.engines.c.source import every_pattern, generate
 from flowgraph.pipeline.optimise import optimise
@@ -23,6 +23,8 @@ from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
 _CHUNK_BYTES = 16 * 2**20
 _MOST_TICKS = 65536
+_LONG = 512
+"""Turns of a loop: more than the entries of a covariance, so particles."""
 Structs = list[np.ndarray]
 Room = list[np.ndarray | None]
 
@@ -77,14 +79,56 @@ class State:
         return [self._seen[named[place]] for place in places]
 
 
-class Compiled:
+class Outputs:
+    """The outputs of a pipeline that was compiled: when they are present, and arrays to hold them.
+
+    Args:
+        pipeline: that is played.
+        real: float64 or float32.
+        source: its `presence_of` tells by a pattern of inputs what is present.
+    """
+
+    def __init__(self, pipeline: Pipeline, real: Any, source: Any) -> None:
+        self.pipeline, self.real, self.source = pipeline, np.dtype(real), source
+
+    def kind(self, dtype: str) -> np.dtype[Any]:
+        """What a leaf's numbers are kept as."""
+        return self.real if dtype == "real" else np.dtype(dtype)
+
+    def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
+        """For each output in how many ticks of these patterns it can be present, and whether it then is."""
+        counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
+        found = []
+        for port in range(len(self.pipeline.outputs)):
+            bits = [(n, *(p >> port & 1 for p in self.source.presence_of(k))) for k, n in counts.items()]
+            found.append((sum(n for n, _, may in bits if may), all(m == must for _, must, m in bits)))
+        return found
+
+    def present(self, key: np.ndarray, port: int) -> np.ndarray:
+        """(T,) bool: where an output is whose presence follows from the patterns alone."""
+        there = {int(k): bool(self.source.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
+        if len(set(there.values())) == 1:
+            return np.full(len(key), next(iter(there.values())))
+        return np.isin(key, [k for k, holds in there.items() if holds])
+
+    def room(self, port: int, *size: int, kept: Collection[str] | None = None) -> Room:
+        """Arrays (*size, ...) for the leaves of an output; None for one that is not among `kept`."""
+        return [
+            np.empty((*size, *leaf.shape), self.kind(leaf.dtype))
+            if kept is None or leaf.name in kept
+            else None
+            for leaf in self.pipeline.outputs[port].leaves
+        ]
+
+
+class Compiled(Outputs):
     """A pipeline in C, for one kind of real.
 
     Args:
         pipeline: what to play.
         real: float64 or float32.
         keys: the patterns of present inputs that come.
-        flags: of the compiler.
+        flags: of the compiler; those that suit the pipeline if left out.
         passes: of the optimiser.
 
     Raises:
@@ -96,25 +140,25 @@ class Compiled:
         pipeline: Pipeline,
         real: Any,
         keys: Sequence[int],
-        flags: tuple[str, ...] = FLAGS,
+        flags: tuple[str, ...] | None = None,
         passes: tuple[str, ...] = (),
     ) -> None:
-        self.pipeline, self.real = pipeline, np.dtype(real)
         every = every_pattern(pipeline) is not None
-        self.source = generate(
+        source = generate(
             pipeline,
-            self.real.name,
+            np.dtype(real).name,
             patterns=None if every else keys,
             tidy=lambda program: optimise(program, passes),
             checked=False,  # faults and what is not finite are looked for by whoever plays
         )
+        super().__init__(pipeline, real, source)
         m = self.source.names.module
         files = {
             f"{m}.h": self.source.header,
             f"{m}.c": self.source.source,
             "fg_loop.c": loop_text(pipeline, self.source),
         }
-        self._library = load(files, flags)
+        self._library = load(files, flags or (LOOPS if source.longest >= _LONG else FLAGS))
         self.play_ticks = self._library.fg_play
         self.play_ticks.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self.play_ticks.restype = None
@@ -138,17 +182,14 @@ class Compiled:
     ) -> np.dtype[Any]:
         """The struct that C lays out, as NumPy sees it."""
         fields: list[Any] = [
-            (n, self._kind(leaf.dtype), max(math.prod(leaf.shape), 1))
+            (n, self.kind(leaf.dtype), max(math.prod(leaf.shape), 1))
             if leaf.shape
-            else (n, self._kind(leaf.dtype))
+            else (n, self.kind(leaf.dtype))
             for n, leaf in zip(names, leaves, strict=False)
         ]
         if seed:
             fields.append(("fg_seed", np.uint32, 2))
         return np.dtype(fields or [("nothing", np.bool_)], align=True)
-
-    def _kind(self, dtype: str) -> np.dtype[Any]:
-        return self.real if dtype == "real" else np.dtype(dtype)
 
     def rows(self, inputs: Sequence[Sequence[np.ndarray]]) -> Structs:
         """For each input port its events, leaves (n, ...) each, as structs."""
@@ -167,31 +208,6 @@ class Compiled:
     def scratch(self) -> Structs:
         """Room for the struct of each output."""
         return [np.empty(1, s) for s in self._outputs]
-
-    def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
-        """For each output in how many ticks of these patterns it can be present, and whether it then is."""
-        counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
-        found = []
-        for port in range(len(self.pipeline.outputs)):
-            bits = [(n, *(p >> port & 1 for p in self.source.presence_of(k))) for k, n in counts.items()]
-            found.append((sum(n for n, _, may in bits if may), all(m == must for _, must, m in bits)))
-        return found
-
-    def present(self, key: np.ndarray, port: int) -> np.ndarray:
-        """(T,) bool: where an output is whose presence follows from the patterns alone."""
-        there = {int(k): bool(self.source.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
-        if len(set(there.values())) == 1:
-            return np.full(len(key), next(iter(there.values())))
-        return np.isin(key, [k for k, holds in there.items() if holds])
-
-    def room(self, port: int, *size: int, kept: Collection[str] | None = None) -> Room:
-        """Arrays (*size, ...) for the leaves of an output; None for one that is not among `kept`."""
-        return [
-            np.empty((*size, *leaf.shape), self._kind(leaf.dtype))
-            if kept is None or leaf.name in kept
-            else None
-            for leaf in self.pipeline.outputs[port].leaves
-        ]
 
     def advance(
         self, state: State, time: np.ndarray, key: np.ndarray, rows: Structs, rooms: Sequence[Room]

@@ -27,7 +27,7 @@ def element(w: Lines, view: View, index: Sequence[str]) -> str:
     return w.at(view.buffer, " + ".join(terms))
 
 
-class _Loops:
+class Loops:
     """Opens loops over axes and closes them again."""
 
     def __init__(self, w: Lines, sizes: Sequence[int], letter: str = "b") -> None:
@@ -54,18 +54,18 @@ def _pointer(w: Lines, view: View, batch: Sequence[str]) -> str:
     return "&" + element(w, view, list(batch))
 
 
-def _index(strides: Sequence[int], names: Sequence[str]) -> str:
+def index(strides: Sequence[int], names: Sequence[str]) -> str:
     """An index into a matrix."""
     terms = [n if s == 1 else f"{s} * {n}" for s, n in zip(strides, names, strict=True) if s]
     return " + ".join(terms) or "0"
 
 
-def _call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
+def call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
     """Call the function for these sizes and strides, which a file has once, for each of the batch."""
     views = [*m.inputs, m.output]
     key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
     name = w.write.function(key, kind, make, *views)
-    with _Loops(w, m.output.shape[:-2]) as batch:
+    with Loops(w, m.output.shape[:-2]) as batch:
         w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
 
 
@@ -74,9 +74,9 @@ def _matmul(w: Lines, m: Macro) -> None:
 
     def text(name: str, a: View, b: View, out: View) -> str:
         rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
-        left = _index(a.strides[-2:], ("i", "k"))
-        right = _index(b.strides[-2:], ("k", "j"))
-        made = _index(out.strides[-2:], ("i", "j"))
+        left = index(a.strides[-2:], ("i", "k"))
+        right = index(b.strides[-2:], ("k", "j"))
+        made = index(out.strides[-2:], ("i", "j"))
         turned = b.strides[-1] != 1 and columns > 1
         copy = f"""    {type_} turned[{inner * columns}];
     for (int32_t k = 0; k < {inner}; k++)
@@ -98,14 +98,14 @@ static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b
 }}
 """
 
-    _call(w, "matmul", m, text, type_)
+    call(w, "matmul", m, text, type_)
 
 
 def _cholesky(w: Lines, m: Macro) -> None:
     real, helper = w.write.real, w.write.helper("fg_cholesky")
 
     def text(name: str, a: View, out: View) -> str:
-        n, at = out.shape[-1], _index(a.strides[-2:], "ij")
+        n, at = out.shape[-1], index(a.strides[-2:], "ij")
         return f"""/* lower factor of ({n} x {n}) */
 static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
 {{
@@ -114,11 +114,11 @@ static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
         for (int32_t j = 0; j < {n}; j++) factor[{n} * i + j] = j <= i ? a[{at}] : 0;
     {helper}(factor, {n});
     for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {n}; j++) out[{_index(out.strides[-2:], "ij")}] = factor[{n} * i + j];
+        for (int32_t j = 0; j < {n}; j++) out[{index(out.strides[-2:], "ij")}] = factor[{n} * i + j];
 }}
 """
 
-    _call(w, "cholesky", m, text)
+    call(w, "cholesky", m, text)
 
 
 def _solve(w: Lines, m: Macro) -> None:
@@ -126,36 +126,36 @@ def _solve(w: Lines, m: Macro) -> None:
 
     def text(name: str, a: View, b: View, out: View) -> str:
         n, columns = out.shape[-2:]
-        made = _index(out.strides[-2:], "ij")
+        made = index(out.strides[-2:], "ij")
         return f"""/* ({n} x {n}) x = ({n} x {columns}) */
 static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
 {{
     {real} matrix[{n * n}], right[{n * columns}];
     for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{_index(a.strides[-2:], "ij")}];
+        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{index(a.strides[-2:], "ij")}];
     for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{_index(b.strides[-2:], "ij")}];
+        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{index(b.strides[-2:], "ij")}];
     {helper}(matrix, right, {n}, {columns});
     for (int32_t i = 0; i < {n}; i++)
         for (int32_t j = 0; j < {columns}; j++) out[{made}] = right[{columns} * i + j];
 }}
 """
 
-    _call(w, "solve", m, text)
+    call(w, "solve", m, text)
 
 
 def _reduce(w: Lines, m: Macro) -> None:
     (x,), out, axes = m.inputs, m.output, m.extra["axes"]
     kind, dtype = m.extra["joins"], out.buffer.dtype
     kept = [k for k in range(len(x.shape)) if k not in axes]
-    with _Loops(w, [x.shape[k] for k in kept], "r") as outer:
+    with Loops(w, [x.shape[k] for k in kept], "r") as outer:
         w.line("{")
         w.depth += 1
         first = [dict(zip(kept, outer, strict=True)).get(k, "0") for k in range(len(x.shape))]
         c = ctype(dtype, w.write.real)
         start = {"sum": "0", "prod": "1", "any": "0", "all": "1"}.get(kind) or element(w, x, first)
         w.line(f"{c} total = {start};")
-        with _Loops(w, [x.shape[k] for k in axes], "k") as inner:
+        with Loops(w, [x.shape[k] for k in axes], "k") as inner:
             at = dict(zip(kept, outer, strict=True)) | dict(zip(axes, inner, strict=True))
             w.line(f"const {c} term = {element(w, x, [at[k] for k in range(len(x.shape))])};")
             if kind in ("max", "min"):
@@ -174,7 +174,7 @@ def _reduce(w: Lines, m: Macro) -> None:
         w.line("}")
 
 
-def _lines(w: Lines, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[str], str], str]]:
+def _lines(w: Lines, m: Macro, axis: int) -> tuple[Loops, Callable[[View, list[str], str], str]]:
     """Loops over all axes but one, and how an element along that one is written."""
     shape = m.inputs[0].shape
     others = [n for k, n in enumerate(shape) if k != axis]
@@ -183,7 +183,7 @@ def _lines(w: Lines, m: Macro, axis: int) -> tuple[_Loops, Callable[[View, list[
         short = len(view.shape) < len(shape)
         return element(w, view, outer if short else [*outer[:axis], inner, *outer[axis:]])
 
-    return _Loops(w, others, "r"), at
+    return Loops(w, others, "r"), at
 
 
 def _cumulative(w: Lines, m: Macro) -> None:
@@ -194,7 +194,7 @@ def _cumulative(w: Lines, m: Macro) -> None:
         w.line("{")
         w.depth += 1
         w.line(f"{c} total = 0;")
-        with _Loops(w, (m.inputs[0].shape[axis],), "k") as (k,):
+        with Loops(w, (m.inputs[0].shape[axis],), "k") as (k,):
             term = at(m.inputs[0], outer, k)
             if dtype in ("int32", "int64"):
                 wide = f"uint{dtype[3:]}_t"
@@ -217,7 +217,7 @@ def _place(w: Lines, m: Macro) -> None:
         w.depth += 1
         w.line("int64_t place = 0;")
         w.line(f"{c} best = {at(x, outer, '0')};")
-        with _Loops(w, (x.shape[axis],), "k") as (k,):
+        with Loops(w, (x.shape[axis],), "k") as (k,):
             w.line(f"const {c} term = {at(x, outer, k)};")
             nan = " || (term != term && best == best)" if x.buffer.dtype == "real" else ""
             w.line(f"if (term {sign} best{nan}) {{ best = term; place = {k}; }}")

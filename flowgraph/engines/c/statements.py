@@ -11,7 +11,7 @@ from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.macros import write_macro
 from flowgraph.engines.c.nodes import Buffer, Macro, Node, Space, Store
 from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
-from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.engines.c.syntax import comment, number
 from flowgraph.recorder.ops import FUNCTIONS
 
 _SHORT = 50  # characters of an expression that is written where it is used
@@ -57,7 +57,7 @@ class Writer(Lines):
             self._note("state that was still in use until here")
             self._copy(buffer, stand_in)
         for store in self.ends:
-            self.line(f"{self.at(store.buffer, str(store.offset))} = {self.ref(store.node)};")
+            self.line(f"{self.at(store.buffer, str(store.offset))} = {self.stored(store)};")
         return self.lines
 
     def _note(self, text: str) -> None:
@@ -71,9 +71,9 @@ class Writer(Lines):
         for item in self.straight[level]:
             if isinstance(item, Macro):
                 self._note(item.origin)
-                write_macro(self, item)
+                self.macro(item)
             elif isinstance(item, Store):
-                self.line(f"{self.at(item.buffer, str(item.offset))} = {self.ref(item.node)};")
+                self.line(f"{self.at(item.buffer, str(item.offset))} = {self.stored(item)};")
             elif item.op not in ("const", "given", "reduce"):
                 self._compute(item, self.uniform)
 
@@ -93,7 +93,7 @@ class Writer(Lines):
         if node.op not in REPEATED:
             self._note(node.origin)
         names[node] = f"v{node.order}"
-        self.line(f"const {ctype(node.dtype, self.write.real)} v{node.order} = {text};")
+        self.line(f"const {self.type_of(node)} v{node.order} = {text};")
 
     def _reads_memory(self, node: Node) -> bool:
         if node.op not in ("load", "gather", "search"):
@@ -108,17 +108,13 @@ class Writer(Lines):
         for node in reductions:
             self.uniform[node] = f"v{node.order}"
             kind = node.extra[0]
-            self.line(f"{self._sum_type(node)} v{node.order} = {self._start(kind, node.dtype)};")
+            self.line(f"{self.sum_type(node)} v{node.order} = {self.start(kind, node.dtype)};")
             if kind in ("max", "min") and node.dtype == "real":
-                self.line(f"int n{node.order} = 0;")
-        clauses = "".join(self._clause(n) for n in reductions)
-        gathers = any(isinstance(i, Node) and i.op == "search" for i in items)
+                self.line(f"{self.flag_type} n{node.order} = {self.no_flag};")
         self.flat = len(space) > 1 and is_flat(items, space)
         sizes = (math.prod(space),) if self.flat else space
-        if len(sizes) == 1 and clauses:
-            self.line(f"FG_SIMD(omp simd{clauses})")
-        elif len(sizes) == 1 and not gathers:
-            self.line("FG_SIMD(omp simd)")
+        if len(sizes) == 1:
+            self.at_once(reductions, items)
         for k, n in enumerate(sizes):
             self.line(f"for (int32_t i{k} = 0; i{k} < {n}; i{k}++) {{")
             self.depth += 1
@@ -132,7 +128,7 @@ class Writer(Lines):
                 else:
                     self._store(item)
             elif item.op == "reduce":
-                self._accumulate(item)
+                self.accumulate(item)
             else:
                 self._compute(item, self.local)
         for node in [n for n in items if isinstance(n, Node) and n in self.plan.spills]:
@@ -146,14 +142,29 @@ class Writer(Lines):
         self.flat = False
         for node in reductions:
             if node.extra[0] in ("max", "min") and node.dtype == "real":
-                self.line(f"if (n{node.order}) v{node.order} = NAN;")
+                self.settle(node)
         self.local = {}
         self.place = ""
 
-    def _sum_type(self, node: Node) -> str:
-        return "int" if node.dtype == "bool" else ctype(node.dtype, self.write.real)
+    flag_type, no_flag = "int", "0"
+    """Of what remembers that there was a NaN."""
 
-    def _start(self, kind: str, dtype: str) -> str:
+    def macro(self, item: Macro) -> None:
+        """Write an operation that has loops of its own."""
+        write_macro(self, item)
+
+    def at_once(self, reductions: list[Node], items: list[Node | Store]) -> None:
+        """Say that the turns of the next loop may be done together, where they may."""
+        clauses = "".join(self._clause(n) for n in reductions)
+        if clauses or not any(isinstance(i, Node) and i.op == "search" for i in items):
+            self.line(f"FG_SIMD(omp simd{clauses})")
+
+    def sum_type(self, node: Node) -> str:
+        """The type of what a loop sums up."""
+        return "int" if node.dtype == "bool" else self.type_of(node)
+
+    def start(self, kind: str, dtype: str) -> str:
+        """What a sum, or the like, begins with."""
         if kind in ("sum", "any"):
             return "0"
         if kind in ("prod", "all"):
@@ -171,7 +182,12 @@ class Writer(Lines):
         more = f" reduction(|:n{node.order})" if kind in ("max", "min") and node.dtype == "real" else ""
         return f" reduction({sign}:{name}){more}"
 
-    def _accumulate(self, node: Node) -> None:
+    def settle(self, node: Node) -> None:
+        """After the loop: the extreme of what holds a NaN is NaN."""
+        self.line(f"if (n{node.order}) v{node.order} = NAN;")
+
+    def accumulate(self, node: Node) -> None:
+        """One turn of a sum, or the like."""
         kind, name, value = node.extra[0], f"v{node.order}", self.ref(node.args[0])
         if kind in ("sum", "prod"):
             sign = "+" if kind == "sum" else "*"
@@ -190,7 +206,7 @@ class Writer(Lines):
 
     def _store(self, item: Store) -> None:
         buffer = self.plan.late.get(item.buffer, item.buffer)
-        self.line(f"{self.at(buffer, self.index(item.offset, item.strides))} = {self.ref(item.node)};")
+        self.line(f"{self.at(buffer, self.index(item.offset, item.strides))} = {self.stored(item)};")
 
     def _spilled(self, node: Node) -> str:
         return self.at(self.plan.spills[node], self.index(0, strides_of(node.space)))
@@ -218,6 +234,14 @@ class Writer(Lines):
             terms = [str(offset), *terms] if offset >= 0 or not terms else [*terms, f"({offset})"]
         return " + ".join(terms)
 
+    def type_of(self, node: Node) -> str:
+        """The type of a node's variable."""
+        return self.write.ctype(node.dtype)
+
+    def stored(self, item: Store) -> str:
+        """What a store writes, in the type of its buffer."""
+        return self.ref(item.node)
+
     def ref(self, node: Node) -> str:
         """How a node is called here."""
         if node.op == "const":
@@ -229,9 +253,7 @@ class Writer(Lines):
         if node not in self.local:
             if node.op in REPEATED:
                 self.local[node] = f"v{node.order}"
-                self.line(
-                    f"const {ctype(node.dtype, self.write.real)} v{node.order} = {self.expression(node)};"
-                )
+                self.line(f"const {self.type_of(node)} v{node.order} = {self.expression(node)};")
             else:
                 self.local[node] = self._spilled(node)
         return self.local[node]
