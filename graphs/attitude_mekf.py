@@ -17,15 +17,18 @@ Fiszel's thesis (2017), sections on control inputs and magnetometer. The equatio
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
+from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import attitude_errors
+from flowgraph.blocks.models.recordings import turn_recording
 from flowgraph.blocks.orientation.commanded import (
     TURN,
     attitude_belief,
@@ -34,8 +37,10 @@ from flowgraph.blocks.orientation.commanded import (
     predict_turn,
     see_attitude,
     start_turn,
+    turn_crossing,
+    turn_steps,
 )
-from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, BodyRate, Gaussian
@@ -57,6 +62,7 @@ def attitude_mekf(
     robust: Robust | None = None,
     adaptive: float | None = None,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """Multiplicative extended Kalman filter: commanded body rate, corrected by measured attitudes.
 
@@ -64,7 +70,8 @@ def attitude_mekf(
     `reading` of the rate is of an "instant", and a step is driven by the mean of the two at its ends; or it
     is the "mean" over the time since the one before. Before the first, the vehicle is still.
 
-    Collected: `belief` at every tick, and the `innovation` at every measured attitude.
+    Collected: `belief` at every tick, and the `innovation` at every measured attitude; with `smoothing` what
+    a smoother needs too.
     """
     belief = delay(start, name="belief")
     last = delay(_STILL, name="last_rate")
@@ -72,6 +79,8 @@ def attitude_mekf(
     drive = rate if reading == "mean" else between_rates(last, rate)
     prior = predict_turn(belief, drive, noise=rate_noise, name="predict")
     prior = bridged(belief, prior, body_rate, held=held, attitude=0)
+    if smoothing:
+        collect_steps(belief, prior, drive, crossing=turn_crossing, held=held)
     scale = scale_of(adaptive, "attitude")
     posterior, innovation = update_extended(
         prior,
@@ -91,6 +100,8 @@ def attitude_mekf(
     belief.feed(posterior)
     last.feed(rate)
     collect(innovation, "innovation")
+    if smoothing:
+        collect(posterior, "posterior")
     return {"belief": attitude_belief(posterior)}
 
 
@@ -106,7 +117,7 @@ def for_flight(
     attitude_noise: Positive | None = None,
     control: HeldControl,
     gated: Adapted,
-    scored: Scored,
+    scored: Smoothed,
 ) -> Case:
     """Start the filter on a flight with commanded body rates and measured attitudes, at the first of these.
 
@@ -125,12 +136,13 @@ def for_flight(
     told = on.flight.info.get("noise", {})
     own = [told.get(name, {}).get("noise") for name in _STREAMS]
     step = float(np.median(np.diff(rate.time))) * 1e-9 if len(rate) > 1 else 1.0
-    return on.case(
-        scored.score(on, attitude_errors),
-        start=start_turn(seen["attitude"][0]),
-        rate_noise=on.noise("rate_noise", rate_noise, own[0]) * math.sqrt(step),
-        attitude_noise=on.noise("attitude_noise", attitude_noise, own[1]),
-        reading=reading_of(on.flight, "body_rate"),
-        held=control.held(on, rate, on.inputs),
-        **gated.gating(),
-    )
+    known: dict[str, Any] = {
+        "start": start_turn(seen["attitude"][0]),
+        "rate_noise": on.noise("rate_noise", rate_noise, own[0]) * math.sqrt(step),
+        "attitude_noise": on.noise("attitude_noise", attitude_noise, own[1]),
+        "reading": reading_of(on.flight, "body_rate"),
+        "held": control.held(on, rate, on.inputs),
+    }
+    recording = turn_recording(on.inputs, **known)
+    score = scored.score(on, attitude_errors, steps=turn_steps, recording=recording)
+    return on.case(score, smoothing=scored.smoothed, **known, **gated.gating())

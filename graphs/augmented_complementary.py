@@ -68,7 +68,12 @@ def augmented_complementary(
     return {"pose": pose}
 
 
-@on_flight(augmented_complementary, "imu", "vicon", told=with_imu, measured=None)
+_UNSMOOTHED = (
+    "its gains are set by hand, so nothing says how much of a later correction belongs to an earlier time"
+)
+
+
+@on_flight(augmented_complementary, "imu", "vicon", told=with_imu, measured=None, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

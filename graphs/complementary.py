@@ -78,8 +78,19 @@ def complementary(
     return {"attitude": attitude, "gyroscope": turned}
 
 
+_UNSMOOTHED = (
+    "its gains are set by hand, so nothing says how much of a later correction belongs to an earlier time"
+)
+
+
 @on_flight(
-    complementary, "gyro", "accelerometer", told=with_parts, measured=None, fix="choose a flight with an imu"
+    complementary,
+    "gyro",
+    "accelerometer",
+    told=with_parts,
+    measured=None,
+    fix="choose a flight with an imu",
+    unsmoothed=_UNSMOOTHED,
 )
 def for_flight(
     on: OnFlight,

@@ -32,6 +32,7 @@ from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
+from flowgraph.blocks.outdoor.tracks import track_files
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.outdoors import Outdoors
 from flowgraph.blocks.scoring.tuning import reading_of, with_imu
@@ -211,6 +212,10 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
         "gravity": world.gravity,
         "earth": world.earth,
         "held": filter.held(on, inputs["imu"], inputs),
+        "north": filter.north(on, world) if "magnetometer" in inputs else 0.0,
+        "compass_noise": filter.compass_noise,
+        "speed_noise": filter.speed_noise,
+        "slip": filter.slip,
     }
     return on.case(
         filter.score(
@@ -220,10 +225,7 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
             recording=navigation_recording(inputs, reading=reading_of(on.flight), **known),
         ),
         inputs=inputs,
-        north=filter.north(on, world) if "magnetometer" in inputs else 0.0,
-        compass_noise=filter.compass_noise,
-        speed_noise=filter.speed_noise,
-        slip=filter.slip,
+        files=track_files(world.origin, on.flight.name, on.flight.truth),
         resting=filter.resting(),
         invariant=invariant,
         smoothing=filter.smoothed,

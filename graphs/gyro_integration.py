@@ -40,7 +40,10 @@ def gyro_integration(
     return {"attitude": attitude}
 
 
-@on_flight(gyro_integration, "imu", told=with_imu, measured=None)
+_UNSMOOTHED = "nothing corrects it, so the later readings say nothing of the earlier ones"
+
+
+@on_flight(gyro_integration, "imu", told=with_imu, measured=None, unsmoothed=_UNSMOOTHED)
 def for_flight(on: OnFlight, *, still: NotNegative | None = None, scored: Scored, started: Started) -> Case:
     """Start it on a flight with an inertial unit, level, with the heading of the truth if it has one.
 

@@ -63,7 +63,10 @@ def imu_calibration(
     return {"gyro": gyro, "force": force, "equations": equations, "window": window}
 
 
-@on_flight(imu_calibration, "counts", measured=None, ranged=False)
+_UNSMOOTHED = "what it finds stays the same all along, so its last belief is the smoothed one already"
+
+
+@on_flight(imu_calibration, "counts", measured=None, ranged=False, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

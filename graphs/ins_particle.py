@@ -114,7 +114,12 @@ def ins_particle(
     }
 
 
-@on_flight(ins_particle, "imu", told=with_imu)
+_UNSMOOTHED = (
+    "its particles are moved by the pose too, so the density of a step to go back by is not the motion's"
+)
+
+
+@on_flight(ins_particle, "imu", told=with_imu, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

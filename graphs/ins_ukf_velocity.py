@@ -13,7 +13,7 @@ Source: the report's second filter. Equations: `blocks/models/euler_ins.py` and
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -25,12 +25,12 @@ from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian, with_heading
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
-from flowgraph.blocks.scoring.euler import EulerKalman, FarPoints
+from flowgraph.blocks.scoring.euler import EulerVelocity, FarPoints
 from flowgraph.blocks.scoring.settings import Positive, named
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, with_imu
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu
-from flowgraph.blocks.unscented.filters import predict_unscented
+from flowgraph.blocks.unscented.filters import predict_unscented, unscented_crossing
 from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.graphs.euler_loop import euler_loop
@@ -38,7 +38,7 @@ from flowgraph.graphs.euler_loop import euler_loop
 FAR = (far_points(12), far_points(6))
 """Of the state and the IMU's noises, and of the state and those of the camera's velocity."""
 
-_REPORTS = EulerKalman(order="zyx")
+_REPORTS = EulerVelocity(order="zyx")
 
 
 @graph
@@ -61,20 +61,21 @@ def ins_ukf_velocity(
     robust: Robust | None = None,
     adaptive: float | None = None,
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
 
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
-    Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity.
+    Collected: `belief` and `angles` at every tick, and the `innovation` at every camera velocity; with
+    `smoothing` what a smoother needs too.
     """
-    predict = lambda belief, drive: predict_unscented(
-        belief, drive, move=carried(order, gravity), noise=np.diag(increment_variances(noise)), space=STATE,
-        points=points[0], name="predict",
-    )  # fmt: skip
+    moving: dict[str, Any] = {"move": carried(order, gravity), "noise": np.diag(increment_variances(noise))}
+    moving |= {"space": STATE, "points": points[0]}
     return euler_loop(
         imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience,
         adaptive=adaptive, held=held, gravity=gravity,
-        predict=predict,
+        crossing=unscented_crossing(**moving) if smoothing else None,
+        predict=lambda belief, drive: predict_unscented(belief, drive, name="predict", **moving),
         update=lambda prior, control, scale: update_camera_velocity(
             prior, motion, control, scale, order=order, mount=mount, velocity_noise=velocity_noise,
             rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, robust=robust, name="update",
@@ -89,7 +90,7 @@ def for_flight(
     rate: Annotated[str, named("source of the rate", RATES)] = "gyro",
     velocity_noise: Positive = 0.1,
     rate_noise: Positive | None = None,
-    filter: EulerKalman = _REPORTS,
+    filter: EulerVelocity = _REPORTS,
     sigma: FarPoints,
     started: Started,
 ) -> Case:
@@ -135,4 +136,5 @@ def for_flight(
         rate_noise=given(rate_noise, {"gyro": 0.02, "camera": 0.2}[rate]),
         rate=rate,
         points=(sigma.points(12), sigma.points(6)),
+        smoothing=filter.smoothed,
     )

@@ -93,7 +93,13 @@ def marg(
     return {"belief": join_orientation(level, found, name="belief"), "rest": still, "heading": found}
 
 
-@on_flight(marg, "imu", "magnetometer", measured=None)
+_UNSMOOTHED = (
+    "its heading is filtered on what its tilt has come to, which is no one belief that a"
+    " smoother goes back over"
+)
+
+
+@on_flight(marg, "imu", "magnetometer", measured=None, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

@@ -99,7 +99,14 @@ _STREAMS = ("gyro", "coordinate_acceleration", "thrust")
 _FIX = f"simulated, with the sensors: --data sim:thesis --set sensors={','.join(_STREAMS)}"
 
 
-@on_flight(orientation_complementary, *_STREAMS, told=with_parts, measured=None, fix=_FIX)
+_UNSMOOTHED = (
+    "its gains are set by hand, so nothing says how much of a later correction belongs to an earlier time"
+)
+
+
+@on_flight(
+    orientation_complementary, *_STREAMS, told=with_parts, measured=None, fix=_FIX, unsmoothed=_UNSMOOTHED
+)
 def for_flight(
     on: OnFlight,
     *,

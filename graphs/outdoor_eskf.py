@@ -11,6 +11,8 @@ Roumeliotis and J. W. Burdick, "Stochastic cloning", ICRA 2002. The equations st
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,7 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor.recording import outdoor_recording
 from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
@@ -48,11 +51,11 @@ from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, 
 @graph
 def outdoor_eskf(
     imu: Stream[Imu],
-    gps: Stream[Position],
-    gps2: Stream[Position],
-    altimeter: Stream[Range],
-    magnetometer: Stream[MagneticField],
-    optical_flow: Stream[OpticalFlow],
+    gps: Stream[Position] | None = None,
+    gps2: Stream[Position] | None = None,
+    altimeter: Stream[Range] | None = None,
+    magnetometer: Stream[MagneticField] | None = None,
+    optical_flow: Stream[OpticalFlow] | None = None,
     *,
     start: Gaussian,
     sensors: OutdoorSensors,
@@ -66,14 +69,16 @@ def outdoor_eskf(
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
-    A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
+    Of the sensors beside the IMU any are there. A `reading` of the IMU is of an "instant", or the "mean" over
+    the time since the one before (`driving`).
     Collected: `belief` at every tick, and the innovation of each sensor where there was a reading;
     with `smoothing` what a smoother needs too.
     """
     s = sensors
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
-    ticks = imu | gps | gps2 | altimeter | magnetometer | optical_flow
+    aids = [aid for aid in (gps, gps2, altimeter, magnetometer, optical_flow) if aid is not None]
+    ticks = functools.reduce(operator.or_, aids, imu)
     control = latest(imu, init=Imu.at_rest(), at=ticks, name="control")
     drive = driving(last, control, reading)
     now = predict_clone(belief, drive, noise=s.imu, name="predict")
@@ -98,34 +103,33 @@ def outdoor_eskf(
             lost = {"moving": (6, 9), "attitude": 6}
         return find_back(now, innovation, patience=patience, name=f"find_back_{name}", **lost)
 
-    readings: dict[str, tuple[Stream, Any, float]] = {
-        "gps": (gps.map(lambda z: z.position), PositionObserver(s.gps_lever), s.gps),
-        "gps2": (gps2.map(lambda z: z.position), PositionObserver(s.gps2_lever), s.gps2),
-        "magnetometer": (
-            magnetometer.map(lambda z: z.field / s.magnetometer), FieldObserver(s.field, s.magnetometer), 1.0,
-        ),
-    }  # fmt: skip
-    for name, (seen, observe, noise) in readings.items():
-        R = np.eye(3) * noise**2
-        now, innovation = update_extended(
-            now, seen, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}", **trust(name)
-        )
-        now = told(now, innovation, name)
-    now, innovation = update_extended(
-        now, altimeter.map(lambda z: z.distance[..., None]),
-        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, name="fuse_altimeter",
-        **trust("altimeter"),
-    )  # fmt: skip
-    now = told(now, innovation, "altimeter")
-    now, innovation = update_extended(
-        now, optical_flow.map(flow_vector), observe=observe_flow, name="fuse_flow", measured_space=FLOW,
-        R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, **trust("optical_flow"),
-    )  # fmt: skip
-    now = told(now, innovation, "optical_flow")
+    def fused(now: Stream[Gaussian], seen: Any, name: str, block: str, **sees: Any) -> Stream[Gaussian]:
+        now, innovation = update_extended(now, seen, space=OUTDOOR, name=block, **trust(name), **sees)
+        return told(now, innovation, name)
+
+    for name, seen, lever in (("gps", gps, s.gps_lever), ("gps2", gps2, s.gps2_lever)):
+        if seen is not None:
+            R, place = np.eye(3) * s.noise(name) ** 2, seen.map(lambda z: z.position)
+            now = fused(now, place, name, f"fuse_{name}", observe=PositionObserver(lever), R=R)
+    if magnetometer is not None:
+        tesla = s.noise("magnetometer")
+        seen = magnetometer.map(lambda z: z.field / tesla)
+        sees = FieldObserver(s.field, tesla)
+        now = fused(now, seen, "magnetometer", "fuse_magnetometer", observe=sees, R=np.eye(3))
+    if altimeter is not None:
+        seen, R = altimeter.map(lambda z: z.distance[..., None]), [[s.noise("altimeter") ** 2]]
+        now = fused(now, seen, "altimeter", "fuse_altimeter", observe=observe_distance, R=R)
+    if optical_flow is not None:
+        R = np.diag(np.repeat(np.square([s.noise("displacement"), s.noise("turn")]), 3))
+        now = fused(
+            now, optical_flow.map(flow_vector), "optical_flow", "fuse_flow", observe=observe_flow, R=R,
+            measured_space=FLOW,
+        )  # fmt: skip
     if smoothing:  # what is smoothed has the clone that its readings were measured from
         collect(now, "posterior")
-        taken.feed(picture_cross(now, optical_flow, name="picture_cross"))
-    now = new_picture(now, optical_flow, name="picture")
+        taken.feed(now if optical_flow is None else picture_cross(now, optical_flow, name="picture_cross"))
+    if optical_flow is not None:
+        now = new_picture(now, optical_flow, name="picture")
     last.feed(control)
     belief.feed(now)
     return {"belief": outdoor_pose(now)}
@@ -138,15 +142,14 @@ def for_flight(on: OnFlight, *, gated: Adapted, control: HeldControl, scored: Sm
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
     """
-    inputs, sensors, first = outdoor_flight(on.flight, on.name)
-    score = scored.score(on, pose_errors, steps=outdoor_steps)
-    return on.case(
-        score,
-        inputs=inputs,
-        start=start_outdoor(first),
-        sensors=sensors,
-        reading=reading_of(on.flight),
-        smoothing=scored.smoothed,
-        held=control.held(on, inputs["imu"], inputs),
-        **gated.gating(),
-    )
+    inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
+    on.notes.extend(notes)
+    known: dict[str, Any] = {
+        "start": start_outdoor(first),
+        "sensors": sensors,
+        "reading": reading_of(on.flight),
+        "held": control.held(on, inputs["imu"], inputs),
+    }
+    recording = outdoor_recording(inputs, **known)
+    score = scored.score(on, pose_errors, steps=outdoor_steps, recording=recording)
+    return on.case(score, inputs=inputs, smoothing=scored.smoothed, **known, **gated.gating())

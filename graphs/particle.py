@@ -15,6 +15,8 @@ Gordon, D. Salmond and A. Smith, IEE Proceedings F 140(2), 1993. The blocks stan
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest, merge
@@ -22,15 +24,17 @@ from flowgraph.blocks.kalman.lost import Held, stay
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.plane import (
     average_plane,
+    cloud_steps,
     move_plane,
     plane_sample_size,
+    plane_states,
     resample_plane,
     start_plane,
     weigh_plane,
 )
 from flowgraph.blocks.models.spread import spread_plane
 from flowgraph.blocks.particles.lost import depletion
-from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.cases import HeldControl, OnFlight, Particles, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.signals import PlaneCloud, PlanePosition, PlaneVelocity
 
@@ -47,12 +51,13 @@ def particle(
     scheme: str = "systematic",
     draws: str = "particle",
     held: Held | None = None,
+    smoothing: bool = False,
 ):
     """Bootstrap particle filter of a point in the plane.
 
     Every tick moves the cloud to now; a tick with a position also weighs it and may resample it. Collected:
     `belief` at every tick, averaged before resampling; `effective_sample_size`, `depleted` and `ancestors`
-    at every position.
+    at every position; with `smoothing` the `cloud` of each tick and the `control` of the step to it.
     """
     cloud = delay(start, name="cloud")
     control = latest(velocity, init=PlaneVelocity(velocity=np.zeros(2)), name="control")
@@ -69,7 +74,11 @@ def particle(
     )
     cloud.feed(merge(fresh, moved, tie="left", name="next"))
     collect(depletion(size, numbers=2), "depleted")
-    belief = average_plane(merge(weighed, moved, tie="left", name="now"), name="average")
+    now = merge(weighed, moved, tie="left", name="now")
+    belief = average_plane(now, name="average")
+    if smoothing:
+        collect(plane_states(now, name="states"), "cloud")
+        collect(latest(velocity, init=PlaneVelocity(velocity=np.zeros(2)), at=velocity | position), "control")
     return {"belief": belief, "effective_sample_size": size, "ancestors": ancestors}
 
 
@@ -82,7 +91,7 @@ def for_flight(
     position_noise: Positive | None = None,
     spread: Positive = 1.0,
     control: HeldControl,
-    scored: Scored,
+    scored: Smoothed,
 ) -> Case:
     """Start the filter on a flight in the plane, such as `sim:plane`, about the origin.
 
@@ -95,11 +104,17 @@ def for_flight(
     Raises:
         DataError: where the flight lacks a stream; DeclarationError: for a setting that is out of range.
     """
+    noise = on.noise("velocity_noise", velocity_noise)
+    score = scored.score(
+        on, plane_errors, steps=partial(cloud_steps, noise=noise),
+        recording="its start is a cloud; tracker is a filter of the same point that has one",
+    )  # fmt: skip
     return on.case(
-        scored.score(on, plane_errors),
+        score,
         start=start_plane(cloud.particles, seed=cloud.seed, spread=spread),
-        velocity_noise=on.noise("velocity_noise", velocity_noise),
+        velocity_noise=noise,
         position_noise=on.noise("position_noise", position_noise),
         held=control.held(on, on.inputs["velocity"]),
+        smoothing=scored.smoothed,
         **cloud.resampling(),
     )

@@ -22,18 +22,21 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
-from flowgraph.blocks.kalman.lost import PATIENCE, find_back, stay
+from flowgraph.blocks.kalman.backward import collect_steps
+from flowgraph.blocks.kalman.lost import PATIENCE, Held, find_back, stay
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
     named_orientation,
+    orientation_crossing,
+    orientation_steps,
     see_rate_and_gravity,
     stacked_imu,
     start_orientation,
     turn_by_rate,
 )
-from flowgraph.blocks.scoring.cases import OnFlight, Scored, Weighed, on_flight
+from flowgraph.blocks.scoring.cases import OnFlight, Smoothed, Weighed, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
@@ -62,6 +65,7 @@ def quaternion_ukf(
     patience: int = PATIENCE,
     robust: Robust | None = None,
     longest: float | None = None,
+    smoothing: bool = False,
 ):
     """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
 
@@ -69,24 +73,28 @@ def quaternion_ukf(
     `force_noise` (m/s^2) are standard deviations of a reading, the latter with all that accelerates the body.
     When the body stands `still` for some seconds at first, with its vertical along `up`, what the unit reads
     then is its bias. A gyroscope that is `frozen` for so many seconds is taken to read nothing.
-    Collected: `belief` and `innovation` at every reading.
+    Collected: `belief` and `innovation` at every reading; with `smoothing` what a smoother needs too.
     """
     if still > 0.0:
         imu = subtract_rest_bias(imu, seconds=still, up=up, name="calibrate")
     if frozen > 0.0:
         imu = silence_frozen_gyro(imu, seconds=frozen, name="thaw")
     belief = delay(start, name="belief")
+    Q = np.diag(np.repeat([attitude_walk, rate_walk], 3) ** 2)
     prior = predict_unscented(
         belief,
         imu,
         move=turn_by_rate,
-        Q=np.diag(np.repeat([attitude_walk, rate_walk], 3) ** 2),
+        Q=Q,
         Q_first=True,
         space=STATE,
         points=points,
     )
     if longest is not None:
         prior = stay(belief, prior, longest=longest)
+    if smoothing:
+        held = None if longest is None else Held(after=longest, longest=longest)
+        collect_steps(belief, prior, imu, crossing=orientation_crossing(Q, points), held=held)
     posterior, innovation = update_unscented(
         prior,
         stacked_imu(imu, name="reading"),
@@ -101,6 +109,8 @@ def quaternion_ukf(
         posterior = find_back(posterior, innovation, patience=patience, moving=6, attitude=0)
     belief.feed(posterior)
     collect(innovation, "innovation")
+    if smoothing:
+        collect(posterior, "posterior")
     return {"belief": named_orientation(posterior)}
 
 
@@ -120,7 +130,7 @@ def for_flight(
     still: NotNegative | None = None,
     frozen: NotNegative | None = None,
     gated: Weighed,
-    scored: Scored,
+    scored: Smoothed,
     started: Started,
 ) -> Case:
     """Start the filter on a flight with an inertial unit, level, with the heading of the truth if it has one.
@@ -148,8 +158,12 @@ def for_flight(
     if pose.heading is not None:
         up = to_matrix(begin.attitude, xp=np)[2]  # the vertical, in the body
         start.covariance[:3, :3] += np.outer(up, up) * (pose.heading**2 - up @ start.covariance[:3, :3] @ up)
+    score = scored.score(
+        on, orientation_errors, innovations=False, steps=orientation_steps,
+        recording="its readings are calibrated in the run",
+    )  # fmt: skip
     return on.case(
-        scored.score(on, orientation_errors, innovations=False),
+        score,
         inputs=pose.inputs,
         start=start,
         attitude_walk=attitude_walk,
@@ -161,5 +175,6 @@ def for_flight(
         up=begin.up,
         frozen=after,
         longest=on.longest(),
+        smoothing=scored.smoothed,
         **gated.gating(),
     )

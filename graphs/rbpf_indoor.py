@@ -177,7 +177,12 @@ def rbpf_indoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_indoor, "imu", "vicon", told=with_imu)
+_UNSMOOTHED = (
+    "each particle has a Kalman filter of its own, and particles that are resampled take their past with them"
+)
+
+
+@on_flight(rbpf_indoor, "imu", "vicon", told=with_imu, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

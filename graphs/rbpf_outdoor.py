@@ -15,6 +15,9 @@ q_1, in the world). The equations stand in `blocks/outdoor/cloud.py` and
 
 from __future__ import annotations
 
+import functools
+import operator
+
 from flowgraph import Case, Stream, collect, delay, graph, latest, merge
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, stay
 from flowgraph.blocks.metrics.errors import pose_errors
@@ -54,11 +57,11 @@ def average(cloud: Stream[OutdoorCloud], plain: Stream[Cloud]):
 @graph
 def rbpf_outdoor(
     imu: Stream[Imu],
-    gps: Stream[Position],
-    gps2: Stream[Position],
-    altimeter: Stream[Range],
-    magnetometer: Stream[MagneticField],
-    optical_flow: Stream[OpticalFlow],
+    gps: Stream[Position] | None = None,
+    gps2: Stream[Position] | None = None,
+    altimeter: Stream[Range] | None = None,
+    magnetometer: Stream[MagneticField] | None = None,
+    optical_flow: Stream[OpticalFlow] | None = None,
     *,
     start: OutdoorCloud,
     sensors: OutdoorSensors,
@@ -74,6 +77,7 @@ def rbpf_outdoor(
 
     Every tick predicts to now, and then fuses each reading there is; where there is one, the cloud is
     resampled if its weights have become too uneven; where a picture is taken, each attitude is then drawn.
+    Of the sensors any are there; without optical flow the attitudes are drawn with the first of the others.
     A `reading` of the IMU is of an "instant", or the "mean" over the time since the one before (`driving`).
     With a gate, a reading that is too far from the cloud is refused; after `patience` readings of one sensor
     in a row the particles become as unsure as the reading was far, and believe it.
@@ -84,27 +88,34 @@ def rbpf_outdoor(
     s = sensors
     cloud = delay(start, name="cloud")
     last = delay(Imu.at_rest(), name="last_control")
-    seen = gps | gps2 | altimeter | magnetometer | optical_flow
+    aids = [aid for aid in (optical_flow, gps, gps2, altimeter, magnetometer) if aid is not None]
+    seen = functools.reduce(operator.or_, aids)
     control = latest(imu, init=Imu.at_rest(), at=imu | seen, name="control")
     now = predict_outdoor(cloud, driving(last, control, reading), noise=s.imu, name="predict")
     if held is not None:
         now = now if held.longest is None else stay(cloud, now, longest=held.longest)
         now = spread_outdoor(now, imu, held=held)
     gated = {"gate": gate, "patience": patience}
-    now, told = correct_position(now, gps, noise=s.gps, lever=s.gps_lever, **gated, name="fuse_gps")
-    collect(told, "gps_innovation")
-    now, told = correct_position(now, gps2, noise=s.gps2, lever=s.gps2_lever, **gated, name="fuse_gps2")
-    collect(told, "gps2_innovation")
-    now, told = correct_distance(now, altimeter, noise=s.altimeter, **gated, name="fuse_altimeter")
-    collect(told, "altimeter_innovation")
-    now, told = correct_field(
-        now, magnetometer, earth=s.field, noise=s.magnetometer, **gated, name="fuse_field"
-    )
-    collect(told, "magnetometer_innovation")
-    now, told = correct_flow(
-        now, optical_flow, displacement=s.displacement, turn=s.turn, **gated, name="fuse_flow"
-    )
-    collect(told, "optical_flow_innovation")
+    for name, place, lever in (("gps", gps, s.gps_lever), ("gps2", gps2, s.gps2_lever)):
+        if place is not None:
+            now, told = correct_position(
+                now, place, noise=s.noise(name), lever=lever, **gated, name=f"fuse_{name}"
+            )
+            collect(told, f"{name}_innovation")
+    if altimeter is not None:
+        noise = s.noise("altimeter")
+        now, told = correct_distance(now, altimeter, noise=noise, **gated, name="fuse_altimeter")
+        collect(told, "altimeter_innovation")
+    if magnetometer is not None:
+        noise = s.noise("magnetometer")
+        now, told = correct_field(now, magnetometer, earth=s.field, noise=noise, **gated, name="fuse_field")
+        collect(told, "magnetometer_innovation")
+    if optical_flow is not None:
+        moved, turned = s.noise("displacement"), s.noise("turn")
+        now, told = correct_flow(
+            now, optical_flow, displacement=moved, turn=turned, **gated, name="fuse_flow"
+        )
+        collect(told, "optical_flow_innovation")
 
     plain = as_cloud(now, name="plain")
     size = effective_sample_size(plain, at=seen, name="size")
@@ -112,7 +123,7 @@ def rbpf_outdoor(
         plain, size, below=resample_below, scheme=scheme, draws=f"{draws}.resample", at=seen, name="ancestors"
     )
     fresh = take_outdoor_ancestors(now, ancestors, at=seen, name="resample")
-    fresh = take_picture(fresh, optical_flow, draws=f"{draws}.attitude", name="picture")
+    fresh = take_picture(fresh, aids[0], draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
     pose, belief = average(now, plain)
@@ -121,7 +132,12 @@ def rbpf_outdoor(
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
 
-@on_flight(rbpf_outdoor)
+_UNSMOOTHED = (
+    "each particle has a Kalman filter of its own, and particles that are resampled take their past with them"
+)
+
+
+@on_flight(rbpf_outdoor, unsmoothed=_UNSMOOTHED)
 def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldControl, scored: Scored) -> Case:
     """Start the filter on an outdoor flight, at its first readings and at rest.
 
@@ -134,7 +150,8 @@ def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldCon
         DeclarationError: for a setting that is out of range.
         UnknownNameError: for a scheme that is not there.
     """
-    inputs, sensors, first = outdoor_flight(on.flight, on.name)
+    inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
+    on.notes.extend(notes)
     return on.case(
         scored.score(on, pose_errors, estimate="belief"),
         inputs=inputs,

@@ -26,7 +26,10 @@ def roll_pitch(imu: Stream[Imu]):
     return {"attitude": roll_pitch_attitude(imu, name="attitude")}
 
 
-@on_flight(roll_pitch, "imu", measured=None)
+_UNSMOOTHED = "each reading is taken by itself, so the later ones say nothing of it"
+
+
+@on_flight(roll_pitch, "imu", measured=None, unsmoothed=_UNSMOOTHED)
 def for_flight(on: OnFlight, *, scored: Scored) -> Case:
     """Run it on a flight with an inertial unit.
 

@@ -51,7 +51,10 @@ def tag_pose(
     return {"pose": pose}
 
 
-@on_flight(tag_pose, "tags", ranged=False)
+_UNSMOOTHED = "each picture is taken by itself, so the later ones say nothing of it"
+
+
+@on_flight(tag_pose, "tags", ranged=False, unsmoothed=_UNSMOOTHED)
 def for_flight(
     on: OnFlight,
     *,

@@ -12,13 +12,16 @@ sec. 6.2.2. The model stands in `blocks/models/tracking.py`, the methods in `blo
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 
 from flowgraph import Case, DataError, Result, Series, Stream, block, graph
 from flowgraph.blocks.filtering import (
+    CloudSteps,
     LinearMeasurement,
+    bank_steps_of,
     cubature,
     extended,
     filtered,
@@ -28,13 +31,13 @@ from flowgraph.blocks.filtering import (
     unscented,
 )
 from flowgraph.blocks.filtering.batch import Recording
-from flowgraph.blocks.kalman.smoothing import Steps, steps_of
+from flowgraph.blocks.kalman.linear import LinearModel
+from flowgraph.blocks.kalman.smoothing import Smoothing, steps_of
 from flowgraph.blocks.metrics.errors import plane_errors
 from flowgraph.blocks.models.tracking import constant_velocity
 from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive, one_of
 from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
-from flowgraph.errors import DeclarationError
 
 METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
 
@@ -50,13 +53,17 @@ def seen_position(noise: float) -> LinearMeasurement:
     return LinearMeasurement(constant_velocity(1.0).space, np.eye(2, 4), noise=noise**2)
 
 
-def plane_steps(result: Result) -> Steps:
-    """Those of a run that was wired for a smoother."""
+def plane_steps(result: Result, motion: LinearModel) -> Smoothing:
+    """What smooths a run that was wired for it, by what the method collected."""
 
     def named(smoothed: Series) -> Series:
         belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
         return Series(smoothed.time, seen_in_plane.step(belief), name=smoothed.name)
 
+    if "bank" in result.series:
+        return bank_steps_of(result, motion.space)._replace(named=named)
+    if "cloud" in result.series:
+        return CloudSteps(result["cloud"], motion, named)
     return steps_of(result)._replace(named=named)
 
 
@@ -131,17 +138,11 @@ def for_flight(
             fix="choose a flight such as sim:plane",
         )  # fmt: skip
     start = motion.space.gaussian(position=(first, noise), velocity=((0.0, 0.0), 3.0))
-    if method == "particles" and scored.smoothed:
-        raise DeclarationError(
-            "particles have no smoother that goes back over their run",
-            path="tracker.method",
-            expected="linear, extended, unscented or cubature, with smooth or lag",
-            got="particles",
-            fix='smooth the clouds of a run of your own: smoothed_cloud(result["cloud"], motion)',
-        )
-    recording = Recording(motion, {seen_position(noise): on.inputs["position"]}, start)
+    recording: Recording | str = Recording(motion, {seen_position(noise): on.inputs["position"]}, start)
+    if method == "imm":
+        recording = "which motion was the true one at each step is no number that a least-squares problem has"
     return on.case(
-        scored.score(on, plane_errors, steps=plane_steps, recording=recording),
+        scored.score(on, plane_errors, steps=partial(plane_steps, motion=motion), recording=recording),
         start=start,
         wander=wander,
         position_noise=noise,

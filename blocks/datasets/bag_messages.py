@@ -7,14 +7,15 @@
     nav_msgs/Odometry                            Pose              vicon, likewise
     tf2_msgs/TFMessage, tf/tfMessage             Pose              vicon, likewise
     geometry_msgs/PointStamped                   Position          leica
-    sensor_msgs/NavSatFix                        GeodeticPosition  gps
+    sensor_msgs/NavSatFix                        GnssFix           gps
     sensor_msgs/MagneticField                    MagneticField     magnetometer
     geometry_msgs/TwistStamped                   Velocity          velocity, when it is named
-    geometry_msgs/TwistWithCovarianceStamped     Velocity          velocity, when it is named
+    geometry_msgs/TwistWithCovarianceStamped     GnssVelocity      velocity, when it is named
 
 A message says what it did not measure: a negative first variance (ROS has -1), and a NavSatFix by its status.
-Such numbers are NaN. A stream that is called gyro or accelerometer takes that part of an Imu, and one that is
-called velocity the velocity of an Odometry, turned into its frame.
+Such numbers are NaN. Fixes and velocities keep the covariance of each message; one that is not known is zero.
+A stream that is called gyro or accelerometer takes that part of an Imu, and one that is called velocity the
+velocity of an Odometry, turned into its frame.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 from flowgraph.blocks.signals import (
-    GeodeticPosition,
+    GnssFix,
+    GnssVelocity,
     Gyro,
     Imu,
     MagneticField,
@@ -64,7 +66,7 @@ class Kind(NamedTuple):
             if attrgetter(name)(reading)[0] < 0.0:
                 numbers[part] = [math.nan] * len(numbers[part])
                 flags.append(f"{name}[0] < 0")
-        if self.signal is _geodetic and reading.status.status < 0:
+        if self.signal is _fixed and reading.status.status < 0:
             numbers = [math.nan] * len(numbers)
             flags.append("status.status < 0")
         return numbers, flags
@@ -105,11 +107,26 @@ def _orientation(m: Any) -> list[str]:
 
 
 def _fix(m: Any) -> list[float]:
-    return [math.radians(m.latitude), math.radians(m.longitude), m.altitude]
+    known = m.position_covariance_type > 0 and m.position_covariance[0] >= 0.0
+    covariance = [float(x) for x in m.position_covariance] if known else [0.0] * 9
+    return [math.radians(m.latitude), math.radians(m.longitude), m.altitude, *covariance]
 
 
-def _geodetic(latitude: Any, longitude: Any, height: Any) -> GeodeticPosition:
-    return GeodeticPosition(latitude=latitude[:, 0], longitude=longitude[:, 0], height=height[:, 0])
+def _fixed(latitude: Any, longitude: Any, height: Any, covariance: Any) -> GnssFix:
+    return GnssFix(
+        latitude=latitude[:, 0], longitude=longitude[:, 0], height=height[:, 0],
+        covariance=covariance.reshape(-1, 3, 3),
+    )  # fmt: skip
+
+
+def _twist(m: Any) -> list[float]:
+    """The velocity, and its block of the covariance."""
+    rows = [float(x) for k in range(3) for x in m.twist.covariance[6 * k : 6 * k + 3]]
+    return _vector(m.twist.twist.linear) + ([0.0] * 9 if rows[0] < 0.0 else rows)
+
+
+def _moved(velocity: Any, covariance: Any) -> GnssVelocity:
+    return GnssVelocity(velocity=velocity, covariance=covariance.reshape(-1, 3, 3))
 
 
 _POSE = {"position": slice(0, 3), "attitude": slice(3, 7)}
@@ -150,8 +167,13 @@ KINDS: Mapping[str, Kind] = {
     "sensor_msgs/msg/NavSatFix": Kind(
         "gps",
         _fix,
-        {"latitude": slice(0, 1), "longitude": slice(1, 2), "height": slice(2, 3)},
-        _geodetic,
+        {
+            "latitude": slice(0, 1),
+            "longitude": slice(1, 2),
+            "height": slice(2, 3),
+            "covariance": slice(3, 12),
+        },
+        _fixed,
         {"position_covariance": slice(0, 3)},
     ),
     "sensor_msgs/msg/MagneticField": Kind(
@@ -166,9 +188,9 @@ KINDS: Mapping[str, Kind] = {
     ),
     "geometry_msgs/msg/TwistWithCovarianceStamped": Kind(
         "velocity",
-        lambda m: _vector(m.twist.twist.linear),
-        _VELOCITY,
-        Velocity,
+        _twist,
+        {"velocity": slice(0, 3), "covariance": slice(3, 12)},
+        _moved,
         {"twist.covariance": slice(0, 3)},
         named=True,
     ),

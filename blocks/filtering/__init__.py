@@ -9,7 +9,7 @@ user's own filter needs is importable from here.
 from __future__ import annotations
 
 from flowgraph.blocks.filtering.ageing import AgedMotion, Ageing, doubt_control
-from flowgraph.blocks.filtering.banks import Interacting, imm, mmae
+from flowgraph.blocks.filtering.banks import BankFilter, Interacting, bank_step, imm, mmae
 from flowgraph.blocks.filtering.batch import (
     LOSSES,
     Aged,
@@ -21,7 +21,13 @@ from flowgraph.blocks.filtering.batch import (
     huber,
     loss_of,
 )
-from flowgraph.blocks.filtering.ensembles import Ensemble, carry_ensemble, correct_ensemble, ensemble
+from flowgraph.blocks.filtering.ensembles import (
+    Ensemble,
+    carry_ensemble,
+    correct_ensemble,
+    ensemble,
+    ensemble_cross,
+)
 from flowgraph.blocks.filtering.filtered import FirstMeasurement, filtered, first
 from flowgraph.blocks.filtering.gaussian import (
     Extended,
@@ -60,7 +66,8 @@ from flowgraph.blocks.filtering.proposals import (
     propose_cloud,
 )
 from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
-from flowgraph.blocks.filtering.simulation import backward_simulation, smoothed_cloud
+from flowgraph.blocks.filtering.simulation import CloudSteps, backward_simulation, smoothed_cloud
+from flowgraph.blocks.filtering.switching import BankStep, BankSteps, bank_steps_of
 from flowgraph.blocks.filtering.towards import Moved, deviations, find_cloud_back, moved_towards
 from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
@@ -106,6 +113,7 @@ __all__ = [
     "doubt_control",
     "FirstMeasurement",
     "smooth",
+    "CloudSteps",
     "backward_simulation",
     "smoothed_cloud",
     "estimate_batch",
@@ -120,6 +128,7 @@ __all__ = [
     "Ensemble",
     "carry_ensemble",
     "correct_ensemble",
+    "ensemble_cross",
     "rao_blackwellized",
     "Marginal",
     "carry_conditional",
@@ -131,6 +140,11 @@ __all__ = [
     "imm",
     "mmae",
     "Interacting",
+    "BankFilter",
+    "BankStep",
+    "BankSteps",
+    "bank_step",
+    "bank_steps_of",
     "particles",
     "PROPOSALS",
     "Particles",

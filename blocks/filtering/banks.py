@@ -19,16 +19,17 @@ to Tracking and Navigation", 2001, sec. 11.6.6.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array
+from flowgraph import Array, block
 from flowgraph.blocks.filtering.gaussian import GaussianMethod
-from flowgraph.blocks.filtering.methods import GaussianFilter, Method, extended
+from flowgraph.blocks.filtering.methods import Advanced, GaussianFilter, Method, extended
+from flowgraph.blocks.filtering.switching import BankStep
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import passes
 from flowgraph.blocks.particles.cloud import log_sum_exp
@@ -37,7 +38,7 @@ from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import When
 
-__all__ = ["Interacting", "imm", "mmae"]
+__all__ = ["BankFilter", "Interacting", "bank_step", "imm", "mmae"]
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,50 @@ class Interacting(GaussianMethod):
             covariance=choose(xp.stack([one.covariance for one in found]), kept.covariance),
         )
         return corrected, When(innovations[0].present, whole), likely
+
+
+@block
+def bank_step(bank: Bank, control: Any | None, *, method: Interacting, dt: float, xp: Any) -> BankStep:
+    """What the smoother of a bank (`switching`) needs of a step of `dt` seconds: each filter, each motion.
+
+    Args:
+        bank: that of the tick before.
+        control: of the step.
+        method: the bank's.
+    """
+    kind, models = bank.weight.dtype, range(len(method.motions))
+    chance = xp.eye(len(models), dtype=kind)
+    if method.transition is not None:
+        passed = xp.asarray(dt, dtype=kind) > 0.0
+        chance = xp.where(passed, xp.asarray(method.transition, dtype=kind), chance)
+    ahead, crossed = [], []
+    for i in models:
+        own = Gaussian(mean=bank.mean[i, :], covariance=bank.covariance[i, ...])
+        ahead += [method.maths.predicted(own, control, motion, dt, xp) for motion in method.motions]
+        crossed += [method.maths.crossed(own, control, motion, dt, xp) for motion in method.motions]
+    square = lambda parts: xp.reshape(xp.stack(parts), (len(models), len(models), *parts[0].shape))
+    return BankStep(
+        chance=chance,
+        prior_mean=square([one.mean for one in ahead]),
+        prior_covariance=square([one.covariance for one in ahead]),
+        cross=square(crossed),
+    )
+
+
+@dataclass(frozen=True)
+class BankFilter(GaussianFilter):
+    """The filter of a bank."""
+
+    maths: Interacting
+
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> Mapping[str, Any]:
+        still = motion.space.resting()
+        if type(self.maths.maths).crossed is GaussianMethod.crossed:  # refuses, before anything is wired
+            self.maths.maths.crossed(still, None, motion, 0.0, np)
+        step = bank_step(kept, control, method=self.maths, at=at, name="bank_step")
+        return {"bank": found.kept, "bank_step": step}
 
 
 def _mixed(
@@ -228,4 +273,4 @@ def _bank(
             fix=f"write {path}(..., method=extended())",
         )
     w.flags.writeable = False
-    return GaussianFilter(Interacting(motions, transition, w, inner.maths))
+    return BankFilter(Interacting(motions, transition, w, inner.maths))

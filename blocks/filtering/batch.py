@@ -47,7 +47,18 @@ from flowgraph.language.graph import SourceNode, Wire
 from flowgraph.recorder.derivatives import jacobian
 from flowgraph.types import Type, zeros
 
-__all__ = ["LOSSES", "Aged", "Derived", "Loss", "Recording", "cauchy", "estimate_batch", "huber", "loss_of"]
+__all__ = [
+    "LOSSES",
+    "Aged",
+    "Derived",
+    "Loss",
+    "Moves",
+    "Recording",
+    "cauchy",
+    "estimate_batch",
+    "huber",
+    "loss_of",
+]
 
 LOSSES = ("none", "huber", "cauchy")
 """What a measurement that is far off counts."""

@@ -8,14 +8,18 @@ covariance, and by the gain of that each is moved towards a measurement that has
 So no derivative is taken and no covariance kept: for states that are large. With more and more members the
 filter of a linear model is the Kalman filter; with n the mean is off by about 1/sqrt(n) of a deviation.
 
+It is smoothed by the sample covariance of the members before and after a step, in place of P F^T; so the
+ensemble Kalman smoother and that of Rauch, Tung and Striebel are one (Raanes 2016).
+
 Source: G. Burgers, P. van Leeuwen and G. Evensen, "Analysis scheme in the ensemble Kalman filter", Monthly
 Weather Review 126(6), 1998; G. Evensen, "The ensemble Kalman filter: theoretical formulation and practical
-implementation", Ocean Dynamics 53, 2003, sec. 4.
+implementation", Ocean Dynamics 53, 2003, sec. 4; P. Raanes, "On the ensemble Rauch-Tung-Striebel smoother and
+its equivalence to the ensemble Kalman smoother", Q. J. Royal Meteorological Society 142, 2016.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,11 +31,11 @@ from flowgraph.blocks.filtering.proposals import drawn, shaken
 from flowgraph.blocks.filtering.towards import deviations, moved_towards
 from flowgraph.blocks.kalman.triangles import semidefinite_root
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
-from flowgraph.blocks.signals import Gaussian, KalmanInnovation, StateEnsemble
+from flowgraph.blocks.signals import CrossCovariance, Gaussian, KalmanInnovation, StateEnsemble
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
 
-__all__ = ["Ensemble", "carry_ensemble", "correct_ensemble", "ensemble"]
+__all__ = ["Ensemble", "carry_ensemble", "correct_ensemble", "ensemble", "ensemble_cross"]
 
 
 @block
@@ -73,6 +77,21 @@ def correct_ensemble(
     return members.replace(state=found.state), when(here, found.innovation), when(here, likely)
 
 
+@block
+def ensemble_cross(
+    members: StateEnsemble, moved: StateEnsemble, *, motion: Motion, xp: Any
+) -> CrossCovariance:
+    """The sample covariance of members and of what became of each, which a smoother goes back by.
+
+    Args:
+        members: of the tick before.
+        moved: the same, after the step and before measurements.
+        motion: of the filter.
+    """
+    before, after = (deviations(one.state, motion.space, xp)[0] for one in (members, moved))
+    return CrossCovariance(covariance=before.mT @ after / (before.shape[-2] - 1.0))
+
+
 @dataclass(frozen=True)
 class Ensemble(Method):
     """The ensemble Kalman filter; see `ensemble`."""
@@ -96,7 +115,7 @@ class Ensemble(Method):
         self, kept: Any, control: Any, motion: Motion, seen: Sequence[Seen], *,
         at: Any, gate: float | None, patience: int,
     ) -> Advanced:  # fmt: skip
-        members = carry_ensemble(
+        members = moved = carry_ensemble(
             kept, control, motion=motion, at=at, draws=f"{self.draws}.move", name="carry"
         )
         prior = believed(members, method=self, motion=motion, name="prior")
@@ -113,7 +132,12 @@ class Ensemble(Method):
                     before, members, innovations[one.name], one, patience, f"{self.draws}.find", seen
                 )
         belief = believed(members, method=self, motion=motion, name="posterior")
-        return Advanced(members, prior, belief, innovations, likelihoods, {})
+        return Advanced(members, prior, belief, innovations, likelihoods, {}, moved)
+
+    def smoothable(
+        self, kept: Any, control: Any, motion: Motion, found: Advanced, *, at: Any
+    ) -> Mapping[str, Any]:
+        return {"cross": ensemble_cross(kept, found.moved, motion=motion, name="cross")}
 
 
 def ensemble(count: int, *, seed: int = 0, draws: str = "ensemble") -> Method:

@@ -57,7 +57,8 @@ class Advanced(NamedTuple):
     """What a tick makes of what a filter keeps.
 
     kept: to be kept for the next tick. prior, belief: `Gaussian` before and after the measurements.
-    innovations, log_likelihoods: by the name of the measurement. more: other streams, by name.
+    innovations, log_likelihoods: by the name of the measurement. more: other streams, by name. moved: what is
+    kept before measurements, where a smoother asks for it.
     """
 
     kept: Stream[Any]
@@ -66,6 +67,7 @@ class Advanced(NamedTuple):
     innovations: Mapping[str, Stream[KalmanInnovation]]
     log_likelihoods: Mapping[str, Stream[Any]]
     more: Mapping[str, Stream[Any]]
+    moved: Stream[Any] | None = None
 
 
 class Method(abc.ABC):
@@ -111,7 +113,7 @@ class Method(abc.ABC):
         raise DeclarationError(
             "this method has no smoother",
             path=f"filtered.{type(self).__name__}",
-            expected="a method with a Gaussian belief, or particles",
+            expected="a method with a Gaussian belief, a bank of such, an ensemble or particles",
             got=repr(self),
             fix="leave smoothing out, or use another method",
         )

@@ -16,18 +16,20 @@ Source: S. Godsill, A. Doucet, M. West, "Monte Carlo smoothing for nonlinear tim
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowgraph import Series
+from flowgraph.blocks.kalman.smoothing import lag_ticks
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.blocks.statespace import Motion
 from flowgraph.errors import DataError, DeclarationError
 from flowgraph.language.checks import need_count
 from flowgraph.recorder.derivatives import jacobian
 
-__all__ = ["backward_simulation", "smoothed_cloud"]
+__all__ = ["CloudSteps", "backward_simulation", "smoothed_cloud"]
 
 LEAST = 1e-12
 """Below what part of the largest the smallest variance of a step, each in its own unit, counts as none."""
@@ -88,6 +90,35 @@ def smoothed_cloud(
     apart = np.asarray(space.minus(points, mean[:, None, :], np))
     P = apart.mT @ apart / trajectories
     return Series(cloud.time, Gaussian(mean=mean, covariance=P), name="smoothed")
+
+
+class CloudSteps(NamedTuple):
+    """What smooths a run of particles: the `StateCloud` of each tick, the motion, the control of each step,
+    and `named`, which makes beliefs with names of what it gives back."""
+
+    cloud: Series
+    motion: Motion
+    named: Callable[[Series], Series]
+    control: Series | None = None
+
+    def smoothed(self) -> Series:
+        """The whole run (`smoothed_cloud`)."""
+        return smoothed_cloud(self.cloud, self.motion, control=self.control)
+
+    def lagged(self, seconds: float) -> Series:
+        """Each tick with what came until so much later: of backward simulation from there, its first.
+
+        Every tick needs trajectories of its own, so this takes as long as `smoothed` times the ticks of a
+        lag.
+        """
+        ends = lag_ticks(self.cloud.time, seconds) + np.arange(len(self.cloud))
+        found = []
+        for k, end in enumerate(ends):
+            part = slice(k, int(end) + 1)
+            control = None if self.control is None else self.control[part]
+            found.append(smoothed_cloud(self.cloud[part], self.motion, control=control)[:1])
+        mean, P = (np.concatenate([one[leaf] for one in found]) for leaf in ("mean", "covariance"))
+        return Series(self.cloud.time, Gaussian(mean=mean, covariance=P), name="smoothed")
 
 
 def _step_density(x: np.ndarray, after: np.ndarray, motion: Motion, control: Any, dt: float) -> np.ndarray:

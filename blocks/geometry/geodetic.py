@@ -15,7 +15,7 @@ import numpy as np
 from flowgraph import Series
 from flowgraph.blocks.signals import GeodeticPosition, Position
 
-__all__ = ["SEMI_MAJOR_AXIS", "FLATTENING", "as_geodetic", "as_position", "from_enu", "to_enu"]
+__all__ = ["SEMI_MAJOR_AXIS", "FLATTENING", "as_geodetic", "as_position", "from_enu", "to_earth", "to_enu"]
 
 SEMI_MAJOR_AXIS = 6378137.0
 """m, WGS84."""
@@ -29,8 +29,8 @@ _E2 = FLATTENING * (2.0 - FLATTENING)  # first eccentricity squared
 def to_enu(geodetic: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
     """East, north, up (..., 3) in m, from latitude (rad), longitude (rad), height (m) (..., 3) and the
     origin's."""
-    start = _to_earth(np.array(origin, dtype=float))
-    return np.asarray((_to_earth(np.asarray(geodetic, dtype=float)) - start) @ _axes(origin).T)
+    start = to_earth(np.array(origin, dtype=float))
+    return np.asarray((to_earth(np.asarray(geodetic, dtype=float)) - start) @ _axes(origin).T)
 
 
 def from_enu(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
@@ -39,7 +39,7 @@ def from_enu(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
 
     Exact to the precision of the numbers (below a micrometre) from 50 km under the ellipsoid upwards.
     """
-    x, y, z = np.moveaxis(_to_earth(np.array(origin, dtype=float)) + np.asarray(enu) @ _axes(origin), -1, 0)
+    x, y, z = np.moveaxis(to_earth(np.array(origin, dtype=float)) + np.asarray(enu) @ _axes(origin), -1, 0)
     across = np.hypot(x, y)
     b = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
     sine, cosine = SEMI_MAJOR_AXIS * z, b * across  # of the reduced latitude
@@ -69,7 +69,7 @@ def as_position(geodetic: Series, origin: tuple[float, float, float]) -> Series:
     return Series(geodetic.time, Position(position=to_enu(places, origin)), name=geodetic.name)
 
 
-def _to_earth(geodetic: np.ndarray) -> np.ndarray:
+def to_earth(geodetic: np.ndarray) -> np.ndarray:
     """Earth-centred, Earth-fixed coordinates (..., 3), m."""
     latitude, longitude, height = np.moveaxis(geodetic, -1, 0)
     s, c = np.sin(latitude), np.cos(latitude)

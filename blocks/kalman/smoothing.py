@@ -23,7 +23,7 @@ R. Fiszel, thesis (2017), which defines filtering and smoothing.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,7 @@ from flowgraph.blocks.signals import Gaussian, SmoothedBelief
 from flowgraph.errors import DataError
 
 __all__ = [
+    "Smoothing",
     "Steps",
     "fixed_lag",
     "gone_back",
@@ -60,6 +61,29 @@ class Steps(NamedTuple):
     space: StateSpace | None
     named: Callable[[Series], Series]
 
+    def smoothed(self) -> Series:
+        """The whole run (`rauch_tung_striebel`)."""
+        return rauch_tung_striebel(self.prior, self.posterior, self.transition, space=self.space)
+
+    def lagged(self, seconds: float) -> Series:
+        """Each tick with what came until so much later (`fixed_lag`)."""
+        ticks = lag_ticks(self.posterior.time, seconds)
+        return fixed_lag(self.prior, self.posterior, self.transition, ticks, space=self.space)
+
+
+class Smoothing(Protocol):
+    """A run that can be smoothed: `Steps`, and of other kinds of belief what goes back over them."""
+
+    @property
+    def named(self) -> Callable[[Series], Series]:
+        """Makes beliefs with names of what is given back."""
+
+    def smoothed(self) -> Series:
+        """The whole run: a mean and covariance at every tick."""
+
+    def lagged(self, seconds: float) -> Series:
+        """Each tick with what came until so much later."""
+
 
 def smooth(
     result: Result, space: StateSpace | None = None, *, lag: float | None = None, name: str = "filter"
@@ -78,10 +102,8 @@ def smooth(
     Raises:
         DataError: where the run did not collect what a smoother needs.
     """
-    prior, posterior, cross, space, _ = steps_of(result, space, name=name)
-    if lag is None:
-        return rauch_tung_striebel(prior, posterior, cross, space=space)
-    return fixed_lag(prior, posterior, cross, lag_ticks(posterior.time, lag), space=space)
+    steps = steps_of(result, space, name=name)
+    return steps.smoothed() if lag is None else steps.lagged(lag)
 
 
 def steps_of(result: Result, space: StateSpace | None = None, *, name: str = "filter") -> Steps:

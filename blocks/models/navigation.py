@@ -1,7 +1,6 @@
 """Navigation outdoors over a space: what a smoother of `gnss_ins` goes back over, and what a batch is given.
 
-The motion is that of `inertial.navigation`, with its noise; a position is seen as `aid_gnss_position` sees
-it.
+The motion is that of `inertial.navigation`, with its noise; what is seen stands in `navigation_seen`.
 """
 
 from __future__ import annotations
@@ -16,25 +15,30 @@ import numpy as np
 from flowgraph import Array, Result, Series
 from flowgraph.blocks.filtering.batch import Aged, Derived, Recording
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
-from flowgraph.blocks.geometry.rotations import rotate
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.inertial.navigation import (
     PARAMETERS,
     Earth,
     navigation_crossing,
-    places,
     predict_navigation,
 )
 from flowgraph.blocks.inertial.outdoors import AT_UNIT, Antenna
 from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.models.navigation_seen import (
+    antenna_seen,
+    antennas_seen,
+    compass_seen,
+    height_seen,
+    turning,
+    velocity_seen,
+    wheels_seen,
+)
 from flowgraph.blocks.models.recordings import drive_at
 from flowgraph.blocks.signals import Belief, Gaussian, Imu, NavigationBelief
-from flowgraph.blocks.statespace import Measurement, MeasurementModel
+from flowgraph.blocks.statespace import Measurement
 
 __all__ = [
-    "antenna_seen",
-    "height_seen",
     "navigation_moves",
     "navigation_recording",
     "navigation_space",
@@ -85,59 +89,43 @@ def navigation_moves(
     return Derived(space, linearised)
 
 
-def antenna_seen(antenna: Antenna, estimated: tuple[str, ...]) -> MeasurementModel:
-    """The position of an antenna, as `aid_gnss_position` sees it, with the covariance of the message."""
-    where = places(estimated)
-
-    def observe(x: Any, xp: Any) -> Array:
-        kind = x.position.dtype
-        arm, late = xp.asarray(antenna.lever, dtype=kind), antenna.late
-        if "lever" in where:
-            arm = x.parameters[..., where["lever"]]
-        if "time_offset" in where:
-            late = x.parameters[..., where["time_offset"]]
-        return x.position + rotate(x.attitude, arm, xp=xp) - x.velocity * late
-
-    read = lambda fix: fix.position
-    return MeasurementModel(navigation_space(estimated), observe, noise=lambda fix: fix.covariance, read=read)
-
-
-def height_seen(noise: float, estimated: tuple[str, ...]) -> MeasurementModel:
-    """A height by the pressure of the air, as `aid_height` sees it (m)."""
-    where = places(estimated)
-
-    def observe(x: Any, xp: Any) -> Array:
-        up = x.position[..., 2:3]
-        return up + x.parameters[..., where["height_offset"]] if "height_offset" in where else up
-
-    return MeasurementModel(navigation_space(estimated), observe, noise=np.array([noise**2]))
-
-
 def navigation_recording(
     inputs: Mapping[str, Series], *, start: Any, noise: ImuNoise, gravity: tuple[float, float, float],
     reading: str, earth: Earth | None = None, antenna: Antenna = AT_UNIT, estimated: tuple[str, ...] = (),
-    height_noise: float = 0.5, held: Held | None = None,
-) -> Recording | None:  # fmt: skip
-    """What `gnss_ins` is given; None where it is more than `imu`, `gnss` and `barometer`.
+    baseline: tuple[float, float, float] = (1.0, 0.0, 0.0), north: float = 0.0, compass_noise: float = 0.1,
+    height_noise: float = 0.5, speed_noise: float = 0.1, slip: float = 0.1,
+    axle: tuple[float, float, float] = (0.0, 0.0, 0.0), held: Held | None = None,
+) -> Recording:  # fmt: skip
+    """What `gnss_ins` is given: `imu`, and any of the other sensors.
 
     Args:
         inputs: of the graph. start: its belief.
         reading: as in `drive_at`.
-        noise, gravity, earth, antenna, estimated, height_noise, held: as the graph has them.
+        noise, gravity, earth, antenna, estimated, baseline, north, compass_noise, height_noise, speed_noise,
+            slip, axle, held: as the graph has them.
     """
-    if not {"imu", "gnss"} <= set(inputs) <= {"imu", "gnss", "barometer"}:
-        return None
-    seen: dict[Measurement, Series] = {antenna_seen(antenna, estimated): inputs["gnss"]}
-    if "barometer" in inputs:
-        seen[height_seen(height_noise, estimated)] = inputs["barometer"]
-    moves = navigation_moves(noise, gravity, earth, estimated)
-    mean = np.concatenate([getattr(start, part) for part in moves.space.names])
-    aged = None if held is None else Aged(inputs["imu"], held, {"position": 0, "velocity": 3, "attitude": 6})
+    moves, imu = navigation_moves(noise, gravity, earth, estimated), inputs["imu"]
+    space = moves.space
+    models: dict[str, Measurement] = {
+        "gnss": antenna_seen(space, antenna, estimated),
+        "gnss_velocity": velocity_seen(space, antenna, estimated),
+        "heading": antennas_seen(space, baseline),
+        "magnetometer": compass_seen(space, north, compass_noise),
+        "barometer": height_seen(space, height_noise, estimated),
+        "wheels": wheels_seen(space, speed_noise, slip, axle),
+    }
+    told = {name: inputs[name] for name in models if name in inputs}
+    told |= {name: turning(told[name], imu) for name in ("gnss_velocity", "wheels") if name in told}
+    for name, leaf in (("magnetometer", "field"), ("heading", "angle")):  # a NaN has no derivative
+        if name in told:
+            told[name] = told[name][np.isfinite(told[name][leaf]).reshape(len(told[name]), -1).all(axis=-1)]
+    mean = np.concatenate([getattr(start, part) for part in space.names])
+    aged = None if held is None else Aged(imu, held, {"position": 0, "velocity": 3, "attitude": 6})
     return Recording(
         moves,
-        seen,
+        {models[name]: series for name, series in told.items()},
         Gaussian(mean=mean, covariance=np.asarray(start.covariance)),
-        partial(drive_at, imu=inputs["imu"], reading=reading),
+        partial(drive_at, controls=imu, reading=reading),
         None if held is None else held.longest,
         aged,
     )

@@ -16,17 +16,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Flight, Scalar, Series, block
+from flowgraph import Flight, Result, Scalar, Series, block
+from flowgraph.blocks.filtering.simulation import CloudSteps
+from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.particles.cloud import log_sum_exp
 from flowgraph.blocks.particles.resampling import ancestor_index
-from flowgraph.blocks.signals import Ancestors, PlaneBelief, PlaneCloud, PlanePosition, PlaneVelocity
+from flowgraph.blocks.signals import (
+    Ancestors,
+    PlaneBelief,
+    PlaneCloud,
+    PlanePosition,
+    PlaneVelocity,
+    StateCloud,
+)
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 __all__ = [
     "average_plane",
+    "cloud_steps",
     "exact",
     "move_plane",
     "plane_sample_size",
+    "plane_states",
     "resample_plane",
     "start_plane",
     "weigh_plane",
@@ -99,6 +110,28 @@ def average_plane(cloud: PlaneCloud, *, xp: Any) -> PlaneBelief:
     mean = cloud.position @ weight
     apart = cloud.position - mean[:, None]
     return PlaneBelief(position=mean, covariance=(apart * weight) @ apart.mT)
+
+
+@block
+def plane_states(cloud: PlaneCloud) -> StateCloud:
+    """The points as states, one a row."""
+    return StateCloud(log_weight=cloud.log_weight, state=cloud.position.mT)
+
+
+def cloud_steps(result: Result, noise: float) -> CloudSteps:
+    """What smooths a run of `particle` that was wired for it.
+
+    Args:
+        noise: density of the velocity's error, m/s/sqrt(Hz).
+    """
+
+    def named(smoothed: Series) -> Series:
+        belief = PlaneBelief(position=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, belief, name=smoothed.name)
+
+    moves = LinearModel(np.zeros((2, 2)), np.eye(2), np.full(2, noise**2))
+    control = result["control"]
+    return CloudSteps(result["cloud"], moves, named, control.holding(control["velocity"]))
 
 
 def start_plane(

@@ -1,4 +1,4 @@
-"""What the filters of a pose were given, as a batch estimate takes it: motion, measurements, all readings.
+"""What filters with controls were given, as a batch estimate takes it: motion, measurements, all readings.
 
 The motion and its noise are those of the filters' own prediction; a measurement is seen as they see it. But a
 filter drives its step with the readings that it has by then, and a batch has them all: it takes a reading of
@@ -14,9 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series
-from flowgraph.blocks.filtering.batch import Aged, Derived, Recording
-from flowgraph.blocks.geometry.euler import angles_from_quaternion, body_rate_matrix, quaternion_from_angles
+from flowgraph import Array, Series, Signal, real
+from flowgraph.blocks.filtering.batch import Aged, Derived, Moves, Recording
+from flowgraph.blocks.geometry.euler import (
+    angles_from_quaternion,
+    body_rate_matrix,
+    matrix_from_angles,
+    quaternion_from_angles,
+)
 from flowgraph.blocks.geometry.manifold import StateSpace, quaternion
 from flowgraph.blocks.geometry.rotations import rotate
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, error_jacobian, predict
@@ -24,11 +29,17 @@ from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.blocks.models import euler_ins
 from flowgraph.blocks.models.inertial_pose import INERTIAL, INERTIAL_BIASED, pose_seen
+from flowgraph.blocks.models.point import point_model
 from flowgraph.blocks.models.pose import POSE
-from flowgraph.blocks.signals import Belief, Gaussian, Imu
-from flowgraph.blocks.statespace import Measurement, MeasurementModel
+from flowgraph.blocks.orientation.commanded import TURN, predict_turn, turned_back
+from flowgraph.blocks.signals import Belief, BodyRate, Gaussian, Imu
+from flowgraph.blocks.statespace import LinearMeasurement, Measurement, MeasurementModel
+from flowgraph.blocks.vision.camera import Mount
+from flowgraph.blocks.vision.motion import camera_velocity
+from flowgraph.types import unflatten
 
 __all__ = [
+    "CameraVelocity",
     "EulerPoseSeen",
     "drive_at",
     "euler_moves",
@@ -36,22 +47,25 @@ __all__ = [
     "inertial_moves",
     "inertial_recording",
     "place_seen",
+    "point_recording",
     "pose_recording",
+    "turn_recording",
     "turn_seen",
+    "velocity_recording",
 ]
 
 
-def drive_at(time: np.ndarray, imu: Series, reading: str) -> Series:
+def drive_at(time: np.ndarray, controls: Series, reading: str) -> Series:
     """What drives the step to each of these times (n,) int64 ns, of a unit whose readings are all known.
 
     Args:
-        imu: the readings; one with a NaN is left out.
+        controls: the readings, of vectors; one with a NaN is left out.
         reading: "instant", and the step is driven by the mean of what the unit would read at its two ends; or
             "mean", of the step since the reading before, and it drives all of that.
     """
-    leaves = [imu["gyro"], imu["specific_force"]]
+    leaves = list(controls.leaves.values())
     good = np.all([np.isfinite(a).all(axis=-1) for a in leaves], axis=0)
-    stamps = imu.time[good]
+    stamps = controls.time[good]
     if reading == "mean":
         after = np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)
         found = [a[good][after] for a in leaves]
@@ -60,7 +74,7 @@ def drive_at(time: np.ndarray, imu: Series, reading: str) -> Series:
         own = (stamps - stamps[0]).astype(float)
         ends = [np.stack([np.interp(since, own, column) for column in a[good].T], axis=-1) for a in leaves]
         found = [np.concatenate([a[:1], 0.5 * (a[1:] + a[:-1])]) for a in ends]
-    return Series(time, Imu(gyro=found[0], specific_force=found[1]), name="control")
+    return Series(time, unflatten(controls.type, iter(found)), name="control")
 
 
 def inertial_moves(
@@ -190,10 +204,78 @@ def euler_recording(
     )
 
 
+class CameraVelocity(Signal):
+    """A camera's velocity, and the rate of the body that goes with it: from the gyroscope, with its bias, or
+    from the camera."""
+
+    velocity: Array = real(3, unit="m/s", frame="camera")
+    rate: Array = real(3, unit="rad/s", frame="body")
+
+
+def velocity_recording(
+    inputs: Mapping[str, Series], *, start: Gaussian, order: str, reading: str, noise: ImuNoise,
+    mount: Mount, velocity_noise: float, rate_noise: float, rate: str,
+    gravity: tuple[float, float, float], held: Held | None = None,
+) -> Recording:  # fmt: skip
+    """What `ins_ukf_velocity` is given: `imu` and `motion`; over `euler_ins.STATE`. The gyroscope's rate at a
+    picture is on the straight line between its readings."""
+    imu, motion = inputs["imu"], inputs["motion"]
+    if rate == "gyro":
+        good = np.isfinite(imu["gyro"]).all(axis=-1)
+        since = lambda time: (time - imu.time[0]).astype(float)
+        gyro = imu["gyro"][good].T
+        body = np.stack([np.interp(since(motion.time), since(imu.time[good]), one) for one in gyro], axis=-1)
+    else:
+        body = motion["rate"] @ np.asarray(mount.rotation)
+
+    def observe(x: Array, v: Array, message: CameraVelocity, xp: Any) -> Array:
+        R = matrix_from_angles(x[..., 3:6], order=order, xp=xp)
+        bias = x[..., 9:12] if rate == "gyro" else 0.0 * x[..., 9:12]
+        seen = camera_velocity(x[..., 6:9], R, message.rate - bias - v[..., 3:], mount=mount, xp=xp)
+        return seen + v[..., :3]
+
+    seen = MeasurementModel(
+        euler_ins.STATE, observe, np.repeat(np.square([velocity_noise, rate_noise]), 3),
+        read=lambda message: message.velocity,
+    )  # fmt: skip
+    told = motion.holding(CameraVelocity(velocity=motion["velocity"], rate=body))
+    moves = euler_moves(order, noise, gravity)
+    return _recording(moves, {seen: told}, start, imu, reading, held, position=0, velocity=6, attitude=3)
+
+
+def point_recording(
+    seen: Series, controls: Series, *, start: Gaussian, noise: float, position_noise: float, control: str,
+    held: Held | None = None,
+) -> Recording:  # fmt: skip
+    """What `kalman` and `async_kalman` are given: positions, and `WorldAcceleration` as control."""
+    moves = point_model(noise)
+    place = LinearMeasurement(moves.space, np.eye(3, 6), position_noise**2, read=lambda z: z.position)
+    return _recording(moves, {place: seen}, start, controls, control, held, position=0, velocity=3)
+
+
+def turn_recording(
+    inputs: Mapping[str, Series], *, start: Gaussian, rate_noise: float, attitude_noise: float, reading: str,
+    held: Held | None = None,
+) -> Recording:  # fmt: skip
+    """What `attitude_mekf` is given: `body_rate` and `magnetic_attitude`; over `TURN`."""
+
+    def linearised(x: Array, rate: BodyRate, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
+        exactly = Gaussian(mean=x, covariance=xp.zeros((3, 3), dtype=x.dtype))
+        after = predict_turn.step(exactly, rate, noise=rate_noise, dt=dt, xp=xp)
+        return after.mean, turned_back(rate, dt, xp), after.covariance
+
+    seen = MeasurementModel(TURN, lambda x, xp: x, np.repeat(attitude_noise**2, 3), measured_space=TURN)
+    rates = inputs["body_rate"]
+    return _recording(
+        Derived(TURN, linearised), {seen: inputs["magnetic_attitude"]}, start, rates, reading, held,
+        attitude=0,
+    )  # fmt: skip
+
+
 def _recording(
-    moves: Derived, seen: Mapping[Any, Series], start: Gaussian, imu: Series, reading: str,
+    moves: Moves, seen: Mapping[Any, Series], start: Gaussian, imu: Series, reading: str,
     held: Held | None, **places: int,
 ) -> Recording:  # fmt: skip
-    drive: Callable[[np.ndarray], Series] = partial(drive_at, imu=imu, reading=reading)
+    drive: Callable[[np.ndarray], Series] = partial(drive_at, controls=imu, reading=reading)
     aged = None if held is None else Aged(imu, held, places)
     return Recording(moves, seen, start, drive, None if held is None else held.longest, aged)

@@ -11,21 +11,27 @@ body, as the rate does.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, block
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, rotate
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Attitude, AttitudeRateBelief, Gaussian, Imu
+from flowgraph.blocks.unscented.filters import motion_cross
+from flowgraph.blocks.unscented.sigma_points import SigmaPoints
 
 __all__ = [
     "STATE",
     "OrientationBelief",
     "named_orientation",
+    "orientation_crossing",
+    "orientation_steps",
     "roll_pitch_attitude",
     "see_rate_and_gravity",
     "stacked_imu",
@@ -44,6 +50,36 @@ def turn_by_rate(x: Array, control: Any, noise: Array | None, dt: Any, xp: Any) 
     """The motion over dt seconds: q' = q * Exp(w dt), w' = w (Kraft eqs. 8-12), without noise."""
     q, w = x[..., :4], x[..., 4:]
     return xp.concat([multiply(q, from_rotation_vector(w * dt, xp=xp), xp=xp), w], axis=-1)
+
+
+def orientation_crossing(Q: npt.ArrayLike, points: SigmaPoints) -> Callable[..., Array]:
+    """What `cross_covariance` asks of a filter whose noise is added before the points are drawn.
+
+        D = P (P + Q dt)^-1 D'      D' of the points, which are drawn from P + Q dt
+
+    Args:
+        Q: (6, 6), its spectral density.
+        points: the set of sigma points.
+    """
+
+    def crossing(belief: Gaussian, control: Any, dt: Any, xp: Any) -> Array:
+        P = belief.covariance
+        wide = P + xp.asarray(np.asarray(Q), dtype=P.dtype) * dt
+        carry = lambda x, w: turn_by_rate(x, control, w, dt, xp)
+        drawn = motion_cross(belief.mean, wide, carry, None, space=STATE, points=points, xp=xp)
+        return P @ xp.linalg.solve(wide, drawn)
+
+    return crossing
+
+
+def orientation_steps(result: Result) -> Steps:
+    """Those of a run of `quaternion_ukf` that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, named_orientation.step(belief), name=smoothed.name)
+
+    return steps_of(result, STATE)._replace(named=named)
 
 
 def see_rate_and_gravity(x: Array, xp: Any) -> Array:

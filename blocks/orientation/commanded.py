@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph import Array, block
+from flowgraph import Array, Result, Series, block
 from flowgraph.blocks.geometry.manifold import StateSpace, quaternion
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, normalize, to_matrix
+from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Attitude, AttitudeBelief, BodyRate, Gaussian
 
 __all__ = [
@@ -29,6 +30,9 @@ __all__ = [
     "predict_turn",
     "see_attitude",
     "start_turn",
+    "turn_crossing",
+    "turn_steps",
+    "turned_back",
 ]
 
 TURN = StateSpace(quaternion())
@@ -51,10 +55,30 @@ def predict_turn(belief: Gaussian, rate: BodyRate, *, noise: float, dt: float, x
         noise: density of the rate's white noise, rad/s/sqrt(Hz).
     """
     q, turn = belief.mean, from_rotation_vector(rate.rate * dt, xp=xp)
-    E = to_matrix(turn, xp=xp).mT
+    E = turned_back(rate, dt, xp)
     P = E @ belief.covariance @ E.mT + xp.asarray(np.eye(3), dtype=q.dtype) * (noise**2 * dt)
     turned = normalize(multiply(q, turn, xp=xp), xp=xp)
     return Gaussian(mean=turned, covariance=0.5 * (P + P.mT))
+
+
+def turned_back(rate: BodyRate, dt: Any, xp: Any) -> Array:
+    """E (3, 3) of `predict_turn`: how the error before a step stands in the body after it."""
+    return to_matrix(from_rotation_vector(rate.rate * dt, xp=xp), xp=xp).mT
+
+
+def turn_crossing(belief: Gaussian, rate: BodyRate, dt: Any, xp: Any) -> Array:
+    """What `cross_covariance` asks of a filter that predicts with `predict_turn`."""
+    return belief.covariance @ turned_back(rate, dt, xp).mT
+
+
+def turn_steps(result: Result) -> Steps:
+    """Those of a run of `attitude_mekf` that was wired for a smoother."""
+
+    def named(smoothed: Series) -> Series:
+        belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
+        return Series(smoothed.time, attitude_belief.step(belief), name=smoothed.name)
+
+    return steps_of(result, TURN)._replace(named=named)
 
 
 def see_attitude(x: Array, xp: Any) -> tuple[Array, Array]:

@@ -38,6 +38,7 @@ __all__ = [
     "OUTDOOR",
     "PositionObserver",
     "clone_crossing",
+    "clone_transition",
     "flow_vector",
     "new_picture",
     "observe_distance",
@@ -45,6 +46,7 @@ __all__ = [
     "outdoor_pose",
     "outdoor_steps",
     "picture_cross",
+    "picture_taken",
     "predict_clone",
     "start_outdoor",
 ]
@@ -110,8 +112,13 @@ def predict_clone(
 
 def clone_crossing(belief: Gaussian, imu: Imu, dt: Any, xp: Any) -> Array:
     """What `cross_covariance` asks of a filter that predicts with `predict_clone`."""
-    _, _, R, back = _half_way(_parts(belief.mean)[2], imu, dt, xp)
-    return belief.covariance @ _clone_jacobian(R, back, imu, dt, xp).mT
+    return belief.covariance @ clone_transition(belief.mean, imu, dt, xp).mT
+
+
+def clone_transition(x: Array, imu: Imu, dt: Any, xp: Any) -> Array:
+    """F (15, 15) of `predict_clone` at the state x (17)."""
+    _, _, R, back = _half_way(_parts(x)[2], imu, dt, xp)
+    return _clone_jacobian(R, back, imu, dt, xp)
 
 
 def _half_way(q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array, Array]:
@@ -190,9 +197,14 @@ def new_picture(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gauss
     """
     if flow is None:
         return belief
-    p, v, q, _, _ = _parts(belief.mean)
-    T = xp.asarray(_TAKEN, dtype=p.dtype)
-    return Gaussian(mean=xp.concat([p, v, q, p, q], axis=-1), covariance=T @ belief.covariance @ T.mT)
+    mean, T = picture_taken(belief.mean, xp)
+    return Gaussian(mean=mean, covariance=T @ belief.covariance @ T.mT)
+
+
+def picture_taken(x: Array, xp: Any) -> tuple[Array, Array]:
+    """The state (17) whose clone is its own pose, and T (15, 15)."""
+    p, v, q, _, _ = _parts(x)
+    return xp.concat([p, v, q, p, q], axis=-1), xp.asarray(_TAKEN, dtype=x.dtype)
 
 
 @block
@@ -201,9 +213,8 @@ def picture_cross(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gau
     with the one after, P T^T: what a smoother goes back by."""
     if flow is None:
         return belief
-    p, v, q, _, _ = _parts(belief.mean)
-    T = xp.asarray(_TAKEN, dtype=p.dtype)
-    return Gaussian(mean=xp.concat([p, v, q, p, q], axis=-1), covariance=belief.covariance @ T.mT)
+    mean, T = picture_taken(belief.mean, xp)
+    return Gaussian(mean=mean, covariance=belief.covariance @ T.mT)
 
 
 @block

@@ -35,7 +35,6 @@ from flowgraph.blocks.signals import (
     Ancestors,
     Cloud,
     Imu,
-    OpticalFlow,
     OutdoorCloud,
     PoseBelief,
     PoseEstimate,
@@ -146,7 +145,7 @@ def _advanced(A: Array, push: Array, dt: Array, xp: Any) -> Array:
 
 
 @block
-def take_picture(cloud: OutdoorCloud, flow: OpticalFlow | None, *, draw: Any, xp: Any) -> OutdoorCloud:
+def take_picture(cloud: OutdoorCloud, when: Any | None, *, draw: Any, xp: Any) -> OutdoorCloud:
     """Draw each particle's attitude, and make it that of the last picture.
 
     e ~ N(0, P_ee), one component after the other, each conditioned on those before it; with a component drawn
@@ -155,9 +154,9 @@ def take_picture(cloud: OutdoorCloud, flow: OpticalFlow | None, *, draw: Any, xp
     Draws `turn` (3, n).
 
     Args:
-        flow: the reading that ends at this picture; without one the cloud passes through.
+        when: the reading that ends at this picture; without one the cloud passes through.
     """
-    if flow is None:
+    if when is None:
         return cloud
     P = cloud.covariance
     deviations = xp.asarray(draw.normal("turn", (3, P.shape[-1])), dtype=P.dtype)

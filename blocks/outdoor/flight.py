@@ -1,34 +1,43 @@
 """Outdoors: which sensors a vehicle carries there, how good they are, and how a filter starts on them.
 
-An inertial unit, a magnetometer, two GPS receivers, an altimeter and optical flow each keep a clock of their
-own. What a filter must know of them beforehand is one object, so that two filters on the same streams can be
-given the very same knowledge, and be compared.
+An inertial unit, and any of a magnetometer, two GPS receivers, an altimeter and optical flow, each keep a
+clock of their own. What a filter must know of them beforehand is one object, so that two filters on the same
+streams can be given the very same knowledge, and be compared.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.geometry.rotations import level
 from flowgraph.blocks.inertial.alignment import StartSpread
 from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight"]
+__all__ = ["AIDS", "STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight"]
 
-STREAMS = ("imu", "gps", "gps2", "altimeter", "magnetometer", "optical_flow")
-"""What an outdoor flight has, by name."""
+AIDS = ("gps", "gps2", "altimeter", "magnetometer", "optical_flow")
+"""What an outdoor flight has any of, by name."""
+
+STREAMS = ("imu", *AIDS)
+"""All that an outdoor flight can have."""
+
+LOST = 100.0
+"""m: how far off a start may be whose position nobody tells."""
 
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class OutdoorSensors:
-    """What is known of the sensors. Deviations are of one sample, each the same on its axes.
+    """What is known of the sensors. Deviations are of one sample, each the same on its axes; None of a sensor
+    that is not there.
 
     Args:
         imu: densities of the inertial unit; it has no bias.
@@ -44,19 +53,20 @@ class OutdoorSensors:
     """
 
     imu: ImuNoise
-    gps: float
-    gps2: float
-    altimeter: float
-    magnetometer: float
-    displacement: float
-    turn: float
-    field: Vector
+    gps: float | None = None
+    gps2: float | None = None
+    altimeter: float | None = None
+    magnetometer: float | None = None
+    displacement: float | None = None
+    turn: float | None = None
+    field: Vector = (0.0, 1.0, 0.0)
     gps_lever: Vector = (0.0, 0.0, 0.0)
     gps2_lever: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         names = ("gps", "gps2", "altimeter", "magnetometer", "displacement", "turn")
-        wrong = [f"{n}={getattr(self, n)!r}" for n in names if not 0.0 < getattr(self, n) < np.inf]
+        said = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+        wrong = [f"{n}={value!r}" for n, value in said.items() if not 0.0 < value < np.inf]
         if wrong or not np.any(self.field):
             raise DeclarationError(
                 "these sensors cannot be used",
@@ -65,6 +75,20 @@ class OutdoorSensors:
                 got=", ".join([*wrong, f"field={self.field}"]),
                 fix="give each sensor the noise of one of its samples, for example gps=0.3",
             )
+
+    def noise(self, name: str) -> float:
+        """The deviation of a sensor that is there.
+
+        Raises:
+            DeclarationError: where nobody says it.
+        """
+        value: float | None = getattr(self, name)
+        if value is None:
+            raise DeclarationError(
+                "nobody says the noise of this sensor", path=f"OutdoorSensors.{name}",
+                expected="a standard deviation", got="None", fix=f"write OutdoorSensors(..., {name}=...)",
+            )  # fmt: skip
+        return value
 
 
 @dataclass(frozen=True)
@@ -102,60 +126,101 @@ def attitude_of_two(force: npt.ArrayLike, field: npt.ArrayLike, *, earth: npt.Ar
     return np.array([w, x, y, z])
 
 
-def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart]:
-    """The streams of a flight by name, what is known of its sensors, and where to start.
+def outdoor_flight(
+    flight: Flight, graph: str
+) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart, tuple[str, ...]]:
+    """The streams of a flight by name, what is known of its sensors, where to start, and notes on that.
 
-    The position is that of the first GPS reading; the attitude that of the first force and field.
+    The position is that of the first reading of a receiver, the attitude that of the first force and field.
+    What no sensor tells of these is the truth's, where there is one, and else taken for the origin and north,
+    with a deviation that says so.
 
     Args:
-        flight: with all of `STREAMS`; a reading of optical flow covers the time since the one before it, the
-            first one that since the flight's first reading. info: `imu_noise`, `magnetic_field` and `noise`.
+        flight: with `imu` and any of `AIDS`; a reading of optical flow covers the time since the one before
+            it, the first one that since the flight's first reading. info: `imu_noise`, `noise`, and
+            `magnetic_field` where there is a magnetometer.
         graph: who asks, for messages.
 
     Raises:
         DataError: where a stream or what should be known of it is missing, or optical flow has a gap.
     """
-    streams = flight.need(graph, *STREAMS)
+    streams = flight.need(graph, "imu")
+    streams |= {name: flight.streams[name] for name in AIDS if len(flight.streams.get(name, ()))}
+    if len(streams) == 1:
+        raise DataError(
+            f"this flight lacks what {graph} needs beside an inertial unit",
+            path=flight.name,
+            expected=f"one or more of {', '.join(AIDS)}",
+            got=", ".join(flight.streams),
+            fix=f"choose another flight, such as sim:thesis with sensors={','.join(STREAMS)}",
+        )
     info = flight.info
-    missing = [name for name in ("imu_noise", "noise", "magnetic_field") if name not in info]
+    wanted = ("imu_noise", "noise", *(["magnetic_field"] if "magnetometer" in streams else []))
+    missing = [name for name in wanted if name not in info]
     if missing:
         raise DataError(
             f"this flight does not say what {graph} must know of its sensors",
             path=flight.name,
-            expected="info with imu_noise, noise and magnetic_field",
+            expected=f"info with {', '.join(wanted)}",
             got=f"no {', '.join(missing)}",
             fix="add them to the flight's info, or build the graph with sensors=OutdoorSensors(...)",
         )
     _without_gaps(flight.name, streams)
     noise = info["noise"]
+    known = {name: noise[name]["noise"] for name in AIDS[:-1] if name in streams}
+    if "optical_flow" in streams:
+        flow = noise["optical_flow"]
+        known |= {"displacement": flow["noise"], "turn": flow["attitude_noise"]}
+    if "magnetic_field" in info:
+        known["field"] = _three(info["magnetic_field"])
     sensors = OutdoorSensors(
         imu=info["imu_noise"],
-        gps=noise["gps"]["noise"],
-        gps2=noise["gps2"]["noise"],
-        altimeter=noise["altimeter"]["noise"],
-        magnetometer=noise["magnetometer"]["noise"],
-        displacement=noise["optical_flow"]["noise"],
-        turn=noise["optical_flow"]["attitude_noise"],
-        field=_three(info["magnetic_field"]),
         gps_lever=_three(info.get("gps_lever", (0.0, 0.0, 0.0))),
         gps2_lever=_three(info.get("gps2_lever", (0.0, 0.0, 0.0))),
+        **known,
     )
-    force, field = streams["imu"]["specific_force"][0], streams["magnetometer"]["field"][0]
-    turn = attitude_of_two(force, field, earth=sensors.field)
-    return (
-        streams,
-        sensors,
-        OutdoorStart(streams["gps"]["position"][0], turn, _spread(sensors, streams["imu"])),
-    )
+    return streams, sensors, *_start(flight, streams, sensors)
+
+
+def _start(
+    flight: Flight, streams: dict[str, Series], sensors: OutdoorSensors
+) -> tuple[OutdoorStart, tuple[str, ...]]:
+    """Where to start, and what is assumed for it."""
+    notes, spread = [], _spread(sensors, streams["imu"])
+    truth = flight.truth
+    receiver = next((name for name in ("gps", "gps2") if name in streams), None)
+    place = np.zeros(3)
+    if receiver is not None:
+        place = streams[receiver]["position"][0]
+    elif truth is not None and "position" in truth.leaves:
+        place = truth["position"][0]
+        notes.append(note("assumed", "the position at the start is the truth's: no receiver tells it"))
+    else:
+        spread = replace(spread, position=LOST)
+        notes.append(note("assumed", "the start is the origin, for all that is known: no receiver is there"))
+    force = streams["imu"]["specific_force"][0]
+    if "magnetometer" in streams:
+        turn = attitude_of_two(force, streams["magnetometer"]["field"][0], earth=sensors.field)
+    elif truth is not None and "attitude" in truth.leaves:
+        turn = np.asarray(level(truth["attitude"][0], force, xp=np))
+        spread = replace(spread, heading=StartSpread().heading)
+        notes.append(note("assumed", "the heading at the start is the truth's: no magnetometer tells it"))
+    else:
+        turn = np.asarray(level(np.array([1.0, 0.0, 0.0, 0.0]), force, xp=np))
+        spread = replace(spread, heading=math.pi)
+        notes.append(note("assumed", "the heading at the start is 0, for all that is known"))
+    return OutdoorStart(place, turn, spread), tuple(notes)
 
 
 def _spread(sensors: OutdoorSensors, imu: Series) -> StartSpread:
     """How wrong an attitude of one force and one field is; what tilts the field turns the heading too."""
     period = float(np.median(np.diff(imu.time))) * 1e-9 if len(imu) > 1 else 1.0
     tilt = max(sensors.imu.accelerometer / math.sqrt(period) / 9.81, 0.01)
+    if sensors.magnetometer is None:
+        return StartSpread(tilt=tilt)
     x, y, z = sensors.field
-    level = max(math.hypot(x, y), 1e-12)
-    heading = math.hypot(sensors.magnetometer / level, tilt * z / level)
+    across = max(math.hypot(x, y), 1e-12)
+    heading = math.hypot(sensors.magnetometer / across, tilt * z / across)
     return StartSpread(tilt=tilt, heading=min(heading, math.pi))
 
 
@@ -166,7 +231,9 @@ def _three(values: npt.ArrayLike) -> Vector:
 
 def _without_gaps(name: str, streams: dict[str, Series]) -> None:
     """Refuse optical flow of which a reading does not begin where the one before it ended."""
-    flow = streams["optical_flow"]
+    flow = streams.get("optical_flow")
+    if flow is None:
+        return
     first = min(int(s.time[0]) for s in streams.values())
     since = np.diff(flow.time, prepend=first) * 1e-9
     gap = np.flatnonzero(np.abs(since - flow["interval"]) > 1e-6)

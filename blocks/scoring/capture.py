@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flowgraph import Case, Result
-from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.kalman.smoothing import Smoothing
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.recordings import pose_recording
 from flowgraph.blocks.scoring.cases import OnFlight, PoseFilter
@@ -27,7 +27,7 @@ def on_capture(
     *,
     start: Callable[..., Any],
     believed: Callable[[Any], Gaussian],
-    steps: Callable[[Result], Steps] | None = None,
+    steps: Callable[[Result], Smoothing] | None = None,
     **settings: Any,
 ) -> Case:
     """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.

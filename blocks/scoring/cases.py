@@ -15,6 +15,7 @@ import functools
 import inspect
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
 from flowgraph.blocks.kalman.robust import ROBUST
-from flowgraph.blocks.kalman.smoothing import Steps
+from flowgraph.blocks.kalman.smoothing import Smoothing
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
@@ -43,6 +44,7 @@ from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import GRAVITY
 from flowgraph.data.notes import note, said
+from flowgraph.data.settings import need_settings_taken
 from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
 
@@ -149,6 +151,7 @@ class OnFlight:
         inputs: Mapping[str, Series] | None = None,
         estimate: str | None = None,
         sizes: Mapping[str, int] | None = None,
+        files: Mapping[str, Callable[[Result, Path], None]] | None = None,
         **settings: Any,
     ) -> Case:
         """The graph, built on the clocks of its inputs.
@@ -158,6 +161,7 @@ class OnFlight:
             inputs: by source; those that were needed if left out.
             estimate: the collected stream that it is of; the one that is scored if left out.
             sizes, settings: as for `build`.
+            files: as for `Case`.
         """
         inputs = dict(self.inputs if inputs is None else inputs)
         noted = ["imu"] if "imu" in inputs else []
@@ -167,9 +171,8 @@ class OnFlight:
         smoothed = getattr(score, "smoothing", False)
         built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
         self.notes.extend(said_of_late)
-        return Case(
-            built, inputs, score, given(estimate, getattr(score, "estimate", "belief")), said(self.notes)
-        )
+        named = given(estimate, getattr(score, "estimate", "belief"))
+        return Case(built, inputs, score, named, said(self.notes), given(files, {}))
 
 
 def on_flight(
@@ -179,6 +182,7 @@ def on_flight(
     told: Callable[[Flight], Flight] | None = None,
     measured: Collection[str] | None = (),
     ranged: bool = True,
+    unsmoothed: str | None = None,
 ) -> Callable[[Callable[..., Case]], Callable[..., Case]]:
     """Decorator: registers `function(on, *, settings) -> Case` as that which makes a case of a flight.
 
@@ -192,6 +196,7 @@ def on_flight(
         measured: streams of controls that the graph takes as measurements, which correct by their finite
             entries; None where it takes whole measurements only.
         ranged: whether it takes what inertial sensors read, so that it has the settings of `Ranges`.
+        unsmoothed: why its runs cannot be smoothed, where they cannot.
 
     Raises:
         DataError: by what is registered, where a stream is missing or empty.
@@ -205,6 +210,7 @@ def on_flight(
 
         @functools.wraps(function)
         def prepare(*args: Any, **keywords: Any) -> Case:
+            need_settings_taken(prepare, keywords, graph.name)
             try:
                 bound = signature.bind(*args, **keywords)
             except TypeError as error:
@@ -224,6 +230,10 @@ def on_flight(
         prepare.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()}
         prepare.__doc__ = known.documentation
         prepare.scoring = known.scoring  # type: ignore[attr-defined]
+        if unsmoothed is not None:
+            prepare.refused = dict.fromkeys(  # type: ignore[attr-defined]
+                ("smooth", "lag"), f"the runs of this graph cannot be smoothed: {unsmoothed}"
+            )
         return graph.on_flight(prepare)
 
     return register
@@ -250,15 +260,16 @@ class Scored(Settings):
         *,
         estimate: str = "belief",
         innovations: bool = True,
-        steps: Callable[[Result], Steps] | None = None,
-        recording: Recording | None = None,
+        steps: Callable[[Result], Smoothing] | None = None,
+        recording: Recording | str | None = None,
     ) -> Scorer:
-        """The score of a run on that flight; see `Scorer`."""
+        """The score of a run on that flight; see `Scorer`. In place of a recording it may be said why
+        there is no batch estimate."""
         truth = on.flight.truth
         more = self._smoother(on, recording)
         return Scorer(truth, errors, estimate, self.settle, innovations, steps, *more)
 
-    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
+    def _smoother(self, on: OnFlight, recording: Recording | str | None) -> tuple[Any, ...]:
         return ()
 
 
@@ -283,15 +294,16 @@ class Smoothed(Scored):
         """Whether a graph is to collect what a smoother needs."""
         return self.smooth != "none" or self.lag is not None
 
-    def _smoother(self, on: OnFlight, recording: Recording | None) -> tuple[Any, ...]:
-        if self.smooth == "batch" and recording is None:
+    def _smoother(self, on: OnFlight, recording: Recording | str | None) -> tuple[Any, ...]:
+        if self.smooth == "batch" and not isinstance(recording, Recording):
             raise DeclarationError(
-                "this graph has no batch estimate",
+                "this graph has no batch estimate" + (f": {recording}" if recording else ""),
                 path=f"{on.name}.smooth",
                 expected="rts",
                 got="batch",
                 fix="write smooth=rts",
             )
+        recording = recording if isinstance(recording, Recording) else None
         return self.smooth, self.lag, recording, loss_of(self.loss)
 
 

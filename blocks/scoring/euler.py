@@ -24,7 +24,7 @@ from flowgraph.blocks.models.euler_ins import (
     start_gaussian,
     with_heading,
 )
-from flowgraph.blocks.models.recordings import euler_recording
+from flowgraph.blocks.models.recordings import euler_recording, velocity_recording
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
     Adapted,
@@ -33,6 +33,7 @@ from flowgraph.blocks.scoring.cases import (
     OnFlight,
     PoseAided,
     Scored,
+    Smoothed,
     SmoothedPoseFilter,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
@@ -50,6 +51,7 @@ __all__ = [
     "EulerModel",
     "EulerOrder",
     "EulerPose",
+    "EulerVelocity",
     "FarPoints",
     "ScaledFactors",
     "SingularityWarning",
@@ -197,6 +199,30 @@ class EulerFilter(EulerKalman, EulerPose, SmoothedPoseFilter):
 
 
 @dataclass(frozen=True)
+class EulerVelocity(EulerKalman, Smoothed):
+    """What is set of a Kalman filter with Euler angles that is corrected by a camera's velocities."""
+
+    def judge(
+        self, on: OnFlight, inputs: Mapping[str, Series], start: Any, known: Mapping[str, Any]
+    ) -> EulerScore:
+        """The score of a run, and of the smoothed one."""
+        steps = partial(euler_steps, order=self.order)
+        told = (
+            "noise",
+            "order",
+            "reading",
+            "gravity",
+            "held",
+            "mount",
+            "rate",
+            "rate_noise",
+            "velocity_noise",
+        )
+        recording = velocity_recording(inputs, start=start, **{name: known[name] for name in told})
+        return EulerScore(self.score(on, pose_errors, steps=steps, recording=recording), self.order)
+
+
+@dataclass(frozen=True)
 class FarPoints(Settings):
     """Where the sigma points of state and noises lie.
 
@@ -267,6 +293,11 @@ class EulerScore:
 
     usual: Scorer
     order: str
+
+    @property
+    def smoothing(self) -> bool:
+        """Whether the smoothed runs are compared too."""
+        return self.usual.smoothing
 
     def __call__(self, result: Result) -> dict[str, float]:
         cosine = result["angles"]["cosine"]

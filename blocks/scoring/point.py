@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,13 @@ from flowgraph import Case, DataError, Flight, Series, arrays
 from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
+from flowgraph.blocks.models.recordings import point_recording
 from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.start import from_first
 from flowgraph.blocks.scoring.streams import told_acceleration
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, reading_of
-from flowgraph.blocks.signals import PointReading, Position
+from flowgraph.blocks.signals import PointReading, Position, WorldAcceleration
 
 __all__ = ["PointFilter", "on_point", "positions", "readings"]
 
@@ -52,16 +54,24 @@ def on_point(on: OnFlight, filter: PointFilter, inputs: Mapping[str, Series]) ->
     if held is None and "reading" in inputs and np.isnan(inputs["reading"]["acceleration"]).any():
         held = Held(after=1.0, rate=0.0, force=0.0)  # a control is missing, none for long
     density = given(filter.accelerometer_noise, imu_noise_of(on.name, on.flight).accelerometer)
-    return on.case(
-        filter.score(on, point_errors, steps=partial(point_steps, model=point_model(density))),
-        inputs=inputs,
-        start=start_point(place),
-        noise=density,
-        position_noise=on.noise("position_noise", filter.position_noise),
-        control=reading_of(on.flight),
-        held=held,
-        **filter.gating(),
-    )
+    known: dict[str, Any] = {
+        "start": start_point(place),
+        "noise": density,
+        "position_noise": on.noise("position_noise", filter.position_noise),
+        "control": reading_of(on.flight),
+        "held": held,
+    }
+    seen = inputs["reading"] if "reading" in inputs else inputs["position"]
+    controls = _controls(seen) if "reading" in inputs else inputs["acceleration"]
+    steps = partial(point_steps, model=point_model(density))
+    score = filter.score(on, point_errors, steps=steps, recording=point_recording(seen, controls, **known))
+    return on.case(score, inputs=inputs, **known, **filter.gating())
+
+
+def _controls(readings: Series) -> Series:
+    """Those of records that have one."""
+    values = WorldAcceleration(acceleration=readings["acceleration"])
+    return readings.holding(values, "acceleration")[np.isfinite(readings["acceleration"]).all(axis=-1)]
 
 
 def positions(vicon: Series) -> Series:

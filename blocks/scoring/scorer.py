@@ -14,7 +14,7 @@ from typing import Any
 
 from flowgraph import Graph, Result, Series, Stream
 from flowgraph.blocks.filtering.batch import Loss, Recording
-from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.kalman.smoothing import Smoothing
 from flowgraph.blocks.metrics.chi_square import chi_square_band
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
 from flowgraph.blocks.metrics.errors import pose_errors
@@ -36,6 +36,8 @@ SMOOTHED = (
     "attitude_rmse_deg",
     "tilt_rmse_deg",
     "heading_rmse_deg",
+    "inclination_rmse_deg",
+    "total_rmse_deg",
     "nees_mean",
     "nees_inside",
 )
@@ -68,7 +70,7 @@ class Scorer:
     estimate: str = "belief"
     settle: float = 1.0
     innovations: bool = True
-    steps: Callable[[Result], Steps] | None = None
+    steps: Callable[[Result], Smoothing] | None = None
     smooth: str = "none"
     lag: float | None = None
     recording: Recording | None = None
@@ -95,16 +97,15 @@ class Scorer:
             found.update({front + key: value for key, value in nis_summary(series).items()})
         smoothed: dict[str, Any] = {}
         if self.smoothing and self.steps is not None:
-            prior, posterior, transition, space, named = self.steps(result)
+            steps = self.steps(result)
             if self.smooth != "none":
-                smoothed["smoothed"] = rauch_tung_striebel(prior, posterior, transition, space=space)
+                smoothed["smoothed"] = steps.smoothed()
             if self.smooth == "batch" and self.recording is not None:
                 smoothed["smoothed"] = self.recording(smoothed["smoothed"], self.loss)
             if self.lag is not None:
-                ticks = lag_ticks(posterior.time, self.lag)
-                smoothed["lagged"] = fixed_lag(prior, posterior, transition, ticks, space=space)
+                smoothed["lagged"] = steps.lagged(self.lag)
             for front, series in smoothed.items():
-                better = self._compared(named(series))
+                better = self._compared(steps.named(series))
                 telling = getattr(self.errors, "telling", SMOOTHED.__contains__)
                 found.update({f"{front}_{key}": value for key, value in better.items() if telling(key)})
         return found

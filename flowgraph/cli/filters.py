@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -276,6 +277,7 @@ def _write_report(
     with writing(metrics) as file:
         put(file, json.dumps(report, indent=1, allow_nan=False) + "\n")
     pictures = _pictures(case, flight, result, estimate)
+    pictures |= {name: partial(write, result) for name, write in case.files.items()}
     failed = [failure for name, draw in pictures.items() if (failure := _draw(out / name, draw))]
     if failed:
         report = {**report, "notes": [*report.get("notes", ()), *failed]}

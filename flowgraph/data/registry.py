@@ -48,6 +48,8 @@ class Case:
             `order`, the convention of the graph's own angles, in which pictures draw them: "zyx" or "zxy".
         estimate: name of the collected stream that the score and the pictures are of.
         notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
+        files: what `--out` writes beside what it writes of every run: by name, what writes a result to a
+            path.
     """
 
     graph: Graph
@@ -55,6 +57,7 @@ class Case:
     score: Callable[[Result], dict[str, float]]
     estimate: str = "belief"
     notes: tuple[str, ...] = ()
+    files: Mapping[str, Callable[[Result, Path], None]] = field(default_factory=dict)
 
     @property
     def order(self) -> str:

@@ -5,14 +5,21 @@ from __future__ import annotations
 import inspect
 import math
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["keyword_types", "of_any_stream", "parsed_settings", "setting_names", "text"]
+__all__ = [
+    "keyword_types",
+    "need_settings_taken",
+    "of_any_stream",
+    "parsed_settings",
+    "setting_names",
+    "text",
+]
 
 
 def setting_names(function: Callable[..., Any]) -> list[str]:
@@ -42,6 +49,7 @@ def parsed_settings(
     Raises:
         UnknownNameError: for a key that is in neither; DeclarationError: for a text that is no such value.
     """
+    need_settings_taken(function, given, path)
     types = keyword_types(function)
     own = list(types)
     mine: dict[str, Any] = {}
@@ -57,6 +65,22 @@ def parsed_settings(
         else:
             raise UnknownNameError("setting", key, [*own, *also], path=path)
     return mine, rest
+
+
+def need_settings_taken(function: Callable[..., Any], given: Iterable[str], path: str) -> None:
+    """Refuse settings that others of its kind have and a function cannot, with the reason that it gives: its
+    attribute `refused`, by name.
+
+    Raises:
+        DeclarationError: naming the setting.
+    """
+    refused: Mapping[str, str] = getattr(function, "refused", {})
+    for key in given:
+        if key in refused:
+            raise DeclarationError(
+                refused[key], path=f"{path}.{key}", expected="no such setting", got=key,
+                fix=f"leave {key} out, or choose another graph",
+            )  # fmt: skip
 
 
 def of_any_stream(key: str, also: Sequence[str]) -> bool:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_ins", "plot_space"]
+__all__ = ["plot_ins", "plot_map", "plot_space"]
 
 _SEEN = COLOURS[1]
 _MOST_POINTS = 2000
@@ -34,6 +34,54 @@ _UNITS = {
     "gyro_bias": ("rad/s", "xyz"),
     "accelerometer_bias": ("m/s$^2$", "xyz"),
 }
+
+
+@canvas.picture
+def plot_map(estimate: Series, truth: Series | None = None, file: str | Path | None = None) -> Figure:
+    """The way over the ground from above, with a bar of scale and an arrow to the north.
+
+    Args:
+        estimate, truth: series with `position` (3), m: east, north, up.
+        file: ending in .png, .svg or .pdf.
+
+    Raises:
+        DataError: where a series is empty or has no positions.
+        UnknownNameError: for an unknown file ending.
+    """
+    _need_positions(estimate)
+    figure = canvas.new_figure(7.0, 7.0)
+    axis: Any = figure.add_subplot()
+    if truth is not None and "position" in truth.leaves and len(truth):
+        axis.plot(*_thinned(truth)[:, :2].T, color=TRUTH, label="truth")
+    way = _thinned(estimate)
+    axis.plot(*way[:, :2].T, color=COLOURS[0], label="estimate")
+    axis.plot(*way[0, :2], "o", color=COLOURS[0], label="start")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_axis_off()
+    axis.margins(0.1)
+    wide = max(float(np.ptp(way[:, 0])), float(np.ptp(way[:, 1])), 1e-3)
+    bar = _round_length(0.3 * wide)
+    west, south = float(way[:, 0].min()), float(way[:, 1].min()) - 0.08 * wide
+    axis.plot([west, west + bar], [south, south], color="black", linewidth=3.0)
+    axis.annotate(
+        f"{bar:g} m", (west + 0.5 * bar, south), (0.0, -14.0), textcoords="offset points", ha="center"
+    )
+    axis.annotate(
+        "N", (0.95, 0.97), (0.95, 0.86), xycoords="axes fraction", ha="center", fontsize="large",
+        arrowprops={"arrowstyle": "<-", "color": "black"},
+    )  # fmt: skip
+    axis.legend(loc="upper left")
+    return canvas.save(figure, file)
+
+
+def _thinned(series: Series) -> np.ndarray:
+    return np.asarray(series["position"][:: max(len(series) // _MOST_POINTS, 1)])
+
+
+def _round_length(most: float) -> float:
+    """The longest of 1, 2, 5 times a power of ten that is no longer."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(power * step for step in (1.0, 2.0, 5.0) if power * step <= most * (1.0 + 1e-12)))
 
 
 @canvas.picture

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from flowgraph import DeclarationError, FlowgraphError, PluginError, UnknownNameError, find_graph, load_flight
-from flowgraph.study import Study, read_table, run_study
+from flowgraph.study import OnDask, Study, read_table, run_study
 from flowgraph.study.report import write_report
 from tests.cli.test_cli import invoke
 
@@ -74,8 +74,18 @@ def test_a_table_feeds_it_by_the_names_of_its_head_or_by_settings(here: Path):
     assert "streams steering, fix" in without.stderr
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neither(here: Path, workers: int):
+@pytest.mark.parametrize(
+    "workers",
+    [
+        1,
+        pytest.param(2, marks=pytest.mark.slow),
+        pytest.param("dask", marks=pytest.mark.slow),
+    ],
+)
+def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neither(
+    here: Path, workers: int | str
+):
+    """In this process, in others, and in workers of Dask, which run the file themselves."""
     (here / "small.toml").write_text(
         'graphs = ["own_tracker.py:tracker"]\ndata = ["own_tracker.py:drive"]\nseeds = 2\n'
         'engine = "reference"\n[parameters]\nduration = 3\n'
@@ -84,7 +94,12 @@ def test_a_study_finds_graph_and_flight_beside_its_file_and_a_report_runs_neithe
     study = Study.load(here / "small.toml")
     assert study.graphs == (f"{here / 'own_tracker.py'}:tracker",)
     assert len(list(study.combinations(study.graphs[0]))) == 2
-    outcome = run_study(study, here / "out", workers=workers)
+    if isinstance(workers, str):
+        pytest.importorskip("distributed")
+        with OnDask(workers=2) as executor:
+            outcome = run_study(study, here / "out", executor=executor)
+    else:
+        outcome = run_study(study, here / "out", workers=workers)
     assert (outcome.done, outcome.failed) == (4, [])
     rows = read_table(here / "out")
     assert len({row["position_rmse_m"] for row in rows}) == 4  # of two seeds, at two settings

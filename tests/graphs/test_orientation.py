@@ -32,11 +32,19 @@ from flowgraph.blocks.geometry.rotations import (
 from flowgraph.blocks.inertial.alignment import rest_seconds
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro
 from flowgraph.blocks.metrics.errors import orientation_errors
-from flowgraph.blocks.orientation.accelerometer import STATE, roll_pitch_attitude, see_rate_and_gravity
-from flowgraph.blocks.signals import Attitude, Imu
+from flowgraph.blocks.orientation.accelerometer import (
+    STATE,
+    orientation_crossing,
+    roll_pitch_attitude,
+    see_rate_and_gravity,
+    turn_by_rate,
+)
+from flowgraph.blocks.signals import Attitude, Gaussian, Imu
 from flowgraph.blocks.world import RoundTrip
 from flowgraph.graphs import gyro_integration, quaternion_ukf, roll_pitch
 from flowgraph.graphs.benches.ese650 import PUBLISHED
+from flowgraph.graphs.quaternion_ukf import KRAFT
+from flowgraph.recorder.derivatives import jacobian
 from tests.graphs.estimation import engines_agree, is_lowered_and_drawn
 from tests.recordings import recordings
 
@@ -350,3 +358,17 @@ def test_where_the_truth_is_unknown_nothing_is_compared():
     gappy[:] = np.nan
     with pytest.raises(DataError, match=r"no tick of the estimate[\s\S]*where the truth is known"):
         orientation_errors(a_series(estimate), a_series(gappy))
+
+
+def test_what_the_orientation_filter_goes_back_by_is_the_linear_one_where_it_is_sure():
+    """D = P F^T, of noise that is added before the points are drawn."""
+    mean = np.concatenate([[0.9, 0.1, -0.3, 0.3], [0.4, -0.2, 0.7]])
+    mean[:4] /= np.linalg.norm(mean[:4])
+    root = np.random.default_rng(0).normal(size=(6, 6)) * 1e-4
+    P, dt = root @ root.T, 0.05
+    crossing = orientation_crossing(np.eye(6) * 1e-7, KRAFT)
+    found = crossing(Gaussian(mean=mean, covariance=P), None, dt, np)
+    after = turn_by_rate(mean, None, None, dt, np)
+    move = lambda e, xp: STATE.minus(turn_by_rate(STATE.plus(mean, e, xp), None, None, dt, xp), after, xp)
+    F = jacobian(move, np.zeros(6), np)[1]
+    np.testing.assert_allclose(found, P @ F.T, atol=1e-3 * np.abs(P).max())

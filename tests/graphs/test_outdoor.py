@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from flowgraph.blocks.outdoor.belief import (
     observe_distance,
     observe_flow,
 )
-from flowgraph.blocks.outdoor.flight import OutdoorSensors, attitude_of_two, outdoor_flight
+from flowgraph.blocks.outdoor.flight import AIDS, OutdoorSensors, attitude_of_two, outdoor_flight
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.study import Study, read_table, run_study
@@ -133,7 +134,7 @@ def test_they_are_lowered_and_drawn():
 def test_the_start_is_read_from_the_first_force_and_field():
     f = flight(0, 3.0)
     assert f.truth is not None
-    _, _, start = outdoor_flight(f, "test")
+    _, _, start, _ = outdoor_flight(f, "test")
     off = np.radians(geodesic_angle(start.attitude, f.truth["attitude"][0]))
     assert off < 3.0 * np.hypot(np.sqrt(2.0) * start.spread.tilt, start.spread.heading)
     exact = attitude_of_two([0.0, 0.0, 9.81], [0.0, 25e-6, -43e-6], earth=[0.0, 25e-6, -43e-6])
@@ -152,11 +153,73 @@ def test_a_dead_sensor_is_no_hindrance():
 
 
 @pytest.mark.parametrize("graph", [rbpf_outdoor, outdoor_eskf])
-def test_a_flight_without_a_sensor_is_refused(graph):
+@pytest.mark.parametrize(("left", "lacking"), [("imu", "beside an inertial unit"), ("gps", "needs")])
+def test_a_flight_without_a_sensor_is_refused(graph, left, lacking):
     f = flight()
-    less = {name: s for name, s in f.streams.items() if name != "gps2"}
-    with pytest.raises(DataError, match=f"lacks what {graph.name} needs"):
-        graph.case(dataclasses.replace(f, streams=less))
+    with pytest.raises(DataError, match=f"lacks what {graph.name} needs.*{lacking if left == 'imu' else ''}"):
+        graph.case(dataclasses.replace(f, streams={left: f.streams[left]}))
+
+
+def test_a_sensor_of_which_nobody_says_the_noise_is_refused():
+    _, sensors, *_ = outdoor_flight(flight(), "test")
+    less = dataclasses.replace(sensors, gps2=None)
+    with pytest.raises(DeclarationError, match=r"nobody says the noise[\s\S]*gps2="):
+        less.noise("gps2")
+
+
+SUBSETS = [
+    subset for n in range(1, len(AIDS) + 1) for subset in itertools.combinations(AIDS, n)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("graph", "subsets"),
+    [
+        (rbpf_outdoor, [s for s in SUBSETS if len(s) == 1]),
+        (outdoor_eskf, [s for s in SUBSETS if len(s) in (1, 4)]),
+        pytest.param(rbpf_outdoor, SUBSETS, marks=pytest.mark.slow),
+        pytest.param(outdoor_eskf, SUBSETS, marks=pytest.mark.slow),
+    ],
+)
+def test_any_subset_of_the_sensors_will_do(graph, subsets):
+    """It builds and runs, finite and, where a receiver is there, near where it should be; slowly, all 31."""
+    f = flight(1, 0.7)
+    few = {"particles": 40} if graph is rbpf_outdoor else {}
+    for subset in subsets:
+        case = graph.case(dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", *subset)}), **few)
+        result = simulate(case.graph, case.inputs)
+        assert {n for n in AIDS if f"{n}_innovation" in result.series} == set(subset)
+        belief = result["belief"]
+        assert np.isfinite(belief["covariance"]).all(), subset
+        score = case.score(result)
+        assert score["position_rmse_m"] < (1.5 if {"gps", "gps2"} & set(subset) else 3.0), subset
+        told = " ".join(case.notes)
+        assert ("heading at the start" in told) == ("magnetometer" not in subset)
+        assert ("position at the start" in told) == (not {"gps", "gps2"} & set(subset))
+
+
+def test_a_start_that_nobody_tells_says_how_little_it_knows():
+    f = dataclasses.replace(flight(1, 1.0), truth=None)
+    case = outdoor_eskf.case(dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", "altimeter")}))
+    told = " ".join(case.notes)
+    assert "for all that is known: no receiver" in told
+    assert "the heading at the start is 0" in told
+    _, _, start, _ = outdoor_flight(
+        dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", "altimeter")}), "t"
+    )
+    assert start.spread.position == 100.0
+    assert start.spread.heading == np.pi
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("graph", [rbpf_outdoor, outdoor_eskf])
+@pytest.mark.parametrize("subset", [("gps",), ("magnetometer", "altimeter"), ("gps2", "optical_flow")])
+def test_a_subset_is_equal_in_all_engines(graph, subset):
+    pytest.importorskip("jax")
+    f = flight(0, 0.6)
+    few: dict[str, Any] = {"particles": 30} if graph is rbpf_outdoor else {}
+    case = graph.case(dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", *subset)}), **few)
+    engines_agree(case.graph, case.inputs)
 
 
 def test_a_flight_that_does_not_tell_its_noise_is_refused():
@@ -179,7 +242,7 @@ def test_settings_out_of_range_are_refused(setting):
 
 
 def test_sensors_without_noise_are_refused():
-    _, sensors, _ = outdoor_flight(flight(), "test")
+    _, sensors, *_ = outdoor_flight(flight(), "test")
     assert isinstance(sensors, OutdoorSensors)
     with pytest.raises(DeclarationError, match=r"cannot be used[\s\S]*gps=0.0"):
         dataclasses.replace(sensors, gps=0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 
 from flowgraph import Case, DeclarationError, Flight, Series, load_flight, simulate
 from flowgraph.blocks.kalman import backwards, forwards, rauch_tung_striebel, sizes_of, smoother
-from flowgraph.data.registry import find_graph
+from flowgraph.cli.options import case_of
+from flowgraph.data.registry import find_graph, graph_names
 from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.benches.thesis import Noise, bound_of, fly, smoothed_errors
 from tests.graphs.estimation import smooth
+from tests.graphs.library import OWN
 from tests.graphs.test_outdoor import flight as outdoor
 from tests.recordings import recordings
 
@@ -82,13 +85,111 @@ def test_the_smoother_of_a_pose_filter_is_a_pipeline_too():
         np.testing.assert_allclose(found["covariance"], host["covariance"], atol=1e-9, err_msg=engine)
 
 
-def test_what_has_no_batch_says_so():
-    with pytest.raises(DeclarationError, match=r"this graph has no batch estimate[\s\S]*smooth=rts"):
-        made("outdoor_eskf", smooth="batch")
-    with pytest.raises(DeclarationError, match="no smoother that goes back"):
-        made("tracker", smooth="rts", method="imm")
-    with pytest.raises(DeclarationError, match=r"particles have no smoother[\s\S]*smoothed_cloud"):
-        made("tracker", lag=0.5, method="particles")
+WORKS = "works"
+TABLE = {
+    "async_kalman": (WORKS, WORKS),
+    "attitude_mekf": (WORKS, WORKS),
+    "augmented_complementary": ("its gains are set by hand",) * 2,
+    "complementary": ("its gains are set by hand",) * 2,
+    "ekf": (WORKS, WORKS),
+    "gnss_ins": (WORKS, WORKS),
+    "gyro_integration": ("nothing corrects it",) * 2,
+    "imu_calibration": ("its last belief is the smoothed one",) * 2,
+    "ins_ekf_pose": (WORKS, WORKS),
+    "ins_eskf": (WORKS, WORKS),
+    "ins_particle": ("moved by the pose too",) * 2,
+    "ins_ukf_pose": (WORKS, WORKS),
+    "ins_ukf_velocity": (WORKS, WORKS),
+    "kalman": (WORKS, WORKS),
+    "marg": ("no one belief",) * 2,
+    "orientation_complementary": ("its gains are set by hand",) * 2,
+    "outdoor_eskf": (WORKS, WORKS),
+    "particle": (WORKS, "its start is a cloud"),
+    "quaternion_ukf": (WORKS, "calibrated in the run"),
+    "rbpf_indoor": ("a Kalman filter of its own",) * 2,
+    "rbpf_outdoor": ("a Kalman filter of its own",) * 2,
+    "roll_pitch": ("taken by itself",) * 2,
+    "tag_pose": ("taken by itself",) * 2,
+    "tracker": (WORKS, WORKS),
+    "ukf": (WORKS, WORKS),
+}
+"""Of each graph, what `smooth=rts` (and `lag`) and `smooth=batch` do: work, or refuse with a reason."""
+
+
+def test_the_table_has_every_graph():
+    assert set(TABLE) == set(graph_names())
+
+
+@pytest.mark.parametrize("name", [n for n in TABLE if n != "imu_calibration"])
+@pytest.mark.parametrize("setting", ["smooth=rts", "lag=0.2", "smooth=batch"])
+def test_a_setting_works_or_says_why_not(name, setting):
+    """That a case is made; the figures are those of the tests about it."""
+    said = TABLE[name][setting == "smooth=batch"]
+    data, settings = ("course", []) if name == "tag_pose" else OWN.get(name, ("sim", []))
+    make = partial(case_of, name, data, ["duration=0.5", *settings, setting], 0)
+    if said == WORKS:
+        case: Any = make()[0]
+        assert case.score.smoothing
+    else:
+        with pytest.raises(DeclarationError, match=said):
+            make()
+
+
+def test_a_setting_is_refused_from_python_too():
+    with pytest.raises(DeclarationError, match=r"cannot be smoothed: its last|cannot be smoothed: nothing"):
+        find_graph("gyro_integration").case(smooth(1, 1.0), smooth="rts")
+
+
+@pytest.mark.parametrize("name", ["kalman", "async_kalman"])
+def test_the_batch_of_a_linear_filter_is_its_smoother(name):
+    """Where the positions come with the controls, whose steps both then drive alike."""
+    rts, batch = (scored(made(name, 1.8, smooth=how)) for how in ("rts", "batch"))
+    for key in ("smoothed_position_rmse_m", "smoothed_nees_mean"):
+        assert batch[key] == pytest.approx(rts[key], rel=1e-9)
+    assert rts["smoothed_position_rmse_m"] < 0.95 * rts["position_rmse_m"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "attitude_mekf", pytest.param("ins_ukf_velocity", marks=pytest.mark.slow), "particle", "imm",
+        pytest.param("particles", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_others_are_smoothed_too(name):
+    """On average over a few flights: better than the filter, and with `lag` in between or near."""
+    figure = {"attitude_mekf": "attitude_rmse_deg", "ins_ukf_velocity": "attitude_rmse_deg"}.get(
+        name, "position_rmse_m"
+    )
+    graph, more = ("tracker", [f"method={name}"]) if name in ("imm", "particles") else (name, [])
+    data, settings = OWN.get(graph, ("sim", []))
+    settings = [s.replace("particles=60", "particles=300") for s in settings]
+    few = ["particles=300"] if name == "particles" else []
+    found = []
+    for seed in range(3):
+        given = ["duration=2.5", *settings, *more, *few, "smooth=rts", "lag=0.4"]
+        score = scored(case_of(graph, data, given, seed)[0])
+        found.append([score[figure], score[f"smoothed_{figure}"], score[f"lagged_{figure}"]])
+    usual, smoothed, lagged = np.sqrt(np.mean(np.square(found), axis=0))
+    assert smoothed < 0.97 * usual
+    assert lagged < 1.02 * usual
+
+
+@pytest.mark.slow
+def test_the_batch_outdoors_and_of_velocities_is_no_worse_than_the_smoother():
+    for name, figure in (
+        ("outdoor_eskf", "position_rmse_m"),
+        ("ins_ukf_velocity", "attitude_rmse_deg"),
+        ("gnss_ins", "position_rmse_m"),
+    ):
+        data, settings = OWN[name]
+        rts, batch = (
+            scored(case_of(name, data, ["duration=2", *settings, f"smooth={how}"], 0)[0])[
+                f"smoothed_{figure}"
+            ]
+            for how in ("rts", "batch")
+        )
+        assert batch < 1.1 * rts, name
 
 
 @pytest.mark.slow

@@ -116,9 +116,16 @@ class Pen:
         """Transforms of several bodies in one message."""
         self.put(topic, kind, t, self.make(kind, [self.transformed(t, p, body=b) for b, p in at.items()]))
 
-    def fix(self, topic: str, t: int, status: int, lat: float, lon: float, height: float) -> None:
+    def fix(
+        self, topic: str, t: int, status: int, lat: float, lon: float, height: float, covariance: Any = None
+    ) -> None:
         state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
-        self.write(topic, "sensor_msgs/msg/NavSatFix", t, state, lat, lon, height, np.zeros(9), 0)
+        told = (np.zeros(9), 0) if covariance is None else (np.ravel(covariance).astype(float), 3)
+        self.write(topic, "sensor_msgs/msg/NavSatFix", t, state, lat, lon, height, *told)
+
+    def moving(self, topic: str, t: int, v: Any, covariance: Any) -> None:
+        twist = self.make("geometry_msgs/msg/TwistWithCovariance", self.twist(v), np.ravel(covariance))
+        self.write(topic, "geometry_msgs/msg/TwistWithCovarianceStamped", t, twist)
 
     def field(self, topic: str, t: int, v: Any, variance: float = 0.0) -> None:
         self.write(topic, "sensor_msgs/msg/MagneticField", t, self.vector(v), np.full(9, variance))

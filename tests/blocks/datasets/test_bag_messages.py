@@ -8,6 +8,7 @@ import pytest
 from flowgraph import load_flight
 from flowgraph.blocks.datasets import rosbag
 from flowgraph.blocks.datasets.bag_messages import KINDS
+from flowgraph.data.registry import find_graph
 from flowgraph.errors import DeclarationError, UnknownNameError
 from tests.blocks.datasets.bags import MS, Pen, refused
 
@@ -287,3 +288,24 @@ def test_stamps_that_nobody_set_are_refused_with_the_remedy(tmp_path, stamps, go
         refused(tmp_path / "b", "/pose, message", "are not set", got, "vicon.stamp=bag")
     flight = rosbag.load(str(tmp_path / "b"), settings={"stamp": "bag"})
     assert flight.streams["vicon"].time.tolist() == [5_000_000_000 + k * MS for k in range(len(stamps))]
+
+
+def test_fixes_and_velocities_keep_their_covariances(tmp_path):
+    """Of each message; one that is not known is zero, and the filter takes its own for it."""
+    P = np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 16.0]])
+    wide = np.zeros((6, 6))
+    wide[:3, :3] = 0.25 * P
+    with Pen(tmp_path / "b.bag", 1) as pen:
+        for k, t in enumerate(TIMES):
+            pen.imu("/imu", t, [0, 0, 0], [0, 0, 9.81])
+            pen.fix("/gps", t, 0, 47.0, 8.0, 400.0, P * (1 + k) if k else None)
+            pen.moving("/vel", t, [1, 2, 3], wide)
+    flight = rosbag.load(str(tmp_path / "b.bag"), settings={"topics": "imu:/imu,gps:/gps,gps_velocity:/vel"})
+    fixes, speeds = flight.streams["gps"], flight.streams["gps_velocity"]
+    np.testing.assert_array_equal(fixes["covariance"], [0.0 * P, 2.0 * P, 3.0 * P, 4.0 * P])
+    np.testing.assert_array_equal(speeds["covariance"], [0.25 * P] * 4)
+    np.testing.assert_array_equal(speeds["velocity"], [[1.0, 2.0, 3.0]] * 4)
+    case = find_graph("gnss_ins").case(flight)
+    aid = case.inputs["gnss"]["covariance"]
+    np.testing.assert_array_equal(aid[1:], fixes["covariance"][1:])
+    assert np.all(np.linalg.eigvalsh(aid[0]) > 0.0)
