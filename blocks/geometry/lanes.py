@@ -117,9 +117,9 @@ def matrix_product(a: Array, b: Array) -> Array:
 def inverse_and_log_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
     """The inverses (3, 3, n) and log det (n) of symmetric positive matrices (3, 3, n), by L D L^T.
 
-    S = L D L^T with a unit lower triangle L, and S^-1 = M^T D^-1 M with M = L^-1. The pivots are of the size of
-    variances, where a determinant is of the size of their cube, which words of few bits do not hold (Golub and
-    Van Loan, Matrix Computations, section 4.1).
+    S = L D L^T with a unit lower triangle L, and S^-1 = M^T D^-1 M with M = L^-1. The pivots are of the size
+    of variances, where a determinant is of the size of their cube, which words of few bits do not hold (Golub
+    and Van Loan, Matrix Computations, section 4.1).
     """
     first = S[0, 0, :]
     a, b = S[1, 0, :] / first, S[2, 0, :] / first
