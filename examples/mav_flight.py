@@ -2,8 +2,9 @@
 
 The figure of `sim`, flown by a vehicle whose inertial unit lies with its x axis upwards, in another corner
 of the hall each time, with the biases of a cheap unit and the jolts of a vehicle that is carried, started and
-set down. A laser tracker follows a prism and tells its position alone. Number formats for fixed point are
-found on such flights: the sizes of everything matter there, more than the beauty of the path.
+set down. A laser tracker finds a prism late, loses it at times, and tells its position alone. Number formats
+for fixed point are found on such flights: the sizes of everything matter there, more than the beauty of the
+path.
 
     flowgraph quantise ins_eskf --data examples/mav_flight.py:mav --width 32 -o formats
 """
@@ -53,11 +54,15 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
     position = truth["position"] + place
     at = np.searchsorted(truth.time, seen.time)
     prism = seen["position"] + place + np.einsum("nij,j->ni", to_matrix(attitude[at], xp=np), np.array(PRISM))
+    after = (seen.time - seen.time[0]) / 1e9
+    lost = after < draw.uniform(0.3, 1.0)  # the tracker finds the prism late, and loses it now and then
+    for begin in draw.uniform(2.0, duration, 3):
+        lost |= (after > begin) & (after < begin + draw.uniform(0.3, 1.0))
     return Flight(
         f"mav-{seed}",
         {
             "imu": Series(imu.time, Imu(gyro=gyro, specific_force=force), name="imu"),
-            "leica": Series(seen.time, Position(position=prism), name="leica"),
+            "leica": Series(seen.time[~lost], Position(position=prism[~lost]), name="leica"),
         },
         truth=Series(truth.time, Pose(position=position, attitude=attitude), name="truth"),
         info={
