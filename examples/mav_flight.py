@@ -16,12 +16,12 @@ import math
 import numpy as np
 
 from flowgraph import Flight, Series, load_flight
-from flowgraph.blocks.geometry.rotations import multiply, to_matrix
+from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, to_matrix
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, Pose, Position
 
 UPRIGHT = np.array([math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0])
-"""How the unit is turned in the vehicle: its x axis points upwards."""
+"""How the unit is turned in the vehicle, about: its x axis points upwards."""
 
 PRISM = (0.0749, -0.0185, -0.1201)
 """The tracker's prism in the unit's axes, m."""
@@ -41,7 +41,8 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
     draw = np.random.default_rng([seed, 77])
     truth, imu, seen = flown.truth, flown.streams["imu"], flown.streams["vicon"]
     assert truth is not None
-    turn = to_matrix(UPRIGHT, xp=np)
+    mount = multiply(UPRIGHT, from_rotation_vector(draw.uniform(-0.4, 0.4, 3), xp=np), xp=np)
+    turn = to_matrix(mount, xp=np)
     place = draw.uniform(-5.0, 5.0, 3) * [1.0, 1.0, 0.2]
 
     gyro, force = imu["gyro"] @ turn, imu["specific_force"] @ turn
@@ -50,7 +51,7 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
         rate = draw.uniform(-3.0, 3.0, 3)
         force[k], force[k - 1] = force[k] + push, force[k - 1] - push
         gyro[k], gyro[k - 1] = gyro[k] + rate, gyro[k - 1] - rate
-    attitude = multiply(truth["attitude"], UPRIGHT, xp=np)
+    attitude = multiply(truth["attitude"], mount, xp=np)
     position = truth["position"] + place
     at = np.searchsorted(truth.time, seen.time)
     prism = seen["position"] + place + np.einsum("nij,j->ni", to_matrix(attitude[at], xp=np), np.array(PRISM))
