@@ -11,6 +11,7 @@ import sys
 
 from flowgraph.cli import (  # noqa: F401  each adds its commands
     bench,
+    cache,
     calibrate,
     contents,
     filters,

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from flowgraph.cli.options import case_of
-from flowgraph.cli.pages import watcher_of, write_page
+from flowgraph.cli.pages import recorder_of, write_page
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
@@ -27,6 +27,9 @@ from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.run_page import describe_run, run_page, runs_of_page
 from flowgraph.engines.watched import simulate_watched
 from flowgraph.pipeline.costs.places import costs_by_path
+from flowgraph.study import Study, run_study
+from flowgraph.study.report import write_comparison, write_report
+from tests.drawing.test_page import _Reader
 from tests.drawing.test_run_page import flown, result_of
 from tests.test_house import ROOT
 
@@ -133,6 +136,10 @@ class Page:
         return found
 
 
+def reader_of(file: Path) -> _Reader:
+    return _Reader(file.read_text())
+
+
 @pytest.fixture(scope="module")
 def chrome() -> Iterator[Chrome]:
     options = ChromeOptions()
@@ -169,8 +176,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Pat
         case, flight = case_of(name, spec, settings, 0)
         diagram, run = folder / f"{name}.html", folder / f"{name}_run.html"
         diagram_page(case.graph, diagram, costs=costs_by_path(case.graph))
-        recorder = watcher_of(case, "python")
-        assert recorder is not None
+        recorder = recorder_of(case)
         result = simulate_watched(case.graph, case.inputs, recorder)
         streams = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
         recorded = {k: s for k, s in streams.items() if isinstance(s, Series)}
@@ -304,6 +310,10 @@ def test_run(name, scheme, page, pages) -> None:
     wires = page.texts("text.value")
     assert len(wires) > 5
     assert all(w for w in wires)
+    wide = "return [...document.querySelectorAll('text.value')].map(t => t.getBBox().width)"
+    for share in (0.1, 0.4, 0.6):
+        page.slide(share)
+        assert max(page.ask(wide)) <= 120.0  # the room that is left beside a wire
     imu = page.ask("const d = diagram.options.values(0, 0); return [d.short, d.lines[0], d.lines[1]]")
     stamp = float(imu[1].split()[1])
     streams = case.inputs["imu"]
@@ -356,6 +366,99 @@ def test_a_way_far_from_the_origin_is_in_the_picture(page, pages, tmp_path) -> N
     assert picture is not None
     blue = (picture[..., 0].astype(int) - picture[..., 2] > 60).sum()  # the line of the estimate
     assert blue > 100
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The page of a study with two of its runs, and of its comparison with itself."""
+    pytest.importorskip("pyarrow")
+    folder = tmp_path_factory.mktemp("study")
+    noises = [0.005, 0.01, 0.05]
+    study = Study(
+        graphs=["ekf", "ins_eskf"], data=["sim"], seeds=2,
+        parameters={"duration": 1.5, "imu.rate": 50, "position_noise": noises},
+    )  # fmt: skip
+    run_study(study, folder)
+    return {
+        "study": write_report(folder, runs=3).page,
+        "comparison": write_comparison(folder, folder, folder / "both").page,
+    }
+
+
+def test_a_report_leads_to_its_runs(page: Page, reports: dict[str, Path]) -> None:
+    assert reports["study"].stat().st_size < 10_000_000
+    look(page, "dark")
+    page.open(reports["study"], "[data-shown]")
+    assert page.ask("return [...document.querySelectorAll('.chart canvas')].length") == 2
+    assert page.ask("return getComputedStyle(document.querySelector('figure img')).display") == "none"
+    titles = page.texts("select[aria-label=Run] option")
+    assert len(titles) == 3
+    chart = reader_of(reports["study"]).data("charts")[0]
+    dot = next(d for s in chart["series"] for d in s["dots"] if d["run"] not in (0, None))
+    place = page.ask(
+        "const [x, y] = arguments, plot = document.querySelector('.chart .u-over');"
+        "plot.scrollIntoView({block: 'center'}); const box = plot.getBoundingClientRect();"
+        "return [box.width, box.height]",
+        dot["x"], dot["y"],
+    )  # fmt: skip
+    assert place[0] > 600
+    found = page.ask(
+        "const plot = document.querySelector('.chart .u-over'), box = plot.getBoundingClientRect();"
+        "const told = document.querySelector('.chart .words');"
+        "for (let y = 0; y < box.height; y += 3) for (let x = 0; x < box.width; x += 6) {"
+        "  const at = {clientX: box.left + x, clientY: box.top + y, bubbles: true};"
+        "  plot.dispatchEvent(new MouseEvent('mousemove', at));"
+        "  if (told.textContent === arguments[0]) {"
+        "    for (const kind of ['mousedown', 'mouseup', 'click'])"
+        "      plot.dispatchEvent(new MouseEvent(kind, at));"
+        "    return true; } }"
+        "return false",
+        dot["words"],
+    )
+    assert found
+    page.until("return document.querySelector('main').dataset.shown === arguments[0]", str(dot["run"]))
+    assert page.ask("return document.querySelector('select[aria-label=\"Compare with\"]').value") == "0"
+    assert len(page.texts(".figures thead th")) == 2
+    page.slide(0.5)
+    assert len(page.texts("text.value")) > 5
+
+    heads = page.texts(".table button.sort")
+    column = heads.index("q50")
+    page.ask("document.querySelectorAll('.table button.sort')[arguments[0]].click()", column)
+    sorted_ = [float(x) for x in page.texts(f".table table tr td:nth-child({column + 1})")[: len(titles)]]
+    assert sorted_ == sorted(sorted_)
+    assert page.ask("return document.querySelector('th[aria-sort]').textContent") == "q50"
+    page.is_accessible()
+    page.is_quiet()
+
+
+def test_a_comparison_has_its_names_whole(page: Page, reports: dict[str, Path]) -> None:
+    look(page, "light")
+    page.open(reports["comparison"], "[data-charted]")
+    names = reader_of(reports["comparison"]).data("charts")[0]["y"]["names"]
+    assert len(names) > 10
+    page.until("return document.querySelectorAll('.chart canvas').length === 1")
+    longest = page.ask(
+        "const c = document.createElement('canvas').getContext('2d'); c.font = '11px system-ui';"
+        "return Math.max(...arguments[0].map(n => c.measureText(n).width))",
+        names,
+    )
+    room = page.ask(
+        "const p = document.querySelector('.chart .u-over').getBoundingClientRect(),"
+        " h = document.querySelector('.chart .canvas').getBoundingClientRect(); return p.left - h.left"
+    )
+    assert longest < room - 8
+    page.is_accessible()
+    page.is_quiet()
+
+
+def test_a_report_prints_with_its_pictures(page: Page, reports: dict[str, Path]) -> None:
+    page.open(reports["comparison"], "[data-charted]")
+    page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    style = "return getComputedStyle(document.querySelector(arguments[0])).display"
+    assert page.ask(style, "figure img") == "block"
+    assert page.ask(style, ".chart") == "none"
+    page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
 
 
 def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:
