@@ -101,7 +101,8 @@ def fixed(
 
 _COLUMNS = (
     "graph", "bits", "position_difference_rms_m", "attitude_difference_rms_deg", RELATIVE,
-    "decisions_differing", "saturations", "divisions_by_zero", "lost_bits", "values_compared", "values_differing", "reason",
+    "decisions_differing", "saturations", "divisions_by_zero", "lost_bits", "values_compared",
+    "values_differing", "reason",
 )  # fmt: skip
 
 
