@@ -20,7 +20,7 @@ from flowgraph.blocks.geometry import rotations as geometry
 __all__ = [
     "cross",
     "exponential",
-    "inverse_and_determinant",
+    "inverse_and_log_determinant",
     "matrix_product",
     "multiply",
     "normalize",
@@ -114,14 +114,23 @@ def matrix_product(a: Array, b: Array) -> Array:
     return a[:, 0:1, :] * b[0:1, :, :] + a[:, 1:2, :] * b[1:2, :, :] + a[:, 2:3, :] * b[2:3, :, :]
 
 
-def inverse_and_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
-    """The inverses (3, 3, n) and determinants (n) of symmetric matrices (3, 3, n), by cofactors.
+def inverse_and_log_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
+    """The inverses (3, 3, n) and log det (n) of symmetric positive matrices (3, 3, n), by L D L^T.
 
-    The cofactor of (i, j) is a 2 x 2 determinant of the rows and columns that follow i and j cyclically, so
-    all nine come from shifted views of the matrix written out to 5 x 5.
+    S = L D L^T with a unit lower triangle L, and S^-1 = M^T D^-1 M with M = L^-1. The pivots are of the size
+    of variances, where a determinant is of the size of their cube, which words of few bits do not hold (Golub
+    and Van Loan, Matrix Computations, section 4.1).
     """
-    wide = xp.concat([S, S[:2, :, :]], axis=0)
-    wide = xp.concat([wide, wide[:, :2, :]], axis=1)
-    cofactors = wide[1:4, 1:4, :] * wide[2:5, 2:5, :] - wide[1:4, 2:5, :] * wide[2:5, 1:4, :]
-    determinant = xp.sum(S[0, :, :] * cofactors[0, :, :], axis=0)
-    return cofactors / determinant, determinant
+    first = S[0, 0, :]
+    a, b = S[1, 0, :] / first, S[2, 0, :] / first
+    second = S[1, 1, :] - a * S[1, 0, :]
+    rest = S[2, 1, :] - b * S[1, 0, :]
+    c = rest / second
+    third = S[2, 2, :] - b * S[2, 0, :] - c * rest
+    corner = a * c - b  # M = [[1, 0, 0], [-a, 1, 0], [corner, -c, 1]]
+    z = 1.0 / third
+    zx, zy = corner * z, -c * z
+    yx = -a / second - c * zx
+    y, x = 1.0 / second - c * zy, 1.0 / first + a * a / second + corner * zx
+    inverse = xp.stack([xp.stack([x, yx, zx]), xp.stack([yx, y, zy]), xp.stack([zx, zy, z])])
+    return inverse, xp.log(first) + xp.log(second) + xp.log(third)

@@ -285,13 +285,11 @@ def _corrected(
     across = seen(cloud.covariance) * believed[:, None, None]  # (3, 12, n)
     own = seen(lanes.transpose(across, xp=xp)) * believed[:, None, None]
     own = own + xp.asarray((np.eye(3) * variance)[:, :, None], dtype=residual.dtype)
-    inverse, determinant = lanes.inverse_and_determinant(own, xp=xp)
+    inverse, log_determinant = lanes.inverse_and_log_determinant(own, xp=xp)
     u = xp.sum(inverse * residual[None, :, :], axis=1)
     solved = sum(inverse[:, k, None, :] * across[None, k, :, :] for k in range(3))  # (3, 12, n)
     less = sum(across[k, :, None, :] * solved[k, None, :, :] for k in range(3))
-    log_likelihood = -0.5 * (
-        xp.sum(residual * u, axis=0) + xp.log(determinant) + 3.0 * math.log(2.0 * math.pi)
-    )
+    log_likelihood = -0.5 * (xp.sum(residual * u, axis=0) + log_determinant + 3.0 * math.log(2.0 * math.pi))
     state = xp.sum(across * u[:, None, :], axis=0)
     return _moved(cloud, state, cloud.covariance - less, log_likelihood, xp)
 

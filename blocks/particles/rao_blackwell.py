@@ -118,7 +118,7 @@ def correct_motion(
     residual = xp.where(missing[:, None], 0.0, residual)
     vague = 1e8 * (xp.max(xp.sum(P * one, axis=1), axis=-1) + noise**2)
     r = xp.where(missing, vague, noise**2)[:, None, None]
-    inverse, determinant = lanes.inverse_and_determinant(P + one * r, xp=xp)
+    inverse, log_determinant = lanes.inverse_and_log_determinant(P + one * r, xp=xp)
     u = xp.sum(inverse * residual[None, :, :], axis=1)
     inverse_C = lanes.matrix_product(inverse, C)
     distance = xp.sum(residual * u, axis=0)
@@ -129,7 +129,7 @@ def correct_motion(
         cross_covariance=r * inverse_C,
         position_covariance=_symmetric(r * lanes.matrix_product(inverse, P), xp),
     )
-    log_likelihood = -0.5 * (distance + xp.log(determinant) + 3.0 * math.log(2.0 * math.pi))
+    log_likelihood = -0.5 * (distance + log_determinant + 3.0 * math.log(2.0 * math.pi))
     return corrected, LogLikelihood(value=log_likelihood)
 
 

@@ -25,8 +25,9 @@ _FORMAT, _VERSION = "flowgraph-formats", 1
 
 
 def structure_of(pipeline: Pipeline) -> str:
-    """A digest of what formats of a plain pipeline depend on: not its name, and not its real constants."""
-    return digest(structure(replace(pipeline, name="")))
+    """A digest of what formats of a plain pipeline depend on: not its name, rates, or real constants."""
+    inputs = tuple(replace(port, timing=None) for port in pipeline.inputs)
+    return digest(structure(replace(pipeline, name="", inputs=inputs)))
 
 
 def with_formats(pipeline: Pipeline, formats: Formats) -> Pipeline:

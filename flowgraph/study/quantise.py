@@ -339,6 +339,6 @@ def _rms(x: np.ndarray) -> float:
 
 def _turned(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """The angles between quaternions, in rad; those of the words need not be of unit length."""
-    p, q = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (p, q))
+    p, q = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (p, q))
     p = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0.0, -p, p)
     return np.asarray(4.0 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=-1) / 2.0, 0.0, 1.0)))

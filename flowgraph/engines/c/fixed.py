@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any
 
@@ -20,6 +20,7 @@ from flowgraph.engines.options import Meter
 from flowgraph.pipeline.formats import real_numbers
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import needed
+from flowgraph.recorder.ops import Spec
 from flowgraph.types import DTYPES
 
 FLAGS = ("-std=c99", "-O1")
@@ -40,6 +41,8 @@ class CompiledIntegers(Player):
         self.pipeline = pipeline
         self.source = Source(pipeline, patterns)
         self.counts = Counts()
+        by_place = sorted((p, n) for n, p in self.source.place.items())
+        self._places, self._values = np.array([p for p, _ in by_place]), [n for _, n in by_place]
         self._play = load({"fixed.c": self.source.text}, FLAGS).fx_play
         self._play.restype = ctypes.c_int64
 
@@ -99,21 +102,16 @@ class CompiledIntegers(Player):
         """Count the marked words that something takes, and clear the marks."""
         program = self.source.bound[self.source.keys.index(key)].program
         self._ended(off, counts)
-        made = {i.out for i in program.instructions}
-        specs = self.pipeline.specs
-        env = {
-            n: w[p : p + math.prod(specs[n].shape)].reshape(specs[n].shape)
-            for n, p in self.source.place.items()
-            if n >= 0
+        marked = {
+            self._values[k] for k in np.searchsorted(self._places, np.flatnonzero(off[:-1]), "right") - 1
         }
-        taken = needed(program, env)
-        for n in made:
-            p, shape = self.source.place[n], specs[n].shape
+        taken = needed(program, _Words(w, self.source.place, self.pipeline.specs)) if marked else {}
+        for n in marked:
+            p, shape = self.source.place[n], self.pipeline.specs[n].shape
             marks = off[p : p + math.prod(shape)].reshape(shape)
-            if marks.any():
-                mask = taken.get(n, False)
-                counts.add("saturations", n, (marks & 1 > 0) & mask)
-                counts.add("divisions_by_zero", n, (marks & 2 > 0) & mask)
+            mask = taken.get(n, False)
+            counts.add("saturations", n, (marks & 1 > 0) & mask)
+            counts.add("divisions_by_zero", n, (marks & 2 > 0) & mask)
         off[:] = 0
 
     def _ended(self, off: np.ndarray, counts: Counts) -> None:
@@ -161,6 +159,22 @@ class CompiledIntegers(Player):
                 value = bound.program.outputs[port][1][leaf]
                 real[here] = real_numbers(words[here], bound.fractions[value])
         return real
+
+
+class _Words(dict[int, np.ndarray]):
+    """The words of each value, looked up when they are asked for."""
+
+    def __init__(self, w: np.ndarray, place: Mapping[int, int], specs: Mapping[int, Spec]) -> None:
+        super().__init__()
+        self._w, self._place, self._specs = w, place, specs
+
+    def __missing__(self, n: int) -> np.ndarray:
+        p, shape = self._place[n], self._specs[n].shape
+        self[n] = found = self._w[p : p + math.prod(shape)].reshape(shape)
+        return found
+
+    def get(self, n: int, other: Any = None) -> Any:
+        return self[n] if n in self._place else other
 
 
 def _at(x: np.ndarray) -> Any:
