@@ -45,7 +45,7 @@ PERIOD = 5_000_000
 """Of the inertial unit, which is that of control too, ns; each tenth reading there is a pose."""
 
 NOISE = ImuNoise(gyro=2e-3, accelerometer=2e-2, gyro_bias=0.0, accelerometer_bias=0.0)
-POSE = {"position_noise": 0.02, "attitude_noise": 0.02}
+POSE: dict[str, Any] = {"position_noise": 0.02, "attitude_noise": 0.02}
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 HOVER = BodyMotion(
     position=np.zeros(3), velocity=np.zeros(3), acceleration=np.zeros(3), attitude=LEVEL, rate=np.zeros(3)
@@ -103,7 +103,7 @@ def flown(
     return simulate(built, given, engine=engine, seed=seed)
 
 
-KINDS = {
+KINDS: dict[str, dict[str, Any]] = {
     "flown on the truth": {"own": False},
     "flown on the estimate": {},
     "on the estimate, poses 60 ms late": {"latency": 12},

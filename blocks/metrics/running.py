@@ -34,6 +34,7 @@ from flowgraph.blocks.signals import (
     Tally,
 )
 from flowgraph.language.clock import nanoseconds
+from flowgraph.types import leaves_of
 
 __all__ = [
     "nis_score",
@@ -289,7 +290,7 @@ def nis_score(
         probability: of the band of each.
         name: of the nodes.
     """
-    width = dict(innovation.type.fields)["residual"].shape[-1]
+    width = int(dict(leaves_of(innovation.type))["residual"].shape[-1])
     tail, parts = 0.5 * (1.0 - probability), np.maximum(np.arange(width + 1), 1)
     limits = np.stack([chi_square(tail, parts), chi_square(1.0 - tail, parts)])
     sums = nis_sums(innovation, limits=limits, name=f"{name}_sums")

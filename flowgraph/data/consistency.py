@@ -19,7 +19,7 @@ import numpy.typing as npt
 from flowgraph.data.notes import note
 from flowgraph.data.series import Series
 
-__all__ = ["chi_square", "far_nis", "measured"]
+__all__ = ["IN_A_ROW", "chi_square", "far_nis", "measured"]
 
 IN_A_ROW = 5
 """Innovations in a row, taken in or refused, that are more than chance."""

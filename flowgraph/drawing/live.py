@@ -238,6 +238,7 @@ class Sender:
         self._recorder = Recorder(graph, inputs)
         self._begin: tuple[int, float] | None = None
         self._sent = -math.inf
+        self._unsent: tuple[int, int, Mapping[Wire, Any], Mapping[int, Any]] | None = None
         self.ticks = 0
 
     def see(
@@ -253,11 +254,13 @@ class Sender:
             if early > 0.002:
                 clock.sleep(early)
                 now += early
+        self._unsent = time, first, seen, read
         if now - self._sent >= EVERY:
             self._sent = now
-            self._send(time, first, seen, read)
+            self._send(*self._unsent)
 
     def _send(self, time: int, first: int, seen: Mapping[Wire, Any], read: Mapping[int, Any]) -> None:
+        self._unsent = None
         row = self._recorder.row(time, seen, read)
         wires = {
             key: [(at - first) * 1e-9, [float(f"{x:.6g}") if math.isfinite(x) else None for x in values]]
@@ -267,6 +270,8 @@ class Sender:
         self.server.send({"t": (time - first) * 1e-9, "ticks": self.ticks, "wires": wires, "facts": told})
 
     def took(self, blocks: Mapping[str, tuple[float, int]]) -> None:
+        if self._unsent is not None:  # how the run ended is shown, too
+            self._send(*self._unsent)
         each = {path: [1e6 * seconds / max(times, 1), times] for path, (seconds, times) in blocks.items()}
         self.server.send({"ended": True, "ticks": self.ticks, "blocks": each, "facts": dict(self.facts())})
 

@@ -228,9 +228,11 @@ def test_what_a_step_by_hand_leaves_out_is_of_the_order_that_it_says():
 @SEEDS
 def test_how_an_attitude_changes_with_a_small_turn(seed):
     """The closed form of a quaternion is what is derived of any part."""
-    q, part = attitude(np.random.default_rng(seed)), quaternion()
-    np.testing.assert_allclose(part.directions(q, np), Part.directions(part, q, np), atol=1e-12)
-    np.testing.assert_allclose(part.errors(q, np), Part.errors(part, q, np), atol=1e-12)
+    q = attitude(np.random.default_rng(seed))
+    part: Any = quaternion()
+    derived: Any = Part
+    np.testing.assert_allclose(part.directions(q, np), derived.directions(part, q, np), atol=1e-12)
+    np.testing.assert_allclose(part.errors(q, np), derived.errors(part, q, np), atol=1e-12)
 
 
 PARTS = (quaternion(), SO(2), SE(2), SE(3), SE_2(3), SE_2(3, error="world"))

@@ -6,6 +6,7 @@ They need Chromium and its driver, and Selenium; what accessibility asks is aske
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import time
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
+from flowgraph import Scalar, Stream, block, delay, graph, match, periodic
 from flowgraph.cli.options import case_of
 from flowgraph.cli.pages import recorder_of, write_page
 from flowgraph.data.registry import Case
@@ -51,6 +53,21 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="no chromium with chromedriver on PATH"),
 ]
+
+
+@block
+def total(before: Scalar, value: Scalar) -> Scalar:
+    """The sum."""
+    return before + value
+
+
+@graph
+def paired(a: Stream[Scalar], b: Stream[Scalar]):
+    """Two sensors of one rate, paired, and a sum."""
+    before = delay(7.25, name="held")
+    now = total(before, a)
+    before.feed(now)
+    return {"sum": now, "pairs": match(a, b, tolerance="6ms", size=4, name="pairs")}
 
 
 class Page:
@@ -240,6 +257,58 @@ def test_graphs_fold_and_unfold_by_mouse_and_by_key(page, pages) -> None:
     )
     page.until("return document.querySelector('.selected text.name')?.textContent === 'pose'")
     assert page.texts(".frame.shut") == []
+    page.is_quiet()
+
+
+def test_a_diagram_is_moved_enlarged_and_read_by_keys(page, pages) -> None:
+    """Arrows, + and - and 0; the legend's colour is the wire's, and who points at a clock sees its wires."""
+    look(page, "light")
+    page.open(pages["ins_eskf"][0], "[data-drawn]")
+    place = "return document.querySelector('svg.diagram > g').getAttribute('transform')"
+    frame = page.find("svg.diagram")
+    page.ask("document.querySelector('svg.diagram').focus()")
+    places = [page.ask(place)]
+    for key in (Keys.ARROW_RIGHT, "+", "-", Keys.ARROW_DOWN):
+        frame.send_keys(key)
+        places.append(page.ask(place))
+    assert all(a != b for a, b in itertools.pairwise(places))
+    frame.send_keys("0")
+    fitted = page.ask(place)
+    frame.send_keys("+")
+    frame.send_keys("0")
+    assert page.ask(place) == fitted
+    colours = page.ask(
+        "return [...document.querySelectorAll('.legend .clock')].map(b =>"
+        " getComputedStyle(b.querySelector('.swatch')).backgroundColor)"
+    )
+    drawn = page.ask(
+        "return [...document.querySelectorAll('.line .stroke')].map(l => getComputedStyle(l).stroke)"
+    )
+    assert len(set(colours)) == len(colours) > 3
+    assert set(drawn) == set(colours)
+    clock = page.chrome.find_elements(By.CSS_SELECTOR, ".legend .clock")[1]
+    ActionChains(page.chrome).move_to_element(clock).perform()
+    page.until("return document.querySelectorAll('.line.faint').length > 0")
+    alone = page.ask(
+        "return [...document.querySelectorAll('.line:not(.faint) .stroke')]"
+        ".map(l => getComputedStyle(l).stroke)"
+    )
+    assert set(alone) == {colours[1]}
+
+
+def test_memory_is_shown_where_it_is(page, tmp_path) -> None:
+    """The bound of a queue, and the role and first value of a register, in the picture and on a click."""
+    graph_ = paired.build(a=periodic("10ms"), b=periodic("10ms", phase="5ms"))
+    diagram_page(graph_, tmp_path / "paired.html")
+    page.open(tmp_path / "paired.html", "[data-drawn]")
+    chips = page.texts("text.chip")
+    assert any("queue" in words for words in chips), chips
+    register = next(words for words in page.texts(".box.register") if "held" in words)
+    assert "delay" in register
+    page.find(".box.register .body").send_keys(Keys.ENTER)
+    details = page.until("return document.querySelector('.details').innerText")
+    assert "Register, delay" in details
+    assert "7.25" in details
     page.is_quiet()
 
 
@@ -470,7 +539,7 @@ def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:
         assert server.wait(True, 30.0)
         simulate_watched(case.graph, case.inputs, Sender(server, case.graph, case.inputs, speed=2.0))
         page.until("return document.querySelector('[data-ended]') !== null")
-        assert page.find("output").text.startswith("ended at 2.9")
+        assert page.find("output").text.startswith("ended at 3.000 s")
         assert len(page.texts("text.value")) > 5
         assert all(page.texts("text.value"))
         assert any(words.startswith("belief: position [m]") for words in page.texts(".scope h4"))

@@ -178,6 +178,16 @@ def test_a_run_is_sent_as_it_is(server: LiveServer, monkeypatch: pytest.MonkeyPa
     assert viewer.message()["ended"] is True
 
 
+def test_how_a_run_ended_is_sent(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a run that is over before a second message was due, the first tick and the last."""
+    monkeypatch.setattr(live, "EVERY", 1e9)
+    viewer = Viewer(server)
+    one = built()
+    result = simulate_watched(one, INPUTS, Sender(server, one, INPUTS, speed=0))
+    assert [viewer.message()["ticks"] for _ in range(2)] == [1, result.ticks]
+    assert viewer.message()["ended"] is True
+
+
 def test_a_run_keeps_to_the_time(server: LiveServer) -> None:
     start = time.monotonic()
     simulate_watched(built(), INPUTS, Sender(server, built(), INPUTS, speed=0.1))

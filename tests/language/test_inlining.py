@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ def distance(v: Stream[Scalar], seldom: Stream[Scalar]):
     return {"x": new, "seen": latest(new, init=0.0, at=seldom) + seldom, "half": new.every(2)}
 
 
-CLOCKS = {"v": periodic("5ms", phase=0), "seldom": periodic("15ms", phase=0)}
+CLOCKS: dict[str, Any] = {"v": periodic("5ms", phase=0), "seldom": periodic("15ms", phase=0)}
 
 
 def built() -> Graph:

@@ -82,6 +82,7 @@ def test_what_hangs_on_the_recording_has_no_whole_case(
     if settings:
         assert made_by is None
     else:
+        assert made_by is not None
         assert whole_case(made_by, *found) is None
 
 
@@ -91,7 +92,9 @@ def test_a_whole_experiment_is_the_same_in_every_engine() -> None:
     for seed in (0, 1):
         flight = load_flight("sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50"})
         found.append((find_graph("ekf").case(flight, start="truth"), flight))
-    case = whole_case(found[0][1].experiment, *found)
+    experiment = found[0][1].experiment
+    assert experiment is not None
+    case = whole_case(experiment, *found)
     assert case is not None
     want = case.score(simulate(case.graph, case.inputs, engine="python", seed=3))
     assert all(map(math.isfinite, want.values()))

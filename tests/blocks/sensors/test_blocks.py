@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
-from flowgraph import Stream, Tick, graph, latest, load_flight, simulate, ticks
+from flowgraph import Flight, Series, Stream, Tick, graph, latest, load_flight, simulate, ticks
 from flowgraph.blocks.flights.figure import figure
 from flowgraph.blocks.geometry.rotations import conjugate, geodesic_angle, multiply, to_rotation_vector
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.sensors import bias_at_start, drift, read_altimeter, read_attitude, read_position
-from flowgraph.blocks.signals import BodyMotion, FigureShape, Vector
+from flowgraph.blocks.signals import FigureShape, Vector
 from flowgraph.blocks.world import figure_motion, figure_shape, shaped, smooth_motion
 from tests.support import MS, all_engines, both_quick
 
-QUIET = {
+QUIET: dict[str, Any] = {
     "rate": 100.0,
     "noise": ImuNoise(0.0, 0.0, 0.0, 0.0),
     "gyro_bias": 0.0,
@@ -35,9 +36,19 @@ def clocks(until: str, imu: str = "10ms", vicon: str = "250ms"):
     }
 
 
+def truth_of(flight: Flight) -> Series:
+    assert flight.truth is not None
+    return flight.truth
+
+
 @pytest.mark.parametrize("engine", ["c", pytest.param("xla", marks=pytest.mark.slow)])
 def test_a_flight_by_a_graph_is_the_same_in_every_engine(engine: str) -> None:
-    noisy = {**QUIET, "noise": ImuNoise(0.01, 0.1, 1e-3, 1e-2), "gyro_bias": 0.1, "attitude_noise": 0.1}
+    noisy: dict[str, Any] = {
+        **QUIET,
+        "noise": ImuNoise(0.01, 0.1, 1e-3, 1e-2),
+        "gyro_bias": 0.1,
+        "attitude_noise": 0.1,
+    }
     built = figure.build(**noisy)
     given = clocks("1.6s", imu="20ms")
     want = both_quick(built, given, seed=7)
@@ -88,7 +99,7 @@ def test_biases_and_noise_are_as_large_as_told() -> None:
         )
         for seed in range(12)
     ]
-    bias = np.stack([f.truth["gyro_bias"] for f in flights])
+    bias = np.stack([truth_of(f)["gyro_bias"] for f in flights])
     assert bias[:, 0].std() == pytest.approx(0.02, rel=0.35)
     walked = bias[:, -1] - bias[:, 0]
     assert walked.std() == pytest.approx(0.01 * math.sqrt(4.0), rel=0.35)
@@ -96,7 +107,7 @@ def test_biases_and_noise_are_as_large_as_told() -> None:
     quiet, noisy = flights[1], load_flight("sim:figure", seed=1, settings=own)
     white = noisy.streams["imu"]["gyro"] - quiet.streams["imu"]["gyro"]
     assert white.std() == pytest.approx(0.01 * math.sqrt(200.0), rel=0.1)
-    np.testing.assert_array_equal(noisy.truth["gyro_bias"], quiet.truth["gyro_bias"])
+    np.testing.assert_array_equal(truth_of(noisy)["gyro_bias"], truth_of(quiet)["gyro_bias"])
 
 
 @graph
@@ -119,7 +130,7 @@ def others(start: Stream[Tick], imu: Stream[Tick]):
 def test_other_sensors_read_what_they_say() -> None:
     given = {n: s for n, s in clocks("3s", imu="50ms").items() if n != "vicon"}
     found = all_engines(others.build(), given, seed=5)
-    motion: BodyMotion = found["motion"]
+    motion = found["motion"]
     tilt = np.degrees(np.arccos(1.0 - 2.0 * (motion["attitude"][:, 1:3] ** 2).sum(1)))
     low = tilt <= np.degrees(0.2)
     assert 0 < low.sum() < len(tilt)
