@@ -37,8 +37,9 @@ from flowgraph.blocks.outdoor.belief import (
     predict_clone,
     start_outdoor,
 )
-from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor.flight import OutdoorSensors
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed, on_flight
+from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -120,13 +121,15 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-def for_flight(on: OnFlight, *, gated: Gated, control: HeldControl, scored: Smoothed) -> Case:
-    """Start the filter on an outdoor flight, at its first readings and at rest.
+def for_flight(
+    on: OnFlight, *, gated: Gated, control: HeldControl, started: StartedOutdoor, scored: Smoothed
+) -> Case:
+    """Start the filter on an outdoor flight, at rest, and at its first readings if nothing else is set.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
     """
-    inputs, sensors, first = outdoor_flight(on.flight, on.name)
+    inputs, sensors, first = started.begin(on)
     score = scored.score(on, pose_errors, steps=outdoor_steps)
     return on.case(
         score,

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.alignment import StartSpread, need_usable, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight"]
+__all__ = ["STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight", "without_gaps"]
 
 STREAMS = ("imu", "gps", "gps2", "altimeter", "magnetometer", "optical_flow")
 """What an outdoor flight has, by name."""
@@ -105,7 +105,8 @@ def attitude_of_two(force: npt.ArrayLike, field: npt.ArrayLike, *, earth: npt.Ar
 def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart]:
     """The streams of a flight by name, what is known of its sensors, and where to start.
 
-    The position is that of the first GPS reading; the attitude that of the first force and field.
+    The position is that of the first GPS reading; the attitude that of the first force and field. Readings
+    that are not finite, and a force or field of nearly no length, are passed over.
 
     Args:
         flight: with all of `STREAMS`; a reading of optical flow covers the time since the one before it, the
@@ -113,7 +114,8 @@ def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], Outdo
         graph: who asks, for messages.
 
     Raises:
-        DataError: where a stream or what should be known of it is missing, or optical flow has a gap.
+        DataError: where a stream or what should be known of it is missing, optical flow has a gap, or no
+            reading of a sensor can start a filter.
     """
     streams = flight.need(graph, *STREAMS)
     info = flight.info
@@ -126,7 +128,7 @@ def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], Outdo
             got=f"no {', '.join(missing)}",
             fix="add them to the flight's info, or build the graph with sensors=OutdoorSensors(...)",
         )
-    _without_gaps(flight.name, streams)
+    without_gaps(flight.name, streams)
     noise = info["noise"]
     sensors = OutdoorSensors(
         imu=info["imu_noise"],
@@ -140,13 +142,26 @@ def outdoor_flight(flight: Flight, graph: str) -> tuple[dict[str, Series], Outdo
         gps_lever=_three(info.get("gps_lever", (0.0, 0.0, 0.0))),
         gps2_lever=_three(info.get("gps2_lever", (0.0, 0.0, 0.0))),
     )
-    force, field = streams["imu"]["specific_force"][0], streams["magnetometer"]["field"][0]
-    turn = attitude_of_two(force, field, earth=sensors.field)
-    return (
-        streams,
-        sensors,
-        OutdoorStart(streams["gps"]["position"][0], turn, _spread(sensors, streams["imu"])),
-    )
+    force = streams["imu"]["specific_force"]
+    up = force[np.argmax(need_usable(force, f"{flight.name}: imu"))]
+    turn = attitude_of_two(up, _first(flight, "magnetometer", "field", 0.0), earth=sensors.field)
+    place = _first(flight, "gps", "position", -1.0)
+    return streams, sensors, OutdoorStart(place, turn, _spread(sensors, streams["imu"]))
+
+
+def _first(flight: Flight, name: str, field: str, least: float) -> np.ndarray:
+    """The first reading (3) of a stream that is finite and longer than that."""
+    readings = flight.streams[name][field]
+    shown = usable(readings, least)
+    if not shown.any():
+        raise DataError(
+            f"no reading of {name} can start a filter",
+            path=f"{flight.name}: {name}",
+            expected="one that is finite" + (", and no field of zero" if least == 0.0 else ""),
+            got=f"none in {len(readings)} readings",
+            fix=f"check the columns of {name} and their unit",
+        )
+    return np.asarray(readings[np.argmax(shown)])
 
 
 def _spread(sensors: OutdoorSensors, imu: Series) -> StartSpread:
@@ -164,7 +179,7 @@ def _three(values: npt.ArrayLike) -> Vector:
     return x, y, z
 
 
-def _without_gaps(name: str, streams: dict[str, Series]) -> None:
+def without_gaps(name: str, streams: dict[str, Series]) -> None:
     """Refuse optical flow of which a reading does not begin where the one before it ended."""
     flow = streams["optical_flow"]
     first = min(int(s.time[0]) for s in streams.values())
