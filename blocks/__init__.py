@@ -15,6 +15,7 @@ from rooms before it in this list, never from one after it, and nothing goes in 
       particles    clouds, resampling, Rao-Blackwell
       statespace   how something moves and what is seen of it: models, for every method
       filtering    a filter of any model by any method
+      control      plants, controllers, and loops that close through them
     What is estimated
       vision       cameras and tags, and the poses that they give
       models       points, poses and inertial navigation, for each of the methods
@@ -45,6 +46,7 @@ __all__ = [
     "particles",
     "statespace",
     "filtering",
+    "control",
     "vision",
     "models",
     "orientation",

@@ -25,6 +25,7 @@ from flowgraph.language.declare import delay, graph
 from flowgraph.language.graph import Graph
 from flowgraph.language.joins import collect, every, latest, merge, sink
 from flowgraph.language.late import absent_for, label_data, resample_at, zip_last
+from flowgraph.language.moore import moore
 from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
 from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.language.stamps import stamp_of
@@ -44,6 +45,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight, Series
+    from flowgraph.drawing.live import LiveView
     from flowgraph.engines.live import Live
     from flowgraph.engines.many import simulate_many
     from flowgraph.engines.options import Checkpoint
@@ -76,6 +78,7 @@ _LATER = {
     "Result": "flowgraph.data.result",
     "Flight": "flowgraph.data.series",
     "Series": "flowgraph.data.series",
+    "LiveView": "flowgraph.drawing.live",
     "simulate_many": "flowgraph.engines.many",
     "Live": "flowgraph.engines.live",
     "Checkpoint": "flowgraph.engines.options",
@@ -137,6 +140,7 @@ __all__ = [
     "Graph",
     "Held",
     "Live",
+    "LiveView",
     "LoweringError",
     "MissingDependencyError",
     "OutputError",
@@ -165,6 +169,7 @@ __all__ = [
     "clocks_of",
     "collect",
     "delay",
+    "moore",
     "delayed",
     "delta_time",
     "drop",

@@ -17,7 +17,9 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.point import between, point_belief, point_model
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, positions
@@ -39,6 +41,8 @@ def async_kalman(
     control: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
 ):
     """Kalman filter of position and velocity whose control and measurements keep clocks of their own.
@@ -54,17 +58,28 @@ def async_kalman(
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
     prior = bridged(belief, prior, acceleration, held=held, position=0, velocity=3)
+    scale = scale_of(adaptive, "position")
     posterior, innovation = update_linear(
-        prior, position.map(lambda z: z.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
+        prior,
+        position.map(lambda z: z.position),
+        H=np.eye(3, 6),
+        R=np.eye(3) * position_noise**2,
+        gate=gate,
+        robust=robust,
+        scale=scale,
     )
     collect(innovation, "position_innovation")
+    feed_scale(scale, innovation, adaptive, "position")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=6)
     if velocity is not None:
+        scale = scale_of(adaptive, "velocity")
         posterior, innovation = update_linear(
             posterior, velocity.map(lambda z: z.velocity),
-            H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate,
+            H=np.eye(3, 6, 3), R=np.eye(3) * velocity_noise**2, gate=gate, robust=robust,
+            scale=scale,
         )  # fmt: skip
+        feed_scale(scale, innovation, adaptive, "velocity")
         collect(innovation, "velocity_innovation")
         if gate is not None:
             posterior = find_back(

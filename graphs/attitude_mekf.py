@@ -22,7 +22,9 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import update_extended
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import attitude_errors
 from flowgraph.blocks.orientation.commanded import (
     TURN,
@@ -33,7 +35,7 @@ from flowgraph.blocks.orientation.commanded import (
     see_attitude,
     start_turn,
 )
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Scored, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Attitude, BodyRate, Gaussian
@@ -52,6 +54,8 @@ def attitude_mekf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
 ):
     """Multiplicative extended Kalman filter: commanded body rate, corrected by measured attitudes.
@@ -68,6 +72,7 @@ def attitude_mekf(
     drive = rate if reading == "mean" else between_rates(last, rate)
     prior = predict_turn(belief, drive, noise=rate_noise, name="predict")
     prior = bridged(belief, prior, body_rate, held=held, attitude=0)
+    scale = scale_of(adaptive, "attitude")
     posterior, innovation = update_extended(
         prior,
         magnetic_attitude.map(attitude_vector, name="measured"),
@@ -76,8 +81,11 @@ def attitude_mekf(
         space=TURN,
         measured_space=TURN,
         gate=gate,
+        robust=robust,
+        scale=scale,
         name="update",
     )
+    feed_scale(scale, innovation, adaptive, "attitude")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=3, attitude=0)
     belief.feed(posterior)
@@ -97,7 +105,7 @@ def for_flight(
     rate_noise: Positive | None = None,
     attitude_noise: Positive | None = None,
     control: HeldControl,
-    gated: Gated,
+    gated: Adapted,
     scored: Scored,
 ) -> Case:
     """Start the filter on a flight with commanded body rates and measured attitudes, at the first of these.

@@ -19,7 +19,9 @@ from __future__ import annotations
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import (
     driving,
     in_tangent_space,
@@ -48,6 +50,8 @@ def ekf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     gravity: tuple[float, float, float] = GRAVITY,
 ):
@@ -65,9 +69,18 @@ def ekf(
     drive = driving(last, control, reading)
     prior = predict_pose(belief, drive, noise=noise, gravity=gravity)
     prior = bridged(belief, prior, imu, held=held, position=3, velocity=0, attitude=6)
+    scale = scale_of(adaptive, "vicon")
     posterior, innovation = update_pose(
-        prior, vicon, position_noise=position_noise, attitude_noise=attitude_noise, lever=lever, gate=gate
+        prior,
+        vicon,
+        position_noise=position_noise,
+        attitude_noise=attitude_noise,
+        lever=lever,
+        gate=gate,
+        robust=robust,
+        scale=scale,
     )
+    feed_scale(scale, innovation, adaptive, "vicon")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=10, attitude=6)
     belief.feed(posterior)

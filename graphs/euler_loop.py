@@ -14,6 +14,7 @@ from typing import Any
 from flowgraph import collect, delay, latest
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.kalman.backward import Crossing, collect_steps
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import Held, bridged, find_back
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.pose import driving
@@ -30,9 +31,10 @@ def euler_loop(
     order: str,
     reading: str,
     predict: Callable[[Any, Any], Any],
-    update: Callable[[Any, Any], Any],
+    update: Callable[[Any, Any, Any], Any],
     gate: float | None,
     patience: int,
+    adaptive: float | None,
     held: Held | None,
     gravity: tuple[float, float, float] = GRAVITY,
     crossing: Crossing | None = None,
@@ -45,8 +47,9 @@ def euler_loop(
         order: "zxy" or "zyx".
         reading: of the IMU, "instant" or "mean"; see `driving`.
         predict: `(belief, drive)`, the prior.
-        update: `(prior, control)`, the posterior and the innovation.
+        update: `(prior, control, scale)`, the posterior and the innovation.
         gate, patience: whether `update` refuses measurements, and how many in a row are taken for outliers.
+        adaptive: over about how many measurements the scale of their noise is learned; None: it is told.
         held: from which age on a reading is old.
         gravity: in the world, m/s^2, for what a unit at rest reads.
         crossing: of the prediction, where a smoother is to go back over the run; then what it needs is
@@ -58,7 +61,9 @@ def euler_loop(
     drive = driving(last, control, reading)
     prior = predict(belief, drive)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=6, attitude=3)
-    posterior, innovation = update(prior, control)
+    scale = scale_of(adaptive, "measured")
+    posterior, innovation = update(prior, control, scale)
+    feed_scale(scale, innovation, adaptive, "measured")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=3)
     belief.feed(posterior)

@@ -27,7 +27,9 @@ from flowgraph.blocks.inertial.outdoors import (
     standing,
 )
 from flowgraph.blocks.kalman.backward import collect_steps
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.navigation import navigation_recording, navigation_steps
 from flowgraph.blocks.outdoor.errors import antenna_errors
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
@@ -72,6 +74,8 @@ def gnss_ins(
     held: Held | None = None,
     invariant: bool = False,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     smoothing: bool = False,
 ):
     """Error-state Kalman filter of 15 states and more, aided by whichever of its sensors there are.
@@ -98,8 +102,15 @@ def gnss_ins(
         crossing = navigation_crossing(gravity, earth, estimated)
         collect_steps(belief, now, control, crossing=crossing, held=held)
 
+    scales: dict[str, Any] = {}
+
+    def trust(name: str) -> dict[str, Any]:
+        scales[name] = scale_of(adaptive, name)
+        return {"gate": gate, "robust": robust, "scale": scales[name], "name": f"fuse_{name}"}
+
     def told(corrected: tuple[Any, Any], name: str) -> Any:
         posterior, innovation = corrected
+        feed_scale(scales[name], innovation, adaptive, name)
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return posterior
@@ -107,30 +118,52 @@ def gnss_ins(
 
     if gnss is not None:
         aided = aid_gnss_position(
-            now, gnss, antenna=antenna, estimated=estimated, gate=gate, invariant=invariant, name="fuse_gnss"
+            now,
+            gnss,
+            antenna=antenna,
+            estimated=estimated,
+            invariant=invariant,
+            **trust("gnss"),
         )
         now = told(aided, "gnss")
     if gnss_velocity is not None:
         aided = aid_gnss_velocity(
-            now, gnss_velocity, control, antenna=antenna, estimated=estimated, gate=gate, invariant=invariant,
-            name="fuse_gnss_velocity",
+            now, gnss_velocity, control, antenna=antenna, estimated=estimated, invariant=invariant,
+            **trust("gnss_velocity"),
         )  # fmt: skip
         now = told(aided, "gnss_velocity")
     if heading is not None:
-        now = told(aid_antennas(now, heading, baseline=baseline, gate=gate, name="fuse_heading"), "heading")
+        now = told(
+            aid_antennas(now, heading, baseline=baseline, **trust("heading")),
+            "heading",
+        )
     if magnetometer is not None:
         aided = aid_compass(
-            now, magnetometer, north=north, noise=compass_noise, gate=gate, name="fuse_magnetometer"
+            now,
+            magnetometer,
+            north=north,
+            noise=compass_noise,
+            **trust("magnetometer"),
         )
         now = told(aided, "magnetometer")
     if barometer is not None:
         aided = aid_height(
-            now, barometer, noise=height_noise, estimated=estimated, gate=gate, name="fuse_barometer"
+            now,
+            barometer,
+            noise=height_noise,
+            estimated=estimated,
+            **trust("barometer"),
         )
         now = told(aided, "barometer")
     if wheels is not None:
         aided = aid_wheels(
-            now, wheels, control, noise=speed_noise, slip=slip, axle=axle, gate=gate, name="fuse_wheels"
+            now,
+            wheels,
+            control,
+            noise=speed_noise,
+            slip=slip,
+            axle=axle,
+            **trust("wheels"),
         )
         now = told(aided, "wheels")
     if resting is not None:

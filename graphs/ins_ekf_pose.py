@@ -15,6 +15,7 @@ from typing import Any
 from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.euler_ins import extended_crossing, predict_extended, update_pose_angles
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.euler import EulerFilter, on_measured_pose
@@ -39,6 +40,8 @@ def ins_ekf_pose(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -49,13 +52,15 @@ def ins_ekf_pose(
     a smoother needs too.
     """
     return euler_loop(
-        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, adaptive=adaptive,
+        held=held,
         gravity=gravity, crossing=extended_crossing(order) if smoothing else None,
         predict=lambda belief, drive: predict_extended(
             belief, drive, order=order, noise=noise, gravity=gravity, name="predict"
         ),
-        update=lambda prior, _: update_pose_angles(
-            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
+        update=lambda prior, _, scale: update_pose_angles(
+            prior, pose, scale, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust,
+            name="update",
         ),
     )  # fmt: skip
 

@@ -16,7 +16,9 @@ from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.kalman.backward import collect_steps
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.inertial_pose import inertial_crossing, inertial_steps, stacked
 from flowgraph.blocks.models.recordings import inertial_recording
@@ -56,6 +58,8 @@ def ins_eskf(
     held: Held | None = None,
     invariant: bool = False,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     smoothing: bool = False,
 ):
     """15-state error-state Kalman filter: every tick predicts to now; a tick with a measurement also updates.
@@ -72,16 +76,27 @@ def ins_eskf(
     if smoothing:
         drive = latest(imu, init=Imu.at_rest(gravity), at=ticks, name="drive")
         collect_steps(belief, prior, drive, crossing=inertial_crossing, held=held)
+    scale = scale_of(adaptive, "position")
     posterior, innovation = aid_position(
-        prior, position, noise=position_noise, lever=lever, gate=gate, invariant=invariant
+        prior,
+        position,
+        noise=position_noise,
+        lever=lever,
+        gate=gate,
+        robust=robust,
+        scale=scale,
+        invariant=invariant,
     )
     collect(innovation, "position_innovation")
+    feed_scale(scale, innovation, adaptive, "position")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6, shown=False)
     if attitude is not None:
+        scale = scale_of(adaptive, "attitude")
         posterior, turn = aid_attitude(
-            posterior, attitude, noise=attitude_noise, gate=gate, invariant=invariant
+            posterior, attitude, scale, noise=attitude_noise, gate=gate, robust=robust, invariant=invariant
         )
+        feed_scale(scale, turn, adaptive, "attitude")
         collect(turn, "attitude_innovation")
         if gate is not None:
             posterior = find_back(

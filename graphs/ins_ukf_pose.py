@@ -18,6 +18,7 @@ import numpy as np
 from flowgraph import Case, Stream, graph
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.euler_ins import STATE, increment_variances, update_pose_angles
 from flowgraph.blocks.models.unscented_ins import carried, far_points
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
@@ -49,6 +50,8 @@ def ins_ukf_pose(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -61,11 +64,13 @@ def ins_ukf_pose(
     moving: dict[str, Any] = {"move": carried(order, gravity), "noise": np.diag(increment_variances(noise))}
     moving |= {"space": STATE, "points": points}
     return euler_loop(
-        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
+        imu, pose, start=start, order=order, reading=reading, gate=gate, patience=patience, adaptive=adaptive,
+        held=held,
         gravity=gravity, crossing=unscented_crossing(**moving) if smoothing else None,
         predict=lambda belief, drive: predict_unscented(belief, drive, name="predict", **moving),
-        update=lambda prior, _: update_pose_angles(
-            prior, pose, order=order, R=R, factor=factor, lever=lever, gate=gate, name="update"
+        update=lambda prior, _, scale: update_pose_angles(
+            prior, pose, scale, order=order, R=R, factor=factor, lever=lever, gate=gate, robust=robust,
+            name="update",
         ),
     )  # fmt: skip
 

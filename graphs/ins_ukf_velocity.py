@@ -21,6 +21,7 @@ from flowgraph import Case, DataError, Stream, graph
 from flowgraph.blocks.geometry.rotations import level
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.euler_ins import STATE, increment_variances, start_gaussian, with_heading
 from flowgraph.blocks.models.unscented_ins import RATES, carried, far_points, update_camera_velocity
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
@@ -57,6 +58,8 @@ def ins_ukf_velocity(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
 ):
     """15-state unscented Kalman filter with Euler angles: IMU control, camera velocity.
@@ -69,12 +72,12 @@ def ins_ukf_velocity(
         points=points[0], name="predict",
     )  # fmt: skip
     return euler_loop(
-        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience, held=held,
-        gravity=gravity,
+        imu, motion, start=start, order=order, reading=reading, gate=gate, patience=patience,
+        adaptive=adaptive, held=held, gravity=gravity,
         predict=predict,
-        update=lambda prior, control: update_camera_velocity(
-            prior, motion, control, order=order, mount=mount, velocity_noise=velocity_noise,
-            rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, name="update",
+        update=lambda prior, control, scale: update_camera_velocity(
+            prior, motion, control, scale, order=order, mount=mount, velocity_noise=velocity_noise,
+            rate_noise=rate_noise, rate=rate, points=points[1], gate=gate, robust=robust, name="update",
         ),
     )  # fmt: skip
 

@@ -19,7 +19,9 @@ import numpy as np
 
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.filters import predict_linear, update_linear
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.point import between, point_belief, point_model, whole
 from flowgraph.blocks.scoring.cases import OnFlight, on_flight
 from flowgraph.blocks.scoring.point import PointFilter, on_point, readings
@@ -37,6 +39,8 @@ def kalman(
     control: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
 ):
     """Kalman filter of position and velocity: a record holds an acceleration and what was measured with it.
@@ -56,9 +60,17 @@ def kalman(
     mean = (now if control == "mean" else between(last, now)).map(lambda u: u.acceleration)
     prior = predict_linear(belief, mean, model=point_model(noise))
     prior = bridged(belief, prior, fresh, held=held, position=0, velocity=3)
+    scale = scale_of(adaptive, "position")
     posterior, innovation = update_linear(
-        prior, reading.map(lambda r: r.position), H=np.eye(3, 6), R=np.eye(3) * position_noise**2, gate=gate
+        prior,
+        reading.map(lambda r: r.position),
+        H=np.eye(3, 6),
+        R=np.eye(3) * position_noise**2,
+        gate=gate,
+        robust=robust,
+        scale=scale,
     )
+    feed_scale(scale, innovation, adaptive, "position")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=6)
     belief.feed(posterior)

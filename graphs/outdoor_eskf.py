@@ -18,7 +18,9 @@ import numpy as np
 from flowgraph import Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.filters import update_extended
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.outdoor.belief import (
@@ -37,9 +39,14 @@ from flowgraph.blocks.outdoor.belief import (
     predict_clone,
     start_outdoor,
 )
+<<<<<<< HEAD
 from flowgraph.blocks.outdoor.flight import OutdoorSensors
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed, on_flight
 from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
+=======
+from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
+>>>>>>> main
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -58,6 +65,8 @@ def outdoor_eskf(
     reading: str = "instant",
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -79,7 +88,14 @@ def outdoor_eskf(
         taken = delay(start, name="taken")
         collect_steps(taken, now, drive, crossing=clone_crossing, held=held)
 
+    scales: dict[str, Any] = {}
+
+    def trust(name: str) -> dict[str, Any]:
+        scales[name] = scale_of(adaptive, name)
+        return {"gate": gate, "robust": robust, "scale": scales[name]}
+
     def told(now: Stream[Gaussian], innovation: Any, name: str) -> Stream[Gaussian]:
+        feed_scale(scales[name], innovation, adaptive, name)
         collect(innovation, f"{name}_innovation")
         if gate is None:
             return now
@@ -98,17 +114,18 @@ def outdoor_eskf(
     for name, (seen, observe, noise) in readings.items():
         R = np.eye(3) * noise**2
         now, innovation = update_extended(
-            now, seen, observe=observe, R=R, space=OUTDOOR, gate=gate, name=f"fuse_{name}"
+            now, seen, observe=observe, R=R, space=OUTDOOR, name=f"fuse_{name}", **trust(name)
         )
         now = told(now, innovation, name)
     now, innovation = update_extended(
         now, altimeter.map(lambda z: z.distance[..., None]),
-        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, gate=gate, name="fuse_altimeter",
+        observe=observe_distance, R=[[s.altimeter**2]], space=OUTDOOR, name="fuse_altimeter",
+        **trust("altimeter"),
     )  # fmt: skip
     now = told(now, innovation, "altimeter")
     now, innovation = update_extended(
-        now, optical_flow.map(flow_vector), observe=observe_flow, gate=gate, name="fuse_flow",
-        R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, measured_space=FLOW,
+        now, optical_flow.map(flow_vector), observe=observe_flow, name="fuse_flow", measured_space=FLOW,
+        R=np.diag([s.displacement**2] * 3 + [s.turn**2] * 3), space=OUTDOOR, **trust("optical_flow"),
     )  # fmt: skip
     now = told(now, innovation, "optical_flow")
     if smoothing:  # what is smoothed has the clone that its readings were measured from
@@ -121,10 +138,15 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
+<<<<<<< HEAD
 def for_flight(
     on: OnFlight, *, gated: Gated, control: HeldControl, started: StartedOutdoor, scored: Smoothed
 ) -> Case:
     """Start the filter on an outdoor flight, at rest, and at its first readings if nothing else is set.
+=======
+def for_flight(on: OnFlight, *, gated: Adapted, control: HeldControl, scored: Smoothed) -> Case:
+    """Start the filter on an outdoor flight, at its first readings and at rest.
+>>>>>>> main
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.

@@ -23,6 +23,7 @@ from flowgraph import Case, Stream, collect, delay, graph
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
 from flowgraph.blocks.kalman.lost import PATIENCE, find_back, stay
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import orientation_errors
 from flowgraph.blocks.orientation.accelerometer import (
     STATE,
@@ -32,7 +33,7 @@ from flowgraph.blocks.orientation.accelerometer import (
     start_orientation,
     turn_by_rate,
 )
-from flowgraph.blocks.scoring.cases import Gated, OnFlight, Scored, on_flight
+from flowgraph.blocks.scoring.cases import OnFlight, Scored, Weighed, on_flight
 from flowgraph.blocks.scoring.settings import NotNegative, Positive
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given
@@ -59,6 +60,7 @@ def quaternion_ukf(
     frozen: float = 0.0,
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
     longest: float | None = None,
 ):
     """Unscented Kalman filter of attitude and body rate: gyroscope and accelerometer as measurements.
@@ -93,6 +95,7 @@ def quaternion_ukf(
         space=STATE,
         points=points,
         gate=gate,
+        robust=robust,
     )
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=6, attitude=0)
@@ -116,7 +119,7 @@ def for_flight(
     mean: str = "kraft",
     still: NotNegative | None = None,
     frozen: NotNegative | None = None,
-    gated: Gated,
+    gated: Weighed,
     scored: Scored,
     started: Started,
 ) -> Case:

@@ -26,7 +26,9 @@ import numpy as np
 from flowgraph import Array, Case, Stream, collect, delay, graph, latest
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.backward import collect_steps
+from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import POSE, driving
 from flowgraph.blocks.models.unscented_pose import (
     STATE,
@@ -68,6 +70,8 @@ def ukf(
     points: SigmaPoints = GAUSSIAN,
     gate: float | None = None,
     patience: int = PATIENCE,
+    robust: Robust | None = None,
+    adaptive: float | None = None,
     held: Held | None = None,
     smoothing: bool = False,
 ):
@@ -84,6 +88,7 @@ def ukf(
     moving["points"] = points
     prior = predict_unscented(belief, drive, **moving)
     prior = bridged(belief, prior, imu, held=held, position=0, velocity=3, attitude=6)
+    scale = scale_of(adaptive, "vicon")
     posterior, innovation = update_unscented(
         prior,
         vicon.map(stacked_pose, name="pose"),
@@ -93,7 +98,10 @@ def ukf(
         measured_space=POSE,
         points=points,
         gate=gate,
+        robust=robust,
+        scale=scale,
     )
+    feed_scale(scale, innovation, adaptive, "vicon")
     if gate is not None:
         posterior = find_back(posterior, innovation, patience=patience, moving=9, attitude=6)
     belief.feed(posterior)

@@ -108,13 +108,13 @@ class Extended(GaussianMethod):
     ) -> tuple[Gaussian, When, Array]:
         x, P, space = kept.mean, kept.covariance, measurement.space
         measured = measurement.vector(message, xp)
-        d = xp.zeros((P.shape[-1],), dtype=x.dtype)
-        for k in range(self.iterations):
+        d = None
+        for _ in range(self.iterations):
             z, H, R = measurement.linearised(x, d, message, xp)
             apart = measurement.apart(measured, z, xp)
             present = ~xp.isnan(apart)
             residual = xp.where(present, apart, 0.0)
-            if k == 0:
+            if d is None:
                 found = correct_jointly(
                     P, residual, H, R, present=present, gate=gate, space=space, robust=self.robust, xp=xp
                 )
@@ -171,8 +171,7 @@ class SquareRoot(GaussianMethod):
     def corrected(
         self, kept: GaussianRoot, message: Any, measurement: Measurement, gate: float | None, xp: Any
     ) -> tuple[GaussianRoot, When, Array]:
-        still = xp.zeros((kept.root.shape[-1],), dtype=kept.mean.dtype)
-        z, H, R = measurement.linearised(kept.mean, still, message, xp)
+        z, H, R = measurement.linearised(kept.mean, None, message, xp)
         apart = measurement.apart(measurement.vector(message, xp), z, xp)
         present, space = ~xp.isnan(apart), measurement.space
         shift, root, innovation = correct_root(

@@ -58,7 +58,7 @@ class Information(GaussianMethod):
         self, kept: GaussianInformation, message: Any, measurement: Measurement, gate: float | None, xp: Any
     ) -> tuple[GaussianInformation, When, Array]:
         Y, space, kind = kept.information, measurement.space, kept.mean.dtype
-        z, H, R = measurement.linearised(kept.mean, xp.zeros((Y.shape[-1],), dtype=kind), message, xp)
+        z, H, R = measurement.linearised(kept.mean, None, message, xp)
         apart = measurement.apart(measurement.vector(message, xp), z, xp)
         present = ~xp.isnan(apart)
         residual = xp.where(present, apart, 0.0)

@@ -19,19 +19,17 @@ Russell, "Rao-Blackwellised particle filtering for dynamic Bayesian networks", U
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Scalar, block, merge, when
+from flowgraph import Array, Scalar, block, when
 from flowgraph.blocks.filtering.gaussian import innovation_log_likelihood
-from flowgraph.blocks.filtering.methods import Advanced, Method, Seen, believed
-from flowgraph.blocks.filtering.particles import cloud_size, found_back, particles, resample_cloud
+from flowgraph.blocks.filtering.methods import Advanced, Method, Seen
+from flowgraph.blocks.filtering.particles import Tick, Weighted, particles
 from flowgraph.blocks.filtering.weighing import chosen, weighed
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import correct, passes
@@ -39,7 +37,6 @@ from flowgraph.blocks.kalman.triangles import semidefinite_root
 from flowgraph.blocks.signals import ConditionalCloud, Gaussian, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
-from flowgraph.language.clock import clock_of
 from flowgraph.recorder.derivatives import jacobian
 
 __all__ = ["Marginal", "carry_conditional", "rao_blackwellized", "weigh_conditional"]
@@ -156,7 +153,7 @@ def weigh_conditional(
 
 
 @dataclass(frozen=True)
-class Marginal(Method):
+class Marginal(Weighted):
     """Rao-Blackwellized particles; see `rao_blackwellized`."""
 
     count: int
@@ -211,33 +208,12 @@ class Marginal(Method):
         self, kept: Any, control: Any, motion: Motion, seen: Sequence[Seen], *,
         at: Any, gate: float | None, patience: int,
     ) -> Advanced:  # fmt: skip
-        split, innovations, likelihoods = self.split(motion.space), {}, {}
-        plain = cloud = carry_conditional(
+        split = self.split(motion.space)
+        cloud = carry_conditional(
             kept, control, motion=motion, split=split, at=at, draws=f"{self.draws}.move", name="carry"
         )
-        for one in seen:
-            suffix = f"_{one.name}" if len(seen) > 1 else ""
-            before = cloud
-            cloud, innovations[one.name], likelihoods[one.name] = weigh_conditional(
-                cloud, one.stream, measurement=one.model, split=split, gate=gate, name=f"weigh{suffix}"
-            )
-            if gate is not None:
-                cloud = found_back(
-                    before, cloud, innovations[one.name], one, patience, f"{self.draws}.find", seen
-                )
-        measured = functools.reduce(operator.or_, (clock_of(one.stream) for one in seen))
-        size = cloud_size(cloud, at=measured, name="size")
-        fresh = resample_cloud(
-            cloud, size, below=self.resample_below, scheme=self.scheme,
-            at=measured, draws=f"{self.draws}.resample", name="resample",
-        )  # fmt: skip
-        return Advanced(
-            merge(fresh, cloud, tie="left", name="next"),
-            believed(plain, method=self, motion=motion, name="prior"),
-            believed(cloud, method=self, motion=motion, name="average"),
-            innovations,
-            likelihoods,
-            {"effective_sample_size": size},
+        return self.weighed(
+            Tick(cloud, cloud, {}, {}), motion, seen, seen, weigh_conditional, gate, patience, split=split
         )
 
 

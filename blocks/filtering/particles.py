@@ -16,7 +16,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowgraph import Scalar, block, merge
 from flowgraph.blocks.filtering.methods import Advanced, Method, Seen, believed
@@ -66,8 +66,61 @@ def resample_cloud(  # type: ignore[no-untyped-def]
     return cloud.replace(**(rows | {"log_weight": xp.where(uneven, -math.log(n), cloud.log_weight)}))
 
 
+class Tick(NamedTuple):
+    """What has become of a cloud in a tick: as it was carried, as it is now, and what measurements said."""
+
+    plain: Any
+    cloud: Any
+    innovations: dict[str, Any]
+    likelihoods: dict[str, Any]
+
+
+class Weighted(Method):
+    """What methods share whose belief is a weighted cloud."""
+
+    resample_below: float
+    scheme: str
+    draws: str
+
+    def weighed(
+        self, tick: Tick, motion: Motion, seen: Sequence[Seen], rest: Sequence[Seen], weigh: Any,
+        gate: float | None, patience: int, **settings: Any,
+    ) -> Advanced:  # fmt: skip
+        """The rest of a tick: weigh the cloud by each of the `rest`, and draw it anew where it is uneven.
+
+        Args:
+            seen: all measurements.
+            weigh: the block that weighs by one of them; `settings` are its own.
+        """
+        plain, cloud, innovations, likelihoods = tick
+        for one in rest:
+            suffix = f"_{one.name}" if len(seen) > 1 else ""
+            before = cloud
+            cloud, innovations[one.name], likelihoods[one.name] = weigh(
+                cloud, one.stream, measurement=one.model, gate=gate, name=f"weigh{suffix}", **settings
+            )
+            if gate is not None:
+                cloud = found_back(
+                    before, cloud, innovations[one.name], one, patience, f"{self.draws}.find", seen
+                )
+        measured = functools.reduce(operator.or_, (clock_of(one.stream) for one in seen))
+        size = cloud_size(cloud, at=measured, name="size")
+        fresh = resample_cloud(
+            cloud, size, below=self.resample_below, scheme=self.scheme,
+            at=measured, draws=f"{self.draws}.resample", name="resample",
+        )  # fmt: skip
+        return Advanced(
+            merge(fresh, cloud, tie="left", name="next"),
+            believed(plain, method=self, motion=motion, name="prior"),
+            believed(cloud, method=self, motion=motion, name="average"),
+            innovations,
+            likelihoods,
+            {"effective_sample_size": size},
+        )
+
+
 @dataclass(frozen=True)
-class Particles(Method):
+class Particles(Weighted):
     """A particle filter; see `particles`."""
 
     count: int
@@ -113,29 +166,8 @@ class Particles(Method):
                 cloud = found_back(
                     plain, cloud, innovations[one.name], one, patience, f"{self.draws}.find", seen
                 )
-        for one in rest:
-            suffix = f"_{one.name}" if len(seen) > 1 else ""
-            before = cloud
-            cloud, innovations[one.name], likelihoods[one.name] = weigh_cloud(
-                cloud, one.stream, measurement=one.model, gate=gate, name=f"weigh{suffix}"
-            )
-            if gate is not None:
-                cloud = found_back(
-                    before, cloud, innovations[one.name], one, patience, f"{self.draws}.find", seen
-                )
-        measured = functools.reduce(operator.or_, (clock_of(one.stream) for one in seen))
-        size = cloud_size(cloud, at=measured, name="size")
-        fresh = resample_cloud(
-            cloud, size, below=self.resample_below, scheme=self.scheme,
-            at=measured, draws=f"{self.draws}.resample", name="resample",
-        )  # fmt: skip
-        return Advanced(
-            merge(fresh, cloud, tie="left", name="next"),
-            believed(plain, method=self, motion=motion, name="prior"),
-            believed(cloud, method=self, motion=motion, name="average"),
-            innovations,
-            likelihoods,
-            {"effective_sample_size": size},
+        return self.weighed(
+            Tick(plain, cloud, innovations, likelihoods), motion, seen, rest, weigh_cloud, gate, patience
         )
 
     def smoothable(

@@ -2,11 +2,12 @@
 
 `simulated` is the maker that `sim` stands for, `load(argument, *, seed=0, settings={}) -> Flight`: a smooth
 figure of a quadrotor with an IMU and a motion capture, or one of the others. `worlds` has the flights through
-the simulated world with sensors of choice, `plane` a point in the plane. Recorded flights are in `datasets`.
+the simulated world with sensors of choice, `plane` a point in the plane, and `figure` the figure as a graph.
+Recorded flights are in `datasets`.
 """
 
 from __future__ import annotations
 
-from flowgraph.blocks.flights import plane, simulated, worlds
+from flowgraph.blocks.flights import figure, plane, simulated, worlds
 
-__all__ = ["plane", "simulated", "worlds"]
+__all__ = ["figure", "plane", "simulated", "worlds"]

@@ -2,12 +2,7 @@
 
 `sim:thesis`, `sim:roundtrip` and `sim:hover` go through the simulated world with sensors of choice: see
 `worlds`; `sim:plane` is a point in the plane: see `plane`; `sim:drive` is a car: see
-`drive`. What follows is the figure of `sim`.
-
-Position and yaw are sums of sinusoids of a phase that starts slowly, so every derivative is exact. Thrust
-must carry gravity and the acceleration, which fixes the body's z axis; with the yaw that fixes the attitude,
-and the jerk fixes the body rate (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control
-for quadrotors", ICRA 2011, eqs. 5-9 and sec. III).
+`drive`. What follows is the figure of `sim`, whose motion is that of `world.smooth`.
 """
 
 from __future__ import annotations
@@ -19,11 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
-from flowgraph.blocks.flights import drive, plane, worlds
+from flowgraph.blocks.flights import drive, figure, plane, worlds
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.signals import Imu, NavigationState, Pose
-from flowgraph.blocks.world import generator
+from flowgraph.blocks.world import AT_REST, generator, shaped, smooth_motion
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
@@ -56,15 +51,14 @@ SETTINGS: Mapping[str, str | float] = {
 """All settings that `load` understands: `DEFAULTS` for the figure, `worlds.SETTINGS` for the worlds, whose
 values when left out are their own."""
 
-_AT_REST, _RAMP = 1.0, 2.0  # seconds
-
 
 def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
     """Make a flight with the streams `imu` (`Imu`) and `vicon` (`Pose`), or one through a world.
 
     Args:
         argument: "" or "quadrotor" for the figure; thesis, roundtrip or hover for a world (see `worlds`);
-            plane for a point in the plane (see `plane`); drive for a car (see `drive`).
+            plane for a point in the plane (see `plane`); drive for a car (see `drive`); figure for the figure
+            made by a graph (see `figure`).
         seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
             change of one setting does not change the draws of another.
         settings: any of `DEFAULTS`; of a world, any of `worlds.SETTINGS` that concern it.
@@ -84,11 +78,12 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         return plane.load_plane(seed=seed, settings=settings)
     if argument == "drive":
         return drive.load_drive(seed=seed, settings=settings)
-    if argument not in ("", "quadrotor"):
-        raise UnknownNameError(
-            "simulated flight", argument, ["quadrotor", "plane", "drive", *worlds.WORLDS], path="sim"
-        )
+    if argument not in ("", "quadrotor", "figure"):
+        kinds = ["quadrotor", "figure", "plane", "drive", *worlds.WORLDS]
+        raise UnknownNameError("simulated flight", argument, kinds, path="sim")
     s = _settings(settings or {})
+    if argument == "figure":
+        return figure.load_figure(seed=seed, settings=s)
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
     end = round(s["duration"] * 1e9)
     time = np.arange(0, end + 1, imu_period, dtype=np.int64)
@@ -133,7 +128,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
             "attitude_noise": s["attitude.noise"],
             "imu_period_ns": imu_period,
             "vicon_period_ns": vicon_period,
-            "still": _AT_REST,
+            "still": AT_REST,
         },
         notes=(note("info", f"simulated with seed {seed}: 1 s at rest, then a smooth figure"),),
     )
@@ -147,79 +142,13 @@ def trajectory(seconds: np.ndarray, *, seed: int = 0) -> dict[str, np.ndarray]:
         m/s^2), both in the body.
     """
     random = generator(seed, "figure")
-    frequencies = np.array([0.75, 1.5, 2.2]) * random.uniform(0.85, 1.15, (3, 3))
-    sizes = np.array([[1.6], [1.6], [0.6]]) * np.array([1.0, 0.5, 0.25]) * random.uniform(0.7, 1.3, (3, 3))
-    phases = random.uniform(0.0, 2.0 * np.pi, (3, 3))
-    yaw_wave = (np.array([0.9, 0.3]), np.array([0.35, 0.9]), random.uniform(0.0, 2.0 * np.pi, 2))
-
-    t = np.asarray(seconds, dtype=float)
-    clock = _phase(t)
-    axes = [_through(_waves(clock[0], sizes[i], frequencies[i], phases[i]), clock) for i in range(3)]
-    position, velocity, acceleration, jerk = (np.stack([axis[k] for axis in axes], axis=-1) for k in range(4))
-    yaw, yaw_rate = _through(_waves(clock[0], *yaw_wave), clock)[:2]
-
-    thrust = acceleration - np.array(GRAVITY)
-    strength = np.linalg.norm(thrust, axis=-1, keepdims=True)
-    z = thrust / strength
-    dz = (jerk - z * _dot(z, jerk)) / strength
-    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=-1)
-    turning = np.stack([-np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=-1) * yaw_rate[:, None]
-    side = np.cross(z, ahead)
-    width = np.linalg.norm(side, axis=-1, keepdims=True)
-    y = side / width
-    d_side = np.cross(dz, ahead) + np.cross(z, turning)
-    dy = (d_side - y * _dot(y, d_side)) / width
-    x = np.cross(y, z)
-    dx = np.cross(dy, z) + np.cross(y, dz)
-    rate = np.concatenate([_dot(z, dy), _dot(x, dz), _dot(y, dx)], axis=-1)  # R^T dR/dt = skew(rate)
+    shape = shaped(lambda name, low, high, size: random.uniform(low, high, size), xp=np)
+    motion = smooth_motion(np.asarray(seconds, dtype=float), shape, xp=np)
+    attitude = _quaternion(np.stack(motion["axes"], axis=-1))
     return {
-        "position": position,
-        "velocity": velocity,
-        "attitude": _quaternion(np.stack([x, y, z], axis=-1)),
-        "rate": rate,
-        "force": np.concatenate([_dot(x, thrust), _dot(y, thrust), _dot(z, thrust)], axis=-1),
+        **{name: motion[name] for name in ("position", "velocity", "rate", "force")},
+        "attitude": attitude,
     }
-
-
-def _phase(t: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A time that stands still for `_AT_REST`, then speeds up to 1 over `_RAMP`; with three derivatives."""
-    u = np.clip((t - _AT_REST) / _RAMP, 0.0, 1.0)
-    after = np.maximum(t - _AT_REST - _RAMP, 0.0)
-    value = _RAMP * (2.5 * u**4 - 3.0 * u**5 + u**6) + after
-    first = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
-    second = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / _RAMP
-    third = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / _RAMP**2
-    return value, first, second, third
-
-
-def _waves(
-    phase: np.ndarray, sizes: np.ndarray, frequencies: np.ndarray, phases: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """A sum of sinusoids that starts at 0, and three derivatives with respect to `phase`, (n,) each."""
-    w, start = frequencies[:, None], phases[:, None]  # (waves, n): the long axis last, for speed
-    sizes = sizes[:, None]
-    angle = w * phase + start
-    sine, cosine = sizes * np.sin(angle), sizes * np.cos(angle)
-    return (
-        (sine - sizes * np.sin(start)).sum(0),
-        (cosine * w).sum(0),
-        (-sine * w**2).sum(0),
-        (-cosine * w**3).sum(0),
-    )
-
-
-def _through(f: tuple[np.ndarray, ...], s: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """The chain rule: f and its derivatives in time, given those of f in s and of s in time."""
-    return (
-        f[0],
-        f[1] * s[1],
-        f[2] * s[1] ** 2 + f[1] * s[2],
-        f[3] * s[1] ** 3 + 3.0 * f[2] * s[1] * s[2] + f[1] * s[3],
-    )
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray((a * b).sum(-1, keepdims=True))
 
 
 def _quaternion(R: np.ndarray) -> np.ndarray:

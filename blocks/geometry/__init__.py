@@ -4,10 +4,10 @@ A filter of poses is mostly about attitudes, and an attitude is no vector. `rota
 that all of this library uses: Hamilton, scalar first, body to world. `euler` goes to and from three angles,
 in two conventions. `manifold` declares once which parts of a state are angles or quaternions, so that a
 filter can move it, subtract it and average it without knowing more; `groups` adds rigid motions to such
-parts, and `views` gives functions of a state its parts by name. `lanes` does the same maths for n
-particles side by side, with n as the last axis, and is used by its module name; `geodetic` turns latitude,
-longitude and height into metres, with NumPy. All others take their array namespace as `xp`, so they run on
-NumPy arrays and in a block.
+parts, `tangent` linearises a function on such a space, and `views` gives functions of a state its parts by
+name. `lanes` does the same maths for n particles side by side, with n as the last axis, and is used by its
+module name; `geodetic` turns latitude, longitude and height into metres, with NumPy. All others take their
+array namespace as `xp`, so they run on NumPy arrays and in a block.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from flowgraph.blocks.geometry.rotations import (
     level,
     multiply,
     normalize,
+    parted,
     right_product,
     rotate,
     skew,
@@ -55,6 +56,7 @@ from flowgraph.blocks.geometry.rotations import (
     to_rotation_vector,
     world_error,
 )
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.geometry.views import View, array_of, joined, stacked_parts
 
 __all__ = [
@@ -62,6 +64,7 @@ __all__ = [
     "right_product",
     "conjugate",
     "normalize",
+    "parted",
     "from_rotation_vector",
     "to_rotation_vector",
     "to_matrix",
@@ -97,6 +100,7 @@ __all__ = [
     "SE_2",
     "swept",
     "turned_by",
+    "linearised",
     "View",
     "array_of",
     "joined",

@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from flowgraph import Array
+from flowgraph import Array, jacobian
 from flowgraph.blocks.geometry.rotations import (
     conjugate,
     from_rotation_vector,
@@ -72,6 +72,15 @@ class Part(abc.ABC):
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         """The vector (..., tangent) that moves b to a."""
 
+    def directions(self, x: Array, xp: Any) -> Array | None:
+        """(..., size, tangent): how x (..., size) changes with a small move; None: by the move itself."""
+        still = xp.zeros((*x.shape[:-1], self.tangent), dtype=x.dtype)
+        return jacobian(lambda d, xp: self.plus(x, d, xp), still, xp)[1]
+
+    def errors(self, x: Array, xp: Any) -> Array | None:
+        """(..., tangent, size): the small move that a small change of x (..., size) is; None: the change."""
+        return jacobian(lambda a, xp: self.minus(a, x, xp), x, xp)[1]
+
     def turn(self, d: Array, xp: Any) -> Array | None:
         """How far tangent vectors, the columns of d (..., tangent, n), turn, in rad; None: not at all."""
         return None
@@ -82,7 +91,17 @@ class Part(abc.ABC):
         return None
 
 
-class _Euclidean(Part):
+class _Plain(Part):
+    """Numbers that move as they change."""
+
+    def directions(self, x: Array, xp: Any) -> None:
+        return None
+
+    def errors(self, x: Array, xp: Any) -> None:
+        return None
+
+
+class _Euclidean(_Plain):
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         return x + d
 
@@ -90,7 +109,7 @@ class _Euclidean(Part):
         return a - b
 
 
-class _Angle(Part):
+class _Angle(_Plain):
     def plus(self, x: Array, d: Array, xp: Any) -> Array:
         return _wrapped(x + d, xp)
 
@@ -113,6 +132,16 @@ class Quaternion(Part):
 
     def minus(self, a: Array, b: Array, xp: Any) -> Array:
         return to_rotation_vector(multiply(conjugate(b, xp=xp), a, xp=xp), xp=xp)
+
+    def directions(self, x: Array, xp: Any) -> Array:
+        """Half of q times (0, d) (Solà eq. 201)."""
+        w, u = x[..., :1], x[..., 1:]
+        low = w[..., None] * xp.eye(3, dtype=x.dtype) + skew(u, xp=xp)
+        return 0.5 * xp.concat([-u[..., None, :], low], axis=-2)
+
+    def errors(self, x: Array, xp: Any) -> Array:
+        """Twice the vector part of q^-1 times the change."""
+        return 4.0 * xp.matrix_transpose(self.directions(x, xp))
 
     def turn(self, d: Array, xp: Any) -> Array:
         return xp.sqrt(xp.sum(d * d, axis=-2, keepdims=True))
@@ -263,6 +292,40 @@ class StateSpace:
             return a - b
         apart = [p.minus(a[..., at], b[..., at], xp) for p, at, _ in self.places()]
         return xp.concat(apart, axis=-1)
+
+    def directions(self, x: Array, xp: Any) -> list[Array] | None:
+        """How x (..., size) changes with a small move: (..., size, 1) for each direction of the tangent
+        space, or (..., size, tangent) for all; None on vectors and angles, where it is the move itself."""
+        parts = [(part.directions(x[..., at], xp), at, on) for part, at, on in self.places()]
+        if all(found is None for found, _, _ in parts):
+            return None
+        lead = tuple(x.shape[:-1])
+        if isinstance(x, np.ndarray):  # at once: zeros are looked for where work is recorded
+            whole = np.zeros((*lead, self.size, self.tangent), dtype=x.dtype)
+            for found, at, on in parts:
+                whole[..., at, on] = np.eye(on.stop - on.start) if found is None else found
+            return [whole]
+        columns = []
+        for found, at, on in parts:
+            for i in range(on.stop - on.start):
+                one = np.eye(at.stop - at.start, 1, -i)
+                piece = (
+                    xp.broadcast_to(xp.asarray(one, dtype=x.dtype), (*lead, *one.shape))
+                    if found is None
+                    else found[..., :, i : i + 1]
+                )
+                above, below = (
+                    xp.zeros((*lead, n, 1), dtype=x.dtype) for n in (at.start, self.size - at.stop)
+                )
+                columns.append(xp.concat([above, piece, below], axis=-2))
+        return columns
+
+    def errors(self, x: Array, J: Array, xp: Any) -> Array:
+        """J (..., size, k), changes of x (..., size), as small moves (..., tangent, k)."""
+        parts = [(part.errors(x[..., at], xp), J[..., at, :]) for part, at, _ in self.places()]
+        if all(found is None for found, _ in parts):
+            return J
+        return xp.concat([j if found is None else found @ j for found, j in parts], axis=-2)
 
     def mean(self, points: Array, weights: Array, xp: Any, *, rounds: int = 8) -> Array:
         """The weighted mean (..., size) of points (..., n, size); weights (n) add up to 1.

@@ -33,6 +33,7 @@ __all__ = [
     "skew",
     "between_vectors",
     "level",
+    "parted",
     "geodesic_angle",
     "tilt_and_heading",
     "world_error",
@@ -170,6 +171,13 @@ def level(nearest: Array, specific_force: Array, *, xp: Any) -> Array:
     return normalize(multiply(between_vectors(upright, up, xp=xp), nearest, xp=xp), xp=xp)
 
 
+def parted(e: Array, *, xp: Any) -> tuple[Array, Array]:
+    """Tilt and heading (...) in rad of a rotation (..., 4); see `tilt_and_heading`."""
+    tilt = 2.0 * xp.atan2(xp.hypot(e[..., 1], e[..., 2]), xp.hypot(e[..., 0], e[..., 3]))
+    sign = xp.where(e[..., 0] < 0.0, -1.0, 1.0)
+    return tilt, 2.0 * xp.atan2(sign * e[..., 3], xp.abs(e[..., 0]))
+
+
 # Judging results: NumPy only, in degrees.
 
 
@@ -196,10 +204,7 @@ def tilt_and_heading(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> tuple[np.
     Source: D. Laidig and T. Seel, "VQF", Information Fusion 2023, sec. 4 (inclination and heading errors).
     """
     conjugated = conjugate(np.asarray(truth, dtype=float), xp=np)
-    e = multiply(np.asarray(estimate, dtype=float), conjugated, xp=np)
-    tilt = 2.0 * np.arctan2(np.hypot(e[..., 1], e[..., 2]), np.hypot(e[..., 0], e[..., 3]))
-    sign = np.where(e[..., 0] < 0.0, -1.0, 1.0)
-    heading = 2.0 * np.arctan2(sign * e[..., 3], np.abs(e[..., 0]))
+    tilt, heading = parted(multiply(np.asarray(estimate, dtype=float), conjugated, xp=np), xp=np)
     return np.degrees(tilt), np.degrees(heading)
 
 

@@ -17,6 +17,7 @@ the right (local) attitude error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from flowgraph import Array, block
@@ -29,7 +30,9 @@ from flowgraph.blocks.geometry.rotations import (
     to_matrix,
     to_rotation_vector,
 )
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.geometry.tangent import linearised
+from flowgraph.blocks.kalman.filters import correct, scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Attitude, Belief, KalmanInnovation, Position
 
 __all__ = ["aid_attitude", "aid_position", "correct_belief"]
@@ -49,10 +52,12 @@ STATE = StateSpace(position=euclidean(3), velocity=euclidean(3), attitude=quater
 def aid_position(
     prior: Belief,
     position: Position | None,
+    scale: Any = None,
     *,
     noise: Spread,
     lever: tuple[float, float, float] = ORIGIN,
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Belief, KalmanInnovation | None]:
@@ -67,6 +72,8 @@ def aid_position(
         lever: the point in body coordinates, m.
         gate: when given, a measurement that is too far off changes nothing; see `update_linear`. (For three
             axes a nis of 16.3 is 99.9 %.)
+        robust: when given, one that is far off counts for less; see `update_linear`.
+        scale: on the variance, where it is learned (`learned_scale`).
         invariant: take the error as one of the group SE_2(3), in which that of an attitude may be large, as
             that of a start of which the heading is not known; see the head of this module.
 
@@ -81,17 +88,21 @@ def aid_position(
     apart = position.position - prior.position - (R @ arm[..., None])[..., 0]
     zero = 0.0 * R
     H = xp.concat([zero + xp.eye(3, dtype=kind), zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(
+        prior, apart, H, scaled(_variance(noise, kind, xp), scale, xp), gate, invariant, xp, robust
+    )
 
 
 @block
 def aid_attitude(
     prior: Belief,
     attitude: Attitude | None,
+    scale: Any = None,
     *,
     noise: Spread,
     mount: tuple[float, float, float, float] = ALIGNED,
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Belief, KalmanInnovation | None]:
@@ -104,7 +115,7 @@ def aid_attitude(
         attitude: z, a unit quaternion, sensor to world; or absent.
         noise: standard deviation about the body axes, rad.
         mount: the sensor's attitude in the body, a unit quaternion.
-        gate, invariant: as in `aid_position`.
+        gate, robust, scale, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (rad, body) where there was a measurement.
@@ -115,7 +126,9 @@ def aid_attitude(
     apart = _attitude_residual(prior.attitude, attitude.attitude, mount, xp)
     zero = 0.0 * to_matrix(prior.attitude, xp=xp)
     H = xp.concat([zero, zero, zero + xp.eye(3, dtype=kind), zero, zero], axis=-1)
-    return correct_belief(prior, apart, H, _variance(noise, kind, xp), gate, invariant, xp)
+    return correct_belief(
+        prior, apart, H, scaled(_variance(noise, kind, xp), scale, xp), gate, invariant, xp, robust
+    )
 
 
 def _carried(q: Array, turn: Array, xp: Any) -> tuple[Array, Array]:
@@ -171,7 +184,14 @@ class _Group(NamedTuple):
 
 
 def correct_belief(
-    prior: Any, apart: Array, H: Array, R: Array, gate: float | None, invariant: bool, xp: Any
+    prior: Any,
+    apart: Array,
+    H: Array,
+    R: Array,
+    gate: float | None,
+    invariant: bool,
+    xp: Any,
+    robust: Robust | None = None,
 ) -> tuple[Any, KalmanInnovation]:
     """The correction that every Kalman filter shares, folded into the nominal state.
 
@@ -179,11 +199,11 @@ def correct_belief(
         prior: a `Belief`, or a `NavigationBelief`.
         apart: measured minus predicted (m); NaN where an entry was not measured.
         H: (m, n), the Jacobian by the error of the belief. R: (m, m), the covariance of the noise.
-        gate, invariant: as in `aid_position`.
+        gate, robust, invariant: as in `aid_position`.
     """
     more = prior.covariance.shape[-1] - 15
     space = _Group(prior.attitude, more) if invariant else _space(more)
-    found = correct(prior.covariance, apart, H, R, gate=gate, space=space, xp=xp)
+    found = correct(prior.covariance, apart, H, R, gate=gate, space=space, robust=robust, xp=xp)
     d, turn = found.shift, found.shift[..., 6:9]
     to_place, to_speed = d[..., 0:3], d[..., 3:6]
     if invariant:
@@ -201,6 +221,32 @@ def correct_belief(
     if more:
         values["parameters"] = prior.parameters + d[..., 15:]
     return type(prior)(**values), found.innovation
+
+
+def aided(
+    prior: Any,
+    measured: Array,
+    see: Callable[[Any, Any], Array],
+    R: Array,
+    gate: float | None,
+    invariant: bool,
+    xp: Any,
+    robust: Robust | None = None,
+) -> tuple[Any, KalmanInnovation]:
+    """`correct_belief` with z = see(x) + noise, whose Jacobian is derived.
+
+    Args:
+        prior, R, gate, robust, invariant: as there.
+        measured: z (m).
+        see: `see(x, xp)` (..., m), of states one a row with the parts of `STATE`; behind the six biases are
+            the parameters of a `NavigationBelief`.
+    """
+    more = prior.covariance.shape[-1] - 15
+    parts = [prior.position, prior.velocity, prior.attitude, prior.gyro_bias, prior.accelerometer_bias]
+    x = xp.concat([*parts, prior.parameters] if more else parts, axis=-1)
+    space = _space(more)
+    y, H = linearised(lambda x, xp: see(space.view(x, xp), xp), x, space, xp)
+    return correct_belief(prior, measured - y, H, R, gate, invariant, xp, robust)
 
 
 def _space(more: int) -> StateSpace:

@@ -217,14 +217,18 @@ def _carried(
     more = sum(PARAMETERS[name].size for name in estimated)
     if not more:
         return values, F
-    columns = []
+    columns, left = [], {9: 1.0 + 0.0 * rate, 12: 1.0 + 0.0 * force}
     for name in estimated:
         if name in raw:  # as the bias of its axis does, times the reading
             at = 9 if name == "gyro_scale" else 12
+            left[at] = 1.0 - belief.parameters[..., where[name]]  # of a bias
             upper = F[..., :9, at : at + 3] * raw[name][..., None, :]
             columns.append(xp.concat([upper, 0.0 * F[..., 9:, :3]], axis=-2))
         else:
             columns.append(0.0 * F[..., :, : PARAMETERS[name].size])
+    if any(name in raw for name in estimated):
+        biased = F[..., :9, 9:] * xp.concat([left[9], left[12]], axis=-1)[..., None, :]
+        F = xp.concat([xp.concat([F[..., :9, :9], biased], axis=-1), F[..., 9:, :]], axis=-2)
     corner = 0.0 * F[..., :more, :more] + xp.eye(more, dtype=kind)
     below = xp.concat([0.0 * F[..., :more, :], corner], axis=-1)
     return values, xp.concat([xp.concat([F, *columns], axis=-1), below], axis=-2)

@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph import Array, block
-from flowgraph.blocks.geometry.rotations import skew, to_matrix
-from flowgraph.blocks.inertial.aiding import correct_belief
-from flowgraph.blocks.inertial.navigation import PARAMETERS, places
+from flowgraph.blocks.geometry.rotations import conjugate, rotate, skew
+from flowgraph.blocks.inertial.aiding import aided, correct_belief
+from flowgraph.blocks.inertial.navigation import places
+from flowgraph.blocks.kalman.filters import scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import (
     GnssHeading,
     GnssPosition,
@@ -60,10 +62,12 @@ AT_UNIT = Antenna()
 def aid_gnss_position(
     prior: Any,
     fix: GnssPosition | None,
+    scale: Any = None,
     *,
     antenna: Antenna = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -76,23 +80,19 @@ def aid_gnss_position(
         fix: the position, m, and its covariance, m^2; or absent.
         antenna: what is known of it; `lever` and `time_offset` count as known unless they are estimated.
         estimated: names of `PARAMETERS`.
-        gate, invariant: as in `aid_position`.
+        gate, robust, scale, invariant: as in `aid_position`.
 
     Returns:
         The posterior, and the innovation (m, world) where there was a fix.
     """
     if fix is None:
         return prior, None
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    arm, late = _antenna(prior, antenna, estimated, kind, xp)
-    place = prior.position + (R @ arm[..., None])[..., 0] - prior.velocity * late
-    zero = 0.0 * R
-    one = zero + xp.eye(3, dtype=kind)
-    parts = {"lever": R, "time_offset": -prior.velocity[..., None]}
-    H = [one, -late[..., None] * one, -R @ skew(arm, xp=xp), zero, zero, *_more(estimated, parts, zero)]
-    apart, H = fix.position - place, xp.concat(H, axis=-1)
-    return correct_belief(prior, apart, H, fix.covariance, gate, invariant, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        arm, late = _antenna(x, antenna, estimated, xp)
+        return x.position + rotate(x.attitude, arm, xp=xp) - x.velocity * late
+
+    return aided(prior, fix.position, see, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
 
 @block
@@ -100,10 +100,12 @@ def aid_gnss_velocity(
     prior: Any,
     fix: GnssVelocity | None,
     imu: Imu,
+    scale: Any = None,
     *,
     antenna: Antenna | None = AT_UNIT,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     invariant: bool = False,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
@@ -115,40 +117,40 @@ def aid_gnss_velocity(
     Args:
         imu: the last reading.
         antenna: what is known of it; None where it is the unit itself of which the velocity is known.
-        prior, fix, estimated, gate, invariant: as in `aid_gnss_position`.
+        prior, fix, estimated, gate, robust, scale, invariant: as in `aid_gnss_position`.
     """
     if fix is None:
         return prior, None
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    arm, _ = _antenna(prior, antenna or Antenna(), estimated, kind, xp)
     if antenna is None:
-        arm = 0.0 * arm
-    rate = imu.gyro - prior.gyro_bias
-    swing = (skew(rate, xp=xp) @ arm[..., None])[..., 0]
-    zero = 0.0 * R
-    one = zero + xp.eye(3, dtype=kind)
-    parts = {} if antenna is None else {"lever": R @ skew(rate, xp=xp)}
-    H = [zero, one, -R @ skew(swing, xp=xp), R @ skew(arm, xp=xp), zero, *_more(estimated, parts, zero)]
-    apart = fix.velocity - prior.velocity - (R @ swing[..., None])[..., 0]
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), fix.covariance, gate, invariant, xp)
+        H = np.eye(3, prior.covariance.shape[-1], 3)
+        apart, H = fix.velocity - prior.velocity, xp.asarray(H, dtype=prior.velocity.dtype)
+        return correct_belief(prior, apart, H, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
+
+    def see(x: Any, xp: Any) -> Array:
+        arm, _ = _antenna(x, antenna, estimated, xp)
+        swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
+        return x.velocity + rotate(x.attitude, swing[..., 0], xp=xp)
+
+    return aided(prior, fix.velocity, see, scaled(fix.covariance, scale, xp), gate, invariant, xp, robust)
 
 
 @block
 def aid_height(
     prior: Any,
     height: Height | None,
+    scale: Any = None,
     *,
     noise: float,
     estimated: tuple[str, ...] = (),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with a height: z = p_up + height_offset + noise.
 
     Args:
         noise: standard deviation, m.
-        prior, estimated, gate: as in `aid_gnss_position`.
+        prior, estimated, gate, robust, scale: as in `aid_gnss_position`.
     """
     if height is None:
         return prior, None
@@ -162,19 +164,20 @@ def aid_height(
     if "height_offset" in where:
         H[0, 15 + where["height_offset"].start] = 1.0
     apart = (height.height - prior.position[..., 2] - level)[..., None]
-    return correct_belief(
-        prior, apart, xp.asarray(H, dtype=kind), xp.asarray([[noise**2]], dtype=kind), gate, False, xp
-    )
+    S = scaled(xp.asarray([[noise**2]], dtype=kind), scale, xp)
+    return correct_belief(prior, apart, xp.asarray(H, dtype=kind), S, gate, False, xp, robust)
 
 
 @block
 def aid_compass(
     prior: Any,
     magnetometer: MagneticField | None,
+    scale: Any = None,
     *,
     north: float,
     noise: float,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction of the magnetic field over the ground.
@@ -186,22 +189,24 @@ def aid_compass(
     Args:
         magnetometer: z, of the body's axes and without their bias; or absent.
         noise: standard deviation, rad.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if magnetometer is None:
         return prior, None
     across = xp.asarray([-math.sin(north), math.cos(north), 0.0], dtype=prior.position.dtype)
     along = xp.asarray([math.cos(north), math.sin(north), 0.0], dtype=prior.position.dtype)
-    return _directed(prior, magnetometer.field, across, along, noise**2, gate, xp)
+    return _directed(prior, magnetometer.field, across, along, noise**2, scale, gate, xp, robust)
 
 
 @block
 def aid_antennas(
     prior: Any,
     heading: GnssHeading | None,
+    scale: Any = None,
     *,
     baseline: tuple[float, float, float] = (1.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with the direction over the ground from one antenna to another.
@@ -209,7 +214,7 @@ def aid_antennas(
     Args:
         heading: the angle and its deviation; or absent.
         baseline: from the one to the other, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if heading is None:
         return prior, None
@@ -217,7 +222,7 @@ def aid_antennas(
     s, c = xp.sin(heading.angle)[..., None], xp.cos(heading.angle)[..., None]
     across, along = xp.concat([-s, c, 0.0 * s], axis=-1), xp.concat([c, s, 0.0 * s], axis=-1)
     b = xp.asarray(baseline, dtype=kind)
-    return _directed(prior, b, across, along, heading.deviation**2, gate, xp)
+    return _directed(prior, b, across, along, heading.deviation**2, scale, gate, xp, robust)
 
 
 @block
@@ -225,11 +230,13 @@ def aid_wheels(
     prior: Any,
     wheels: WheelSpeed | None,
     imu: Imu,
+    scale: Any = None,
     *,
     noise: float,
     slip: float,
     axle: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Any, KalmanInnovation | None]:
     """Correct a belief with how a vehicle rolls: its speed by the wheels, and that it moves along its x axis.
@@ -240,24 +247,21 @@ def aid_wheels(
         imu: the last reading.
         noise: standard deviation of the speed, m/s. slip: of what is across, m/s.
         axle: the point that moves along x, such as the middle of the rear axle, m, body.
-        prior, gate: as in `aid_gnss_position`.
+        prior, gate, robust, scale: as in `aid_gnss_position`.
     """
     if wheels is None:
         return prior, None
     kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
     arm = xp.asarray(axle, dtype=kind)
-    speed = (R.mT @ prior.velocity[..., None])[..., 0]
-    rate = imu.gyro - prior.gyro_bias
-    zero = 0.0 * R
-    H = [zero, R.mT, skew(speed, xp=xp), zero + skew(arm, xp=xp), zero]
-    if prior.covariance.shape[-1] > 15:
-        H.append(xp.zeros((*R.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
-    still = 0.0 * speed[..., :1]
+    still = 0.0 * prior.velocity[..., :1]
     seen = xp.concat([wheels.speed[..., None], still, still], axis=-1)
-    apart = seen - speed - (skew(rate, xp=xp) @ arm[..., None])[..., 0]
-    S = xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind)
-    return correct_belief(prior, apart, xp.concat(H, axis=-1), S, gate, False, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        swing = skew(imu.gyro - x.biases[..., :3], xp=xp) @ arm[..., None]
+        return rotate(conjugate(x.attitude, xp=xp), x.velocity, xp=xp) + swing[..., 0]
+
+    S = scaled(xp.asarray(np.diag([noise**2, slip**2, slip**2]), dtype=kind), scale, xp)
+    return aided(prior, seen, see, S, gate, False, xp, robust)
 
 
 class Resting(NamedTuple):
@@ -312,36 +316,30 @@ def _moving(*_: Any, **__: Any) -> dict[str, Any]:
 
 
 def _directed(
-    prior: Any, seen: Array, across: Array, along: Array, variance: Any, gate: float | None, xp: Any
+    prior: Any,
+    seen: Array,
+    across: Array,
+    along: Array,
+    variance: Any,
+    scale: Any,
+    gate: float | None,
+    xp: Any,
+    robust: Robust | None,
 ) -> tuple[Any, KalmanInnovation]:
     """The correction by a vector of the body (3) that points `along` the ground, and has nothing `across`."""
-    kind = prior.position.dtype
-    R = to_matrix(prior.attitude, xp=xp)
-    m = (R @ seen[..., None])[..., 0]
-    size = xp.sqrt(m[..., 0] ** 2 + m[..., 1] ** 2)
-    angle = xp.atan2(xp.linalg.vecdot(across, m), xp.linalg.vecdot(along, m))
-    # the direction over the ground turns by (n x dR) where the body does
-    n = xp.concat([-m[..., 1:2], m[..., 0:1], 0.0 * m[..., 0:1]], axis=-1) / (size * size)[..., None]
-    row = -(n[..., None, :] @ R @ skew(seen, xp=xp))
-    zero = 0.0 * row
-    H = [zero, zero, row, zero, zero]
-    if prior.covariance.shape[-1] > 15:
-        H.append(xp.zeros((*zero.shape[:-1], prior.covariance.shape[-1] - 15), dtype=kind))
-    S = (variance + 0.0 * size)[..., None, None]
-    return correct_belief(prior, -angle[..., None], xp.concat(H, axis=-1), S, gate, False, xp)
+
+    def see(x: Any, xp: Any) -> Array:
+        m = rotate(x.attitude, seen, xp=xp)
+        return xp.atan2(xp.linalg.vecdot(across, m), xp.linalg.vecdot(along, m))[..., None]
+
+    nothing = 0.0 * prior.position[..., :1]
+    S = scaled((variance + 0.0 * nothing)[..., None], scale, xp)
+    return aided(prior, nothing, see, S, gate, False, xp, robust)
 
 
-def _antenna(
-    prior: Any, antenna: Antenna, estimated: tuple[str, ...], kind: Any, xp: Any
-) -> tuple[Array, Array]:
-    """Its lever (3) and by how much it is late (1), estimated or known."""
-    where = places(estimated)
-    arm = prior.parameters[..., where["lever"]] if "lever" in where else xp.asarray(antenna.lever, dtype=kind)
-    if "time_offset" in where:
-        return arm, prior.parameters[..., where["time_offset"]]
-    return arm, xp.asarray([antenna.late], dtype=kind)
-
-
-def _more(estimated: tuple[str, ...], parts: dict[str, Array], zero: Array) -> list[Array]:
-    """The columns of a Jacobian of three rows for what is estimated beside the fifteen."""
-    return [parts.get(name, zero[..., :, : PARAMETERS[name].size]) for name in estimated]
+def _antenna(x: Any, antenna: Antenna, estimated: tuple[str, ...], xp: Any) -> tuple[Array, Any]:
+    """Its lever (3) and by how much it is late, of a state; estimated or known."""
+    where, parameters = places(estimated), x.biases[..., 6:]
+    arm = parameters[..., where["lever"]] if "lever" in where else None
+    arm = xp.asarray(antenna.lever, dtype=x.position.dtype) if arm is None else arm
+    return arm, parameters[..., where["time_offset"]] if "time_offset" in where else antenna.late

@@ -29,7 +29,14 @@ from flowgraph.blocks.kalman.filters import (
     update_extended,
     update_linear,
 )
-from flowgraph.blocks.kalman.learned import learned_noise, update_learned
+from flowgraph.blocks.kalman.learned import (
+    LEAST,
+    feed_scale,
+    learned_noise,
+    learned_scale,
+    scale_of,
+    update_learned,
+)
 from flowgraph.blocks.kalman.learning import LEARNT, Learned, LinearGaussian, learn
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.lost import (
@@ -47,7 +54,7 @@ from flowgraph.blocks.kalman.lost import (
     stay,
 )
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
-from flowgraph.blocks.kalman.robust import Robust, huber, reweighted, student_t
+from flowgraph.blocks.kalman.robust import ROBUST, Robust, huber, reweighted, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import (
     Steps,
@@ -70,6 +77,12 @@ __all__ = [
     "huber",
     "student_t",
     "learned_noise",
+    "learned_scale",
+    "learn",
+    "feed_scale",
+    "scale_of",
+    "LEAST",
+    "ROBUST",
     "update_learned",
     "Crossing",
     "gone_back",
@@ -91,7 +104,6 @@ __all__ = [
     "LinearGaussian",
     "Learned",
     "LEARNT",
-    "learn",
     "Correction",
     "Vector",
     "correct",

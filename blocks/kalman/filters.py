@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, block, real, when
-from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.robust import Robust, reweighted
@@ -39,6 +40,10 @@ __all__ = [
 
 Vector = Annotated[Any, real("m")]
 """A control or a measurement: m real numbers."""
+
+
+Observe = Callable[..., Array | tuple[Array, Array]]
+"""What is seen of a state, with or without its Jacobian."""
 
 
 class Resets(Protocol):
@@ -79,6 +84,7 @@ def predict_linear(belief: Gaussian, control: Vector, *, model: LinearModel, dt:
 def update_linear(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     H: npt.ArrayLike,
     R: npt.ArrayLike,
@@ -109,6 +115,7 @@ def update_linear(
             as `chi_square_gate` gives it, and where entries are missing one of the same probability
             (`gate_table`).
         robust: when given, `huber()` or `student_t()`, a measurement counts for less that is far off.
+        scale: on R, where it is learned (`learned_scale`).
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -124,15 +131,17 @@ def update_linear(
     m, n = measured.shape[-1], prior.mean.shape[-1]
     H = observation_matrix(H, m, n, "update_linear.H", kind=prior.mean.dtype, xp=xp)
     predicted = (H @ prior.mean[..., None])[..., 0]
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
+    noise = noise_matrix(R, m, "R", kind=prior.mean.dtype, xp=xp)
+    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp, scale)
 
 
 @block
 def update_extended(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
-    observe: Callable[..., tuple[Array, Array]],
+    observe: Observe,
     R: npt.ArrayLike,
     space: StateSpace | None = None,
     measured_space: StateSpace | None = None,
@@ -143,18 +152,20 @@ def update_extended(
     """`update_linear` with a measurement that is any function of the state: z = h(x) + noise.
 
     Args:
-        observe: `observe(x, xp) -> (h(x), H)`, where H (m, t) is the Jacobian of h with respect to the
-            tangent vectors of `space` and `measured_space`, at x.
+        observe: `observe(x, xp) -> h(x)`, on states one a row, whose Jacobian is derived; or
+            `observe(x, xp) -> (h(x), H)`, where H (m, t) is that Jacobian with respect to the tangent
+            vectors of `space` and `measured_space`, at x.
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z, of any parts.
-        prior, measured, gate, robust: as in `update_linear`.
+        prior, measured, gate, robust, scale: as in `update_linear`.
 
     Source: Bar-Shalom et al. sec. 10.3.3; on manifolds Hertzberg et al. 2013, sec. 4.
     """
     if measured is None:
         return prior, None
-    predicted, H = observe(prior.mean, xp)
-    return _update(prior, measured, predicted, H, R, space, measured_space, gate, robust, xp)
+    predicted, H = observed(observe, prior.mean, space, measured_space, xp)
+    noise = noise_matrix(R, H.shape[-2], "R", kind=prior.mean.dtype, xp=xp)
+    return updated(prior, measured, predicted, H, noise, space, measured_space, gate, robust, xp, scale)
 
 
 def correct(
@@ -214,18 +225,35 @@ def correct(
     return Correction(shift, _symmetric(rest @ P @ rest.mT + K @ R @ K.mT), innovation)
 
 
-def _update(
-    prior: Gaussian, measured: Array, predicted: Array, H: Array, R: npt.ArrayLike,
+def updated(
+    prior: Gaussian, measured: Array, predicted: Array, H: Array, R: Array,
     space: StateSpace | None, measured_space: StateSpace | None, gate: float | None,
-    robust: Robust | None, xp: Any,
+    robust: Robust | None, xp: Any, scale: Any = None,
 ) -> tuple[Gaussian, Any]:  # fmt: skip
+    """The posterior and the innovation, of what was measured and predicted, with noise R (m, m)."""
     residual, present = innovate(measured, predicted, measured_space, xp)
-    noise = noise_matrix(R, residual.shape[-1], "R", kind=prior.mean.dtype, xp=xp)
+    R = scaled(R, scale, xp)
     found = correct(
-        prior.covariance, residual, H, noise, present=present, gate=gate, space=space, robust=robust, xp=xp
+        prior.covariance, residual, H, R, present=present, gate=gate, space=space, robust=robust, xp=xp
     )
     mean = moved(prior.mean, found.shift, space, xp)
     return Gaussian(mean=mean, covariance=found.covariance), where_any(present, found.innovation, xp)
+
+
+def scaled(R: Array, scale: Any, xp: Any) -> Array:
+    """The covariance of a noise, times its scale (...), where it has one."""
+    return R if scale is None else R * xp.asarray(scale, dtype=R.dtype)[..., None, None]
+
+
+def observed(
+    observe: Observe, x: Array, space: StateSpace | None, measured_space: StateSpace | None, xp: Any
+) -> tuple[Array, Array]:
+    """What is seen of x (n), and the Jacobian (m, t), which is derived where `observe` does not give it."""
+    found = observe(x, xp)
+    if isinstance(found, tuple):
+        return found
+    space = StateSpace(euclidean(x.shape[-1])) if space is None else space
+    return linearised(observe, x, space, xp, seen=measured_space)
 
 
 def innovate(measured: Array, predicted: Array, space: StateSpace | None, xp: Any) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from flowgraph import Array, block
 from flowgraph.blocks.kalman.triangles import covariance_root
-from flowgraph.blocks.metrics.consistency import IN_A_ROW
+from flowgraph.data.consistency import IN_A_ROW
 
 __all__ = [
     "FARTHEST",

@@ -18,13 +18,14 @@ Student's t filter for heavy tailed process and measurement noise", ICASSP 2013.
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from flowgraph import Array
 from flowgraph.errors import DeclarationError
 
-__all__ = ["Robust", "huber", "reweighted", "student_t"]
+__all__ = ["ROBUST", "Robust", "huber", "reweighted", "student_t"]
 
 
 class Robust(abc.ABC):
@@ -45,7 +46,7 @@ class _Huber(Robust):
     def weight(self, square: Array, parts: Array, xp: Any) -> Array:
         allowed = self.threshold * xp.sqrt(parts)
         far = xp.sqrt(xp.where(square > 0.0, square, 1.0))
-        return xp.where(far > allowed, allowed / far, 1.0)
+        return xp.where((far > allowed) & (square > 0.0), allowed / far, 1.0)  # of no parts, nothing is far
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,14 @@ def student_t(freedom: float = 4.0, *, rounds: int = 5) -> Robust:
     _need_positive("student_t.freedom", freedom)
     _need_positive("student_t.rounds", rounds)
     return _Student(float(freedom), int(rounds))
+
+
+ROBUST: Mapping[str, Callable[[], Robust | None]] = {
+    "none": lambda: None,
+    "huber": huber,
+    "student_t": student_t,
+}
+"""By its name, as a setting has it."""
 
 
 def _need_positive(path: str, value: float) -> None:

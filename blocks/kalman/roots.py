@@ -12,14 +12,22 @@ Source: P. Kaminski, A. Bryson, S. Schmidt, "Discrete square root filtering: a s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy.typing as npt
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
+from flowgraph.blocks.kalman.filters import (
+    Observe,
+    Vector,
+    accepts,
+    innovate,
+    masked,
+    moved,
+    observed,
+    where_any,
+)
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.triangles import lower_root, semidefinite_root
@@ -78,7 +86,7 @@ def update_extended_root(
     prior: GaussianRoot,
     measured: Vector | None,
     *,
-    observe: Callable[..., tuple[Array, Array]],
+    observe: Observe,
     R: npt.ArrayLike,
     space: StateSpace | None = None,
     measured_space: StateSpace | None = None,
@@ -88,7 +96,7 @@ def update_extended_root(
     """`update_extended` on a root: `update_root` with the Jacobian that `observe` gives at the prior."""
     if measured is None:
         return prior, None
-    predicted, H = observe(prior.mean, xp)
+    predicted, H = observed(observe, prior.mean, space, measured_space, xp)
     return _update(prior, measured, predicted, H, R, space, measured_space, gate, xp)
 
 

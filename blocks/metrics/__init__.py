@@ -3,8 +3,9 @@
 `errors` compares an estimate with a truth: metres, degrees, and the NEES, the squared error in deviations of
 the filter's own. `chi_square` says how large such a square is when all is well, which gives bands for the
 average and gates for single measurements. `consistency` has what needs no truth, the NIS of innovations, and
-`bound` how small the errors can be. `states` compares a state of one's own, part by part. All run on the host
-after a run, but for the limits of a gate, which become constants of the graph.
+`bound` how small the errors can be. `states` compares a state of one's own, part by part. All of these run
+on the host after a run, but for the limits of a gate, which become constants of the graph. `running` has
+scores as blocks, which are summed up while a run goes.
 """
 
 from __future__ import annotations
@@ -32,10 +33,26 @@ from flowgraph.blocks.metrics.errors import (
     tilt_and_heading_nees,
     within_truth,
 )
+from flowgraph.blocks.metrics.running import (
+    nis_score,
+    pose_score,
+    running_extremes,
+    running_mean,
+    running_rms,
+    running_share,
+    settle_time,
+)
 from flowgraph.blocks.metrics.states import ALIGNMENTS, StateErrors, true_parts
 from flowgraph.blocks.metrics.truth import known, truth_remarks
 
 __all__ = [
+    "nis_score",
+    "pose_score",
+    "running_extremes",
+    "running_mean",
+    "running_rms",
+    "running_share",
+    "settle_time",
     "ALIGNMENTS",
     "StateErrors",
     "true_parts",

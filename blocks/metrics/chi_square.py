@@ -13,16 +13,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.consistency import chi_square
+
 __all__ = ["chi_square", "chi_square_band", "chi_square_gate", "gate_table", "inside"]
-
-
-def chi_square(probability: npt.ArrayLike, parts: npt.ArrayLike) -> np.ndarray:
-    """What a chi-square variable with `parts` degrees of freedom stays below with this probability."""
-    from scipy.special import gammaincinv  # slow to import, and only gates and scores need it
-
-    return np.asarray(
-        2.0 * gammaincinv(0.5 * np.asarray(parts, dtype=float), np.asarray(probability, dtype=float))
-    )
 
 
 def chi_square_band(parts: int, *, runs: int = 1, probability: float = 0.95) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
 from flowgraph.blocks.metrics.truth import interpolate, within_truth
+from flowgraph.data.consistency import CHANCE, FEW, IN_A_ROW, far_nis
 from flowgraph.data.notes import note
 
 __all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
@@ -63,25 +64,34 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
     return found
 
 
-IN_A_ROW = 5
-"""Refusals in a row from which on a gate may be shut upon an honest sensor."""
+ALIKE, RUN_ALIKE, SIGMAS = 1.0, 0.3, 7.0
+"""From which product of one innovation and the next on, a number and in their deviations, they are alike over
+`FEW` and over a whole run; and how many deviations of chance that must be, too."""
+
+MANY, LEANING, RARELY = 40, 0.6, 1e-9
+"""Over how many innovations their mean is looked at; from how many of their deviations on it is not 0; and
+how rarely an honest filter has so large a one."""
 
 
-FAR, APART, FEW, CHANCE = 4.0, 1.5, 20, 1e-6
-"""By which factor a NIS per number is far from 1 over a few innovations, or below it, and above it over a
-whole run; how many innovations such a mean is of at least; how rarely an honest filter has as large a one."""
+def nis_remarks(name: str, innovation: Series, *, loose: bool = False) -> tuple[str, ...]:
+    """Notes where a gate refused too many measurements, the NIS is far from 1, or innovations are alike.
 
+    A gate refused too many where `IN_A_ROW` or more come in a row, or where chance hardly refuses as many.
 
-def nis_remarks(name: str, innovation: Series) -> tuple[str, ...]:
-    """Notes where a gate refused `IN_A_ROW` measurements or more in a row, and where the NIS is far from 1.
+    What is far from 1 is said in `flowgraph.data.consistency`.
 
-    A NIS is far from 1 whose mean over `IN_A_ROW` innovations that were taken in is more than `FAR`, and more
-    than chance allows; or, over all of them, if these are `FEW` or more, above `APART` or below 1 / `FAR`.
+    Innovations of an honest filter know nothing of each other (R. Mehra, "On the identification of variances
+    and adaptive Kalman filtering", IEEE TAC 15(2), 1970). Where what is left of one is left of the next too,
+    something lasts that the filter does not know, though each alone may be small: a clock that is off, a
+    start that was too sure, a lever.
 
     Args:
         name: of what was measured; empty where there is one kind.
+        loose: whether the filter is one that expects larger innovations than honest ones, which may be alike.
     """
-    return (*_refused(name, innovation), *_far(name, innovation))
+    far = far_nis(name, innovation)
+    alike = () if far or loose else _alike(name, innovation)
+    return (*(_refused(name, innovation) or _too_often(name, innovation)), *far, *alike)
 
 
 def _refused(name: str, innovation: Series) -> tuple[str, ...]:
@@ -101,35 +111,76 @@ def _refused(name: str, innovation: Series) -> tuple[str, ...]:
     return (note("refused", said),)
 
 
-def _far(name: str, innovation: Series) -> tuple[str, ...]:
-    values, width = innovation["nis"], float(innovation["residual"].shape[-1])
-    parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), width)
-    taken = np.isfinite(values) & (parts > 0.0)
-    if "accepted" in innovation.leaves:
-        taken &= innovation["accepted"]
-    values, parts, time = values[taken], parts[taken], innovation.time[taken]
-    if not len(values):
+def _too_often(name: str, innovation: Series) -> tuple[str, ...]:
+    if "accepted" not in innovation.leaves or innovation["accepted"].all():
+        return ()
+    from scipy.special import gammainc, gammaincc  # slow to import, and only scores need them
+
+    values, parts, judged = _judged(innovation)
+    refused = judged & ~innovation["accepted"]
+    if not refused.any():
+        return ()
+    rare = float(gammaincc(0.5 * parts[refused], 0.5 * values[refused]).max())
+    count, usual = int(refused.sum()), rare * float(judged.sum())
+    if gammainc(count, usual) >= CHANCE:  # the chance of as many, where so many are usual
         return ()
     front = f"{name}: " if name else ""
-    mean = float(values.sum() / parts.sum())
-    size = min(IN_A_ROW, len(values))
-    sums, numbers = (np.convolve(x, np.ones(size), "valid") for x in (values, parts))
-    beyond = np.flatnonzero(sums > np.maximum(FAR * numbers, chi_square(1.0 - CHANCE, numbers)))
-    if len(beyond):
-        since = (int(time[beyond[0]]) - int(innovation.time[0])) * 1e-9
-        said = (
-            f"{front}the NIS is far from 1, from {since:.3g} s after the first on: up to"
-            f" {(sums / numbers).max():.3g} a number over {size} innovations, {mean:.3g} over all;"
-            " the noise, the clock, the start or the sensor is not as told"
+    said = f"{front}{count} of {judged.sum()} measurements; chance has {usual:.2g} as far off"
+    return (note("refused", said),)
+
+
+def _judged(innovation: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nis and the number of parts of each, and which say anything."""
+    values, width = innovation["nis"], float(innovation["residual"].shape[-1])
+    parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), width)
+    return values, parts, np.isfinite(values) & (parts > 0.0)
+
+
+def _whitened(innovation: Series) -> np.ndarray:
+    """The residuals (n, m) in their own deviations, S^(-1/2) r; 0 where nothing was measured."""
+    size, axes = np.linalg.eigh(innovation["covariance"])
+    along = (np.swapaxes(axes, -1, -2) @ innovation["residual"][..., None])[..., 0]
+    known = size > 1e-12 * size[:, -1:]
+    scaled = np.where(known, along / np.sqrt(np.where(known, size, 1.0)), 0.0)
+    return np.asarray((axes @ scaled[..., None])[..., 0])
+
+
+def _alike(name: str, innovation: Series) -> tuple[str, ...]:
+    if "covariance" not in innovation.leaves:
+        return ()
+    _, parts, taken = _judged(innovation)
+    if "accepted" in innovation.leaves:
+        taken &= innovation["accepted"]
+    if taken.sum() <= FEW:
+        return ()
+    parts, time, white = parts[taken], innovation.time[taken], _whitened(innovation[taken])
+    front = f"{name}: " if name else ""
+    why = "something lasts that the filter does not know: a clock that is off, too sure a start, a lever"
+
+    def said(what: str, row: int | None, size: float) -> tuple[str, ...]:
+        since = (
+            ""
+            if row is None
+            else f", from {(time[row] - innovation.time[0]) * 1e-9:.3g} s after the first on"
         )
-        return (note("warning", said),)
-    total = float(parts.sum())
-    if len(values) >= FEW and mean > max(APART, float(chi_square(1.0 - CHANCE, total)) / total):
-        why = "the noise is told too small, or a clock is off"
-        return (note("warning", f"{front}the NIS is far from 1: {mean:.3g} a number; {why}"),)
-    if mean < 1.0 / FAR and len(values) >= FEW:
-        said = f"{front}the NIS is far from 1: {mean:.3g} a number; the noise is told too large"
-        return (note("warning", said),)
+        return (note("warning", f"{front}{what}{since}: {size:.2g} a number, where 0 is right; {why}"),)
+
+    products, numbers = np.sum(white[1:] * white[:-1], axis=-1), np.sqrt(parts[1:] * parts[:-1])
+    sums, of = (np.convolve(x, np.ones(FEW), "valid") for x in (products, numbers))
+    here = np.flatnonzero(sums / of > np.maximum(ALIKE, SIGMAS / np.sqrt(of)))
+    if len(here):
+        return said("one innovation is like the next", int(here[0]), float((sums / of).max()))
+    whole, total = float(products.sum() / numbers.sum()), float(numbers.sum())
+    if whole > max(RUN_ALIKE, SIGMAS / np.sqrt(total)):
+        return said("one innovation is like the next", None, whole)
+    if len(white) >= MANY:
+        leaning = np.apply_along_axis(np.convolve, 0, white, np.ones(MANY), "valid")
+        most = np.convolve(parts, np.ones(MANY) / MANY, "valid")
+        square = np.sum(leaning**2, axis=-1) / MANY
+        here = np.flatnonzero(square > np.maximum(LEANING**2 * MANY * most, chi_square(1.0 - RARELY, most)))
+        if len(here):
+            size = float(np.sqrt(square / most / MANY).max())
+            return said(f"the mean of {MANY} innovations is not 0", int(here[0]), size)
     return ()
 
 

@@ -39,9 +39,11 @@ from flowgraph.blocks.geometry.euler import (
 )
 from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
 from flowgraph.blocks.geometry.rotations import skew, to_matrix
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import Correction, correct
+from flowgraph.blocks.kalman.filters import Correction, correct, scaled
 from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.signals import Belief, EulerAngles, Gaussian, Imu, KalmanInnovation, PoseMeasurement
 
@@ -62,8 +64,7 @@ __all__ = [
 STATE = StateSpace(euclidean(3), angle(3), euclidean(9))
 """(p, e, v, b_g, b_a)."""
 
-_POSE = StateSpace(euclidean(3), angle(3))
-_SEES_POSE = np.eye(6, 15)
+POSE_ANGLES = StateSpace(euclidean(3), angle(3))
 
 
 def increments(x: Array, imu: Imu, dt: Any) -> tuple[Array, Array]:
@@ -223,27 +224,27 @@ def seen_place(x: Array, lever: tuple[float, float, float], *, order: str, xp: A
     return x[..., 0:3] + (matrix_from_angles(x[..., 3:6], order=order, xp=xp) @ arm[:, None])[..., 0]
 
 
-def sees_pose(e: Array, lever: tuple[float, float, float], *, order: str, xp: Any) -> Array:
-    """H (6, 15) of a measured pose whose position is of a point: d(R(e) lever)/de = -R [lever]x G."""
-    H = xp.asarray(_SEES_POSE, dtype=e.dtype)
-    if not any(lever):
-        return H
-    arm = skew(xp.asarray(lever, dtype=e.dtype), xp=xp)
-    R, G = (f(e, order=order, xp=xp) for f in (matrix_from_angles, body_rate_matrix))
-    place, angles = (xp.asarray(np.eye(n, 3, shift), dtype=e.dtype) for n, shift in ((6, 0), (15, -3)))
-    return H - place @ (R @ arm @ G) @ angles.mT
+def see_pose_angles(lever: tuple[float, float, float], *, order: str) -> Callable[[Array, Any], Array]:
+    """What a measured pose would be of states (..., 15): the place of the point, and the angles (..., 6)."""
+
+    def see(x: Array, xp: Any) -> Array:
+        return xp.concat([seen_place(x, lever, order=order, xp=xp), x[..., 3:6]], axis=-1)
+
+    return see
 
 
 @block
 def update_pose_angles(
     prior: Gaussian,
     pose: PoseMeasurement | None,
+    scale: Any = None,
     *,
     order: str,
     R: npt.ArrayLike,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with a measured pose, z = (p + R(e) lever, e) + noise; without one the prior passes through.
@@ -258,17 +259,16 @@ def update_pose_angles(
         R: covariance (6, 6) of (position, angles), m and rad, its diagonal (6), or one variance.
         factor: on the measurement's own covariance, which is added to R.
         lever: the point in the body whose position is measured, m.
-        gate: when given, a measurement with a nis above it changes nothing (for six numbers 22.5 is 99.9 %).
+        gate, robust, scale: as in `update_linear` (for six numbers a nis of 22.5 is 99.9 %).
     """
     if pose is None:
         return prior, None
     e = prior.mean[..., 3:6]
     z = xp.concat([pose.position, measured_angles(pose.attitude, e, order=order, xp=xp)], axis=-1)
-    expected = xp.concat([seen_place(prior.mean, lever, order=order, xp=xp), e], axis=-1)
-    residual = _POSE.minus(z, expected, xp)
-    H = sees_pose(e, lever, order=order, xp=xp)
-    noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
-    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, xp=xp), xp)
+    expected, H = linearised(see_pose_angles(lever, order=order), prior.mean, STATE, xp, seen=POSE_ANGLES)
+    residual = POSE_ANGLES.minus(z, expected, xp)
+    noise = scaled(pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp), scale, xp)
+    return moved_by(prior, correct(prior.covariance, residual, H, noise, gate=gate, robust=robust, xp=xp), xp)
 
 
 def moved_by(prior: Gaussian, found: Correction, xp: Any) -> tuple[Gaussian, KalmanInnovation]:

@@ -19,20 +19,20 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, Scalar, block
-from flowgraph.blocks.geometry.manifold import StateSpace, angle, euclidean
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import masked
 from flowgraph.blocks.kalman.lost import PATIENCE
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import (
+    POSE_ANGLES,
     STATE,
     increment_variances,
     increments,
     measured_angles,
     move,
     pose_noise,
-    seen_place,
-    sees_pose,
+    see_pose_angles,
 )
 from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
 from flowgraph.blocks.particles.lost import verdict
@@ -56,7 +56,6 @@ __all__ = [
     "start_states",
 ]
 
-_POSE = StateSpace(euclidean(3), angle(3))
 _MOVING = np.arange(15) < 9
 """Position, angles and velocity: what of a state may have lost track."""
 
@@ -136,14 +135,16 @@ def correct_states(
     e = mean[3:6]
     z = xp.concat([pose.position, measured_angles(pose.attitude, e, order=order, xp=xp)], axis=-1)
 
+    see = see_pose_angles(lever, order=order)
+
     def off(m: Array) -> Array:
-        seen = xp.concat([seen_place(m, lever, order=order, xp=xp), m[..., 3:6]], axis=-1)
-        return _POSE.minus(z, seen, xp)
+        return POSE_ANGLES.minus(z, see(m, xp), xp)
 
     residual = off(mean)
     present = ~xp.isnan(residual)
     noise = pose_noise(pose, e, R=R, factor=factor, order=order, xp=xp)
-    H, noise = masked(sees_pose(e, lever, order=order, xp=xp), noise, present, xp)
+    _, H = linearised(see, mean, STATE, xp, seen=POSE_ANGLES)
+    H, noise = masked(H, noise, present, xp)
     S = H @ spread.covariance @ H.mT + noise
     count, innovation, grow = verdict(
         state, xp.where(present, residual, 0.0), S, present, gate=gate, patience=patience, at_once=True, xp=xp

@@ -27,8 +27,10 @@ from flowgraph.blocks.geometry.rotations import (
     rotate,
     skew,
 )  # fmt: skip
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.signals import Gaussian, Imu, KalmanInnovation, Pose, PoseBelief, QuaternionBelief
 
@@ -44,7 +46,6 @@ __all__ = [
     "predict_pose",
     "quaternion_noise",
     "start_pose",
-    "tangent_jacobian",
     "update_pose",
 ]
 
@@ -100,25 +101,21 @@ def predict_pose(
     """
     v, p, q = move(belief.velocity, belief.position, belief.attitude, imu, dt, xp, gravity=gravity)
     F = move_jacobian(belief.attitude, imu, dt, xp)
-    push, kind = noise.accelerometer**2 * dt, q.dtype
-    Q_vp = xp.asarray(_VV, dtype=kind) * push + xp.asarray(_VP, dtype=kind) * (push * dt)
-    Q_vp = Q_vp + xp.asarray(_PP, dtype=kind) * (push * dt * dt)
-    Q_q = quaternion_noise(q, noise.gyro, dt, xp)
-    wide = xp.asarray(np.zeros((6, 4)), dtype=kind)
-    Q = xp.concat([xp.concat([Q_vp, wide], axis=-1), xp.concat([wide.mT, Q_q], axis=-1)], axis=-2)
-    P = F @ belief.covariance @ F.mT + Q
-    return _unit(v, p, q, P, xp)
+    P = F @ belief.covariance @ F.mT + motion_noise(q, noise, dt, xp)
+    return unit(v, p, q, P, xp)
 
 
 @block
 def update_pose(
     prior: QuaternionBelief,
     pose: Pose | None,
+    scale: Any = None,
     *,
     position_noise: float,
     attitude_noise: float,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[QuaternionBelief, KalmanInnovation | None]:
     """Correct with a measured pose, where there is one; without one the prior passes through.
@@ -132,7 +129,7 @@ def update_pose(
         pose: z; or absent.
         position_noise, attitude_noise: standard deviations, m and rad.
         lever: the point whose position is measured, m, body.
-        gate: when given, a measurement that is too far off changes nothing; see `update_linear`.
+        gate, robust, scale: as in `update_linear`.
 
     An entry that is NaN was not measured, and the others correct alone; a NaN in the quaternion takes all of
     the attitude with it.
@@ -147,10 +144,10 @@ def update_pose(
     residual = xp.where(present, residual, 0.0)
     H = observe_jacobian(prior.attitude, arm, xp)
     R = np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3)
-    R = xp.asarray(R, dtype=kind)
-    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, xp=xp)
+    R = scaled(xp.asarray(R, dtype=kind), scale, xp)
+    found = correct(prior.covariance, residual, H, R, present=present, gate=gate, robust=robust, xp=xp)
     d = found.shift
-    posterior = _unit(
+    posterior = unit(
         prior.velocity + d[..., 0:3],
         prior.position + d[..., 3:6],
         prior.attitude + d[..., 6:10],
@@ -201,16 +198,6 @@ def move_jacobian(q: Array, imu: Imu, dt: Any, xp: Any) -> Array:
     return xp.concat([top, low], axis=-2)
 
 
-def tangent_jacobian(q: Array, predicted: Array, imu: Imu, dt: Any, xp: Any) -> Array:
-    """The Jacobian (9, 9) of `move` from the tangent space at q to that at the q' that it predicted.
-
-    `move_jacobian` between T(q') and T(q)^+, where T (9, 10) makes of a small change of (v, p, q) its error
-    in the order of `PoseBelief`, and T^+ (10, 9) of an error the change.
-    """
-    back = _to_tangent(q, xp).mT * xp.asarray([1.0] * 6 + [0.25] * 3)  # T's rows of angles have length 2
-    return _to_tangent(predicted, xp) @ move_jacobian(q, imu, dt, xp) @ back
-
-
 def observe_jacobian(q: Array, lever: Array, xp: Any) -> Array:
     """The Jacobian (6, 10) of what a motion capture measures, in its tangent space, with respect to (v, p,
     q).
@@ -239,6 +226,16 @@ def rotated_jacobian(q: Array, v: Array, xp: Any) -> Array:
     along = xp.linalg.vecdot(u, v)[..., None, None] * xp.eye(3, dtype=q.dtype)
     rest = along + uv - uv.mT - w[..., None] * skew(v, xp=xp)
     return 2.0 * xp.concat([column[..., :, None], rest], axis=-1)
+
+
+def motion_noise(q: Array, noise: ImuNoise, dt: Any, xp: Any) -> Array:
+    """Q (10, 10) of `predict_pose`, at the attitude after the step."""
+    push, kind = noise.accelerometer**2 * dt, q.dtype
+    Q_vp = xp.asarray(_VV, dtype=kind) * push + xp.asarray(_VP, dtype=kind) * (push * dt)
+    Q_vp = Q_vp + xp.asarray(_PP, dtype=kind) * (push * dt * dt)
+    Q_q = quaternion_noise(q, noise.gyro, dt, xp)
+    wide = xp.asarray(np.zeros((6, 4)), dtype=kind)
+    return xp.concat([xp.concat([Q_vp, wide], axis=-1), xp.concat([wide.mT, Q_q], axis=-1)], axis=-2)
 
 
 def quaternion_noise(q: Array, density: float, dt: Any, xp: Any) -> Array:
@@ -287,18 +284,21 @@ def pose_steps(result: Result) -> Steps:
     prior, posterior = (
         Series(s.time, in_tangent_space(s.values)) for s in (result["prior"], result["posterior"])
     )
-    rows = zip(
-        posterior["mean"][:-1, 6:], prior["mean"][1:, 6:], result["control"][1:],
-        np.diff(posterior.time) * 1e-9, strict=True,
-    )  # fmt: skip
-    jacobians = [tangent_jacobian(q, ahead, control, dt, np) for q, ahead, control, dt in rows]
+    # between the tangent spaces of ten numbers and nine, for all ticks at once
+    drive, dt = result["control"][1:].values, np.diff(posterior.time)[:, None] * 1e-9
+
+    def carried(x: Array, xp: Any) -> Array:
+        v, p, q = move(x[..., 3:6], x[..., 0:3], x[..., 6:], drive, dt, xp)
+        return xp.concat([p, v, q], axis=-1)
+
     space = StateSpace(euclidean(6), quaternion())
+    _, jacobians = linearised(carried, posterior["mean"][:-1], space, np, seen=space)
 
     def named(smoothed: Series) -> Series:
         p, v, q = np.split(smoothed["mean"], (3, 6), axis=-1)
         return Series(smoothed.time, PoseBelief(p, v, q, smoothed["covariance"]), name=smoothed.name)
 
-    return Steps(prior, posterior, np.reshape(jacobians, (-1, 9, 9)), space, named)
+    return Steps(prior, posterior, jacobians, space, named)
 
 
 def in_tangent_space(belief: QuaternionBelief) -> Gaussian:
@@ -326,7 +326,7 @@ def _to_tangent(q: Array, xp: Any) -> Array:
     return xp.concat([swap, xp.concat([none, none, angle], axis=-1)], axis=-2)
 
 
-def _unit(v: Array, p: Array, q: Array, P: Array, xp: Any) -> QuaternionBelief:
+def unit(v: Array, p: Array, q: Array, P: Array, xp: Any) -> QuaternionBelief:
     """A belief with q scaled to unit norm and its covariance with it: N = (I - q q^T) / |q|."""
     size = xp.sqrt(xp.linalg.vecdot(q, q))[..., None]
     q = q / size

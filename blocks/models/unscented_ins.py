@@ -22,7 +22,8 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.euler import matrix_from_angles
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.kalman.filters import correct
+from flowgraph.blocks.kalman.filters import correct, scaled
+from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.models.euler_ins import STATE, increments, move, moved_by
 from flowgraph.blocks.signals import CameraMotion, Gaussian, Imu, KalmanInnovation
@@ -71,6 +72,7 @@ def update_camera_velocity(
     prior: Gaussian,
     motion: CameraMotion | None,
     imu: Imu,
+    scale: Any = None,
     *,
     order: str,
     mount: Mount,
@@ -79,6 +81,7 @@ def update_camera_velocity(
     rate: str = "gyro",
     points: SigmaPoints | None = None,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with a camera's velocity, where there is one; without one the prior passes through.
@@ -99,8 +102,7 @@ def update_camera_velocity(
         rate_noise: of the rate that is taken, rad/s.
         rate: "gyro" or "camera".
         points: the set of sigma points; sqrt(3) deviations away if left out.
-        gate: when given, a measurement with a nis above it changes nothing (for three numbers 16.3 is
-            99.9 %).
+        gate, robust, scale: as in `update_linear` (for three numbers a nis of 16.3 is 99.9 %).
 
     Raises:
         UnknownNameError: for another source of the rate.
@@ -111,10 +113,10 @@ def update_camera_velocity(
         return prior, None
     x, kind = prior.mean, prior.mean.dtype
     n, points = x.shape[-1], far_points(6) if points is None else points
-    scale = points.scale(n + 6)
+    reach = points.scale(n + 6)
     S = covariance_root(prior.covariance, xp=xp)
     deviations = xp.asarray(np.diag(np.repeat([velocity_noise, rate_noise], 3)), dtype=kind)
-    apart, shakes = points.around(S, scale, xp), points.around(deviations, scale, xp)
+    apart, shakes = points.around(S, reach, xp), points.around(deviations, reach, xp)
     X = STATE.plus(x[None, :], xp.concat([0.0 * apart[:1], apart, 0.0 * apart[:12]], axis=0), xp)
     w = xp.concat([xp.zeros((1 + 2 * n, 6), dtype=kind), shakes], axis=0)
     if rate == "gyro":
@@ -123,14 +125,15 @@ def update_camera_velocity(
         turning = motion.rate @ xp.asarray(mount.rotation, dtype=kind) + 0.0 * X[:, 9:12]
     R = matrix_from_angles(X[:, 3:6], order=order, xp=xp)
     seen = camera_velocity(X[:, 6:9], R, turning - w[:, 3:6], mount=mount, xp=xp) + w[:, 0:3]
-    cluster = points.cluster(seen, None, scale, xp)
-    slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * scale)  # H S
-    rest = points.covariance(cluster, cluster, scale) - slope @ slope.mT
+    cluster = points.cluster(seen, None, reach, xp)
+    slope = (cluster.outer[:n] - cluster.outer[n : 2 * n]).mT / (2.0 * reach)  # H S
+    rest = points.covariance(cluster, cluster, reach) - slope @ slope.mT
     # a direction that is known exactly has a column of zeros, and nothing to learn: any H there will do
     known = xp.eye(n, dtype=kind) * xp.astype(S == 0.0, kind)
     H = xp.linalg.solve((S + known).mT, slope.mT).mT
     residual = motion.velocity - cluster.mean
-    found = correct(prior.covariance, residual, H, 0.5 * (rest + rest.mT), gate=gate, xp=xp)
+    rest = scaled(0.5 * (rest + rest.mT), scale, xp)
+    found = correct(prior.covariance, residual, H, rest, gate=gate, robust=robust, xp=xp)
     return moved_by(prior, found, xp)
 
 

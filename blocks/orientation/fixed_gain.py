@@ -184,12 +184,7 @@ def pose_spread(
         [[one, one * dt, A * (0.5 * dt), none], [none, one, A, none], [none, none, turn, none],
          [none, none, none, one]], xp,
     )  # fmt: skip
-    push, rate = noise.imu.accelerometer**2 * dt, noise.imu.gyro**2 * dt
-    Q = _blocks(
-        [[one * (push * dt * dt / 3.0), one * (push * dt / 2.0), none, none],
-         [one * (push * dt / 2.0), one * push, none, none], [none, none, one * rate, none],
-         [none, none, none, none]], xp,
-    )  # fmt: skip
+    Q = motion_noise(noise.imu, one, dt, xp)
     P, since, seen = F @ state["covariance"] @ F.mT + Q, state["since"] + dt, state["seen"]
     if pose is not None:
         c = xp.where(since > 0.0, (1.0 - velocity_alpha) / xp.where(since > 0.0, since, 1.0), 0.0) * seen
@@ -212,6 +207,16 @@ def pose_spread(
         covariance=P[..., :9, :9],
     )
     return {"covariance": P, "since": since, "seen": seen}, belief
+
+
+def motion_noise(noise: ImuNoise, one: Array, dt: Any, xp: Any) -> Array:
+    """What a step of `pose_spread` adds (12, 12); one (3, 3)."""
+    none, push, rate = 0.0 * one, noise.accelerometer**2 * dt, noise.gyro**2 * dt
+    return _blocks(
+        [[one * (push * dt * dt / 3.0), one * (push * dt / 2.0), none, none],
+         [one * (push * dt / 2.0), one * push, none, none], [none, none, one * rate, none],
+         [none, none, none, none]], xp,
+    )  # fmt: skip
 
 
 @pose_spread.init

@@ -2,8 +2,8 @@
 
 State x = (position, velocity, attitude, position at the last picture, attitude at the last picture): 17
 numbers, on a space of 15 dimensions. The last two are clones, which optical flow is measured from. A sensor
-is a function of the state and its Jacobian; `update_extended` does the rest. Attitude errors are right (body)
-rotation vectors.
+is a function of the state; `update_extended` derives its Jacobian and does the rest. Attitude errors are
+right (body) rotation vectors.
 
 Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017; clones:
 S. I. Roumeliotis and J. W. Burdick, "Stochastic cloning: a generalized framework for processing relative
@@ -23,6 +23,7 @@ from flowgraph.blocks.geometry.rotations import (
     from_rotation_vector,
     multiply,
     normalize,
+    rotate,
     skew,
     to_matrix,
 )  # fmt: skip
@@ -143,12 +144,9 @@ class PositionObserver:
     def __init__(self, lever: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.lever = lever
 
-    def __call__(self, x: Array, xp: Any) -> tuple[Array, Array]:
+    def __call__(self, x: Array, xp: Any) -> Array:
         p, _, q, _, _ = _parts(x)
-        R, arm = to_matrix(q, xp=xp), xp.asarray(self.lever, dtype=x.dtype)
-        one, zero = 0.0 * R + xp.eye(3, dtype=x.dtype), 0.0 * R
-        H = xp.concat([one, zero, R @ -skew(arm, xp=xp), zero, zero], axis=-1)
-        return p + _times(R, arm), H
+        return p + rotate(q, xp.asarray(self.lever, dtype=x.dtype), xp=xp)
 
 
 class FieldObserver:
@@ -162,35 +160,21 @@ class FieldObserver:
     def __init__(self, earth: tuple[float, float, float], noise: float) -> None:
         self.earth = tuple(m / noise for m in earth)
 
-    def __call__(self, x: Array, xp: Any) -> tuple[Array, Array]:
-        R = to_matrix(_parts(x)[2], xp=xp)
-        seen = _times(R.mT, xp.asarray(self.earth, dtype=x.dtype))
-        zero = 0.0 * R
-        return seen, xp.concat([zero, zero, skew(seen, xp=xp), zero, zero], axis=-1)
+    def __call__(self, x: Array, xp: Any) -> Array:
+        return _times(to_matrix(_parts(x)[2], xp=xp).mT, xp.asarray(self.earth, dtype=x.dtype))
 
 
-def observe_distance(x: Array, xp: Any) -> tuple[Array, Array]:
+def observe_distance(x: Array, xp: Any) -> Array:
     """h(x) = p_z / R_33: the distance (1) to the ground along body -z, m."""
     p, _, q, _, _ = _parts(x)
-    R = to_matrix(q, xp=xp)
-    up = R[..., 2:3, :]  # the world's z axis in the body
-    seen = p[..., 2:3] / up[..., 0, 2:3]
-    zero = 0.0 * up
-    axis = xp.asarray([0.0, 0.0, 1.0], dtype=x.dtype)
-    fall = xp.concat([zero[..., :2], 1.0 / up[..., 2:3]], axis=-1)
-    lean = up @ skew(axis, xp=xp) * (seen / up[..., 0, 2:3])[..., None]
-    return seen, xp.concat([fall, zero, lean, zero, zero], axis=-1)
+    return p[..., 2:3] / to_matrix(q, xp=xp)[..., 2, 2:3]
 
 
-def observe_flow(x: Array, xp: Any) -> tuple[Array, Array]:
+def observe_flow(x: Array, xp: Any) -> Array:
     """h(x) = (R(q_0)^T (p - p_0), q_0^-1 q): displacement (3) and turn (4) since the last picture."""
     p, _, q, p0, q0 = _parts(x)
-    R0 = to_matrix(q0, xp=xp)
-    moved, turn = _times(R0.mT, p - p0), multiply(conjugate(q0, xp=xp), q, xp=xp)
-    zero, one = 0.0 * R0, 0.0 * R0 + xp.eye(3, dtype=x.dtype)
-    place = xp.concat([R0.mT, zero, zero, -R0.mT, skew(moved, xp=xp)], axis=-1)
-    angle = xp.concat([zero, zero, one, zero, -to_matrix(turn, xp=xp).mT], axis=-1)
-    return xp.concat([moved, turn], axis=-1), xp.concat([place, angle], axis=-2)
+    moved, turn = _times(to_matrix(q0, xp=xp).mT, p - p0), multiply(conjugate(q0, xp=xp), q, xp=xp)
+    return xp.concat([moved, turn], axis=-1)
 
 
 def flow_vector(flow: OpticalFlow, *, xp: Any) -> Array:

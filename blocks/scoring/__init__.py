@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from flowgraph.blocks.scoring.capture import on_capture
 from flowgraph.blocks.scoring.cases import (
+    Adapted,
     Factors,
     Gated,
     HeldControl,
@@ -26,6 +27,7 @@ from flowgraph.blocks.scoring.cases import (
     Scored,
     Smoothed,
     SmoothedPoseFilter,
+    Weighed,
     on_flight,
 )
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
@@ -91,6 +93,8 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
+    "Adapted",
+    "Weighed",
     "SMOOTHED",
     "MAGNETIC_HEADING",
     "UNKNOWN_HEADING",

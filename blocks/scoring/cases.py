@@ -24,12 +24,21 @@ from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held
+from flowgraph.blocks.kalman.robust import ROBUST
 from flowgraph.blocks.kalman.smoothing import Steps
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
-from flowgraph.blocks.scoring.settings import NotNegative, Positive, Settings, count, one_of, spliced
+from flowgraph.blocks.scoring.settings import (
+    NotNegative,
+    Positive,
+    Settings,
+    above_one,
+    count,
+    one_of,
+    spliced,
+)
 from flowgraph.blocks.scoring.start import Started
 from flowgraph.blocks.scoring.tuning import given, imu_noise_of, noise_of
 from flowgraph.blocks.signals import GRAVITY
@@ -38,6 +47,7 @@ from flowgraph.errors import DeclarationError
 from flowgraph.language.declare import GraphFunction
 
 __all__ = [
+    "Adapted",
     "Factors",
     "Gated",
     "HeldControl",
@@ -49,6 +59,7 @@ __all__ = [
     "Scored",
     "Smoothed",
     "SmoothedPoseFilter",
+    "Weighed",
     "on_flight",
 ]
 
@@ -302,6 +313,38 @@ class Gated(Settings):
 
 
 @dataclass(frozen=True)
+class Weighed(Gated):
+    """How far a measurement is believed that is far off.
+
+    Args:
+        robust: none, and it counts as its noise is told; huber or student_t, and for less, by its distance
+            from what is left after the correction (`robust`).
+    """
+
+    robust: Annotated[str, one_of(*ROBUST)] = "none"
+
+    def gating(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {**super().gating(), "robust": ROBUST[self.robust]()}
+
+
+@dataclass(frozen=True)
+class Adapted(Weighed):
+    """How large the noise of a measurement is.
+
+    Args:
+        adaptive: over about how many measurements the size of each sensor's noise is learned; it is as told
+            if left out (`learned_scale`).
+    """
+
+    adaptive: Annotated[float | None, above_one] = None
+
+    def gating(self) -> dict[str, Any]:
+        """What is a setting of the graph itself, by name."""
+        return {**super().gating(), "adaptive": self.adaptive}
+
+
+@dataclass(frozen=True)
 class HeldControl(Settings):
     """What the age of a control does.
 
@@ -375,7 +418,7 @@ class PoseAided(Factors, PoseNoises, Scored, Started):
 
 
 @dataclass(frozen=True)
-class PoseFilter(PoseAided, HeldControl, Gated):
+class PoseFilter(PoseAided, HeldControl, Adapted):
     """A `PoseAided` filter that can refuse a measurement, for which it must be Gaussian."""
 
 

@@ -27,8 +27,8 @@ from flowgraph.blocks.models.euler_ins import (
 from flowgraph.blocks.models.recordings import euler_recording
 from flowgraph.blocks.models.unscented_ins import far_points
 from flowgraph.blocks.scoring.cases import (
+    Adapted,
     Factors,
-    Gated,
     HeldControl,
     OnFlight,
     PoseAided,
@@ -134,7 +134,7 @@ class EulerModel(ScaledFactors, Scored):
 
 
 @dataclass(frozen=True)
-class EulerKalman(EulerModel, HeldControl, Gated):
+class EulerKalman(EulerModel, HeldControl, Adapted):
     """What is set of every Kalman filter with Euler angles."""
 
     def case(

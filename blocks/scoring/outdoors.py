@@ -22,7 +22,7 @@ from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds, start
 from flowgraph.blocks.inertial.moving import align_moving
 from flowgraph.blocks.inertial.navigation import PARAMETERS, Earth, earth_at, extended, gravity_at
 from flowgraph.blocks.inertial.outdoors import Antenna, Resting
-from flowgraph.blocks.scoring.cases import Factors, Gated, HeldControl, OnFlight, Smoothed
+from flowgraph.blocks.scoring.cases import Adapted, Factors, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started
 from flowgraph.blocks.scoring.tuning import given
@@ -50,7 +50,7 @@ class World(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outdoors(Factors, Smoothed, Started, HeldControl, Gated):
+class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
     """What is set of a filter that is aided by satellites.
 
     Args:

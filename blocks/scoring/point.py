@@ -15,7 +15,7 @@ from flowgraph import Case, DataError, Flight, Series, arrays
 from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.metrics.consistency import point_errors
 from flowgraph.blocks.models.point import point_model, point_steps, start_point
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed
+from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.start import from_first
 from flowgraph.blocks.scoring.streams import told_acceleration
@@ -26,7 +26,7 @@ __all__ = ["PointFilter", "on_point", "positions", "readings"]
 
 
 @dataclass(frozen=True)
-class PointFilter(HeldControl, Gated, Smoothed):
+class PointFilter(HeldControl, Adapted, Smoothed):
     """What is set of a linear filter of a point.
 
     Args:

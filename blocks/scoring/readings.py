@@ -20,7 +20,12 @@ from flowgraph.blocks.signals import (
     BodyRate,
     CameraMotion,
     CoordinateAcceleration,
+    GnssFix,
+    GnssHeading,
+    GnssPosition,
+    GnssVelocity,
     Gyro,
+    Height,
     Imu,
     ImuCounts,
     MagneticField,
@@ -34,6 +39,7 @@ from flowgraph.blocks.signals import (
     SpecificForce,
     Thrust,
     Velocity,
+    WheelSpeed,
 )
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
@@ -48,6 +54,8 @@ MEASURED = (
     Pose, PoseMeasurement, Position, Attitude, Velocity, MagneticField, Range, OpticalFlow, PlanePosition,
     CameraMotion,
 )  # fmt: skip
+AIDS = (*MEASURED, GnssFix, GnssPosition, GnssVelocity, GnssHeading, Height, WheelSpeed)
+"""All that corrects; of those that `MEASURED` has not, entries may be missing throughout."""
 
 GAP, MEASURED_GAP = 4.0, 10.0
 """Of how many usual steps a gap is: of a control, and of a measurement, which must last a second, too."""
@@ -199,7 +207,7 @@ def gap_notes(inputs: Mapping[str, Series], noted: Collection[str]) -> Iterator[
     seen = [inputs[name] for name in noted if name in inputs]
     for name, series in inputs.items():
         cls = _class(series)
-        if (cls not in CONTROLS and cls not in MEASURED) or any(
+        if (cls not in CONTROLS and cls not in AIDS) or any(
             np.array_equal(series.time, other.time) for other in seen
         ):
             continue

@@ -12,14 +12,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flowgraph import Graph, Result, Series
+from flowgraph import Graph, Result, Series, Stream
 from flowgraph.blocks.filtering.batch import Loss, Recording
 from flowgraph.blocks.kalman.smoothing import Steps, fixed_lag, lag_ticks, rauch_tung_striebel
+from flowgraph.blocks.metrics.chi_square import chi_square_band
 from flowgraph.blocks.metrics.consistency import nis_remarks, nis_summary
+from flowgraph.blocks.metrics.errors import pose_errors
+from flowgraph.blocks.metrics.running import nis_score, pose_score
 from flowgraph.blocks.metrics.truth import truth_remarks
 from flowgraph.blocks.particles.lost import depletion_remarks
+from flowgraph.data.consistency import measured
 from flowgraph.drawing.states import Quantity, seconds_of
-from flowgraph.types import leaves_of
+from flowgraph.types import ArrayType, leaves_of
 
 __all__ = ["SMOOTHED", "Scorer"]
 
@@ -49,7 +53,8 @@ class Scorer:
         errors: such as `pose_errors`, `point_errors` or `attitude_errors`.
         estimate: the stream that is compared.
         settle: seconds at the start that the errors leave out.
-        innovations: whether those that a run collects are summed up too.
+        innovations: whether those that a run collects are summed up too; where not, the filter expects larger
+            ones than honest ones, and those may be alike.
         steps: what a smoother needs of a result.
         smooth: "rts" smooths the whole run, "batch" takes the most likely trajectory of the recording, "none"
             does neither.
@@ -104,14 +109,46 @@ class Scorer:
                 found.update({f"{front}_{key}": value for key, value in better.items() if telling(key)})
         return found
 
+    def in_graph(self, streams: Mapping[str, Stream[Any]], truth: Stream[Any], end: Stream[Any]) -> Any:
+        """This score as blocks of the graph under construction, in which the truth is a stream.
+
+        Returns:
+            The streams of its figures, at `end`, and what makes the figures of a result with those streams;
+            None where there are no blocks for it, as for one that smooths.
+        """
+        estimate = streams.get(self.estimate)
+        if estimate is None or self.errors is not pose_errors or self.smoothing:
+            return None
+        leaves = dict(leaves_of(estimate.type))
+        if not {"position", "velocity", "attitude"} <= set(leaves) or not _whole(leaves.get("covariance")):
+            return None
+        settle, name = round(self.settle * 1e9), f"{self.estimate}_score"
+        made: dict[str, Any] = {self.estimate: pose_score(estimate, truth, end=end, settle=settle, name=name)}
+        for name, stream in streams.items():
+            if self._sums_up(dict(leaves_of(stream.type))):
+                made[name] = nis_score(stream, end=end, name=f"{name}_score")
+        return made, self._read
+
+    def _read(self, result: Result) -> dict[str, float]:
+        found = {n: float(x[0]) for n, x in result[self.estimate].leaves.items()}
+        found["nees_low"], found["nees_high"] = chi_square_band(9)
+        for name, series in result.series.items():
+            if "nis_count" in series.leaves and series["nis_count"][0]:
+                front, said = name.removesuffix("innovation"), series[0]
+                found.update({front + n: float(x[0]) for n, x in series.leaves.items() if n != "nis_parts"})
+                band = chi_square_band(1, runs=max(round(float(said.nis_parts)), 1))
+                found[f"{front}nis_low"], found[f"{front}nis_high"] = band
+        return found
+
     def remarks(self, result: Result) -> tuple[str, ...]:
         """Notes on a run that the figures do not tell."""
         found: list[str] = []
         if self.truth is not None and self.estimate in result.series:
             found += truth_remarks(result[self.estimate], self.truth, self.settle)
         for name, series in result.series.items():
-            if self._sums_up(series.leaves):
-                found += nis_remarks(name.removesuffix("innovation").rstrip("_"), series)
+            if "nis" in series.leaves:
+                what = measured(name)
+                found += nis_remarks(what, series, loose=not self.innovations)
             if "depleted" in series.leaves:
                 found += depletion_remarks(name.removesuffix("depleted").rstrip("_"), series)
         return tuple(found)
@@ -130,3 +167,9 @@ class Scorer:
 
     def _compared(self, series: Series) -> dict[str, float]:
         return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)
+
+
+def _whole(covariance: ArrayType | None) -> bool:
+    """Whether a covariance has the nine numbers of a pose."""
+    size = 0 if covariance is None else covariance.shape[-1]
+    return isinstance(size, int) and size >= 9

@@ -34,6 +34,7 @@ __all__ = [
     "Positive",
     "Settings",
     "Spliced",
+    "above_one",
     "count",
     "left_out_or",
     "named",
@@ -67,6 +68,19 @@ def share(graph: str, name: str, value: object) -> None:
             expected="a number from 0 to 1",
             got=repr(value),
             fix=f"write {name}=0.5",
+        )
+
+
+def above_one(graph: str, name: str, value: object) -> None:
+    """Refuse what is no number above 1; None passes."""
+    need_numbers(graph, positive={name: value})
+    if isinstance(value, (int, float)) and value <= 1.0:
+        raise DeclarationError(
+            f"setting {name!r} is too small",
+            path=f"{graph}.{name}",
+            expected="a number above 1",
+            got=repr(value),
+            fix=f"write {name}=50",
         )
 
 

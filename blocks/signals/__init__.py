@@ -35,6 +35,8 @@ from flowgraph.blocks.signals.calibration import (
     Rest,
     Window,
 )
+from flowgraph.blocks.signals.control import Controller, FlightCommand
+from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
     Attitude,
@@ -73,6 +75,16 @@ from flowgraph.blocks.signals.particles import (
     StateKernels,
     Weights,
 )
+from flowgraph.blocks.signals.scores import (
+    Bounds,
+    Extremes,
+    NisFigures,
+    NisSums,
+    PoseFigures,
+    PoseSums,
+    Settling,
+    Tally,
+)
 from flowgraph.blocks.signals.sensors import (
     BodyRate,
     CoordinateAcceleration,
@@ -95,6 +107,19 @@ from flowgraph.blocks.signals.vision import (
 )
 
 __all__ = [
+    "Controller",
+    "FlightCommand",
+    "BodyMotion",
+    "FigureShape",
+    "Vector",
+    "Bounds",
+    "Extremes",
+    "NisFigures",
+    "NisSums",
+    "PoseFigures",
+    "PoseSums",
+    "Settling",
+    "Tally",
     "GRAVITY",
     "Position",
     "Velocity",

@@ -22,6 +22,7 @@ import numpy as np
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.signals import vector_of
 from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.errors import DeclarationError
@@ -54,8 +55,9 @@ class Measurement(abc.ABC):
         """Whether noise goes into what is seen, and is not added to it."""
 
     @abc.abstractmethod
-    def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
-        """(z, H, R) at the state x (size) moved by d (t): H (m, t) by d, R (m, m)."""
+    def linearised(self, x: Array, d: Array | None, message: Any, xp: Any) -> tuple[Array, Array, Array]:
+        """(z, H, R) at the state x (size) moved by d (t), which is 0 where it is None: H (m, t) by d, R (m,
+        m)."""
 
     @property
     @abc.abstractmethod
@@ -129,17 +131,22 @@ class MeasurementModel(Measurement):
     def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
         return self._noise.matrix(message, kind, xp, None if self.inside else m)
 
-    def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
-        kind, t, row, d = x.dtype, d.shape[-1], x[None, :], d[None, :]
+    def linearised(self, x: Array, d: Array | None, message: Any, xp: Any) -> tuple[Array, Array, Array]:
+        kind, t, size, row = x.dtype, self.space.tangent, self.space.size, x[None, :]
         inside = self.covariance(message, 0, kind, xp) if self.inside else None
-        still = None if inside is None else xp.zeros((1, inside.shape[-1]), dtype=kind)
-        z = self.seen(self.space.plus(row, d, xp), still, message, xp)
+        n = 0 if inside is None else inside.shape[-1]
+        if d is None:
+            see = lambda s, xp: self.seen(s[..., :size], s[..., size:] if n else None, message, xp)
+            z, both = linearised(see, row, self.space, xp, seen=self.measured_space, more=n)
+        else:
+            still = xp.zeros((1, n), dtype=kind)
+            z = self.seen(self.space.plus(row, d[None, :], xp), still if n else None, message, xp)
 
-        def apart(c: Array, xp: Any) -> Array:
-            v = None if inside is None else c[..., t:]
-            return self.apart(self.seen(self.space.plus(row, c[..., :t], xp), v, message, xp), z, xp)
+            def apart(c: Array, xp: Any) -> Array:
+                v = c[..., t:] if n else None
+                return self.apart(self.seen(self.space.plus(row, c[..., :t], xp), v, message, xp), z, xp)
 
-        _, both = jacobian(apart, d if still is None else xp.concat([d, still], axis=-1), xp)
+            _, both = jacobian(apart, xp.concat([d[None, :], still], axis=-1) if n else d[None, :], xp)
         H, V = both[0, :, :t], both[0, :, t:]
         R = self.covariance(message, H.shape[-2], kind, xp) if inside is None else V @ inside @ V.mT
         return z[0, :], H, R
@@ -198,6 +205,6 @@ class LinearMeasurement(Measurement):
     def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
         return self._noise.matrix(message, kind, xp, m)
 
-    def linearised(self, x: Array, d: Array, message: Any, xp: Any) -> tuple[Array, Array, Array]:
-        z = self.seen(self.space.plus(x, d, xp), None, message, xp)
+    def linearised(self, x: Array, d: Array | None, message: Any, xp: Any) -> tuple[Array, Array, Array]:
+        z = self.seen(x if d is None else self.space.plus(x, d, xp), None, message, xp)
         return z, self._matrix(message, x.dtype, xp), self.covariance(message, z.shape[-1], x.dtype, xp)

@@ -27,12 +27,12 @@ import numpy as np
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.geometry.views import array_of, joined
 from flowgraph.blocks.kalman.triangles import semidefinite_root
 from flowgraph.blocks.signals import vector_of
 from flowgraph.blocks.statespace.functions import Covariance, Handed, numbers
 from flowgraph.errors import DeclarationError
-from flowgraph.recorder.derivatives import jacobian
 
 __all__ = ["DiscreteModel", "Motion", "MotionModel", "runge_kutta"]
 
@@ -115,16 +115,14 @@ class MotionModel:
         return xp.asarray(root, dtype=kind) * xp.sqrt(_per_second(dt, kind, xp))
 
     def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
-        t, kind, row = self.space.tangent, x.dtype, x[None, :]
+        t, size, kind = self.space.tangent, self.space.size, x.dtype
         D = None if self._density is None else self._density.matrix(control, kind, xp)
         n = 0 if D is None else D.shape[-1]
-        after = self.carry(row, control, None if D is None else xp.zeros((1, n), dtype=kind), dt, xp)
 
-        def moved(d: Array, xp: Any) -> Array:
-            start = self.space.plus(row, d[..., :t], xp)
-            return self.space.minus(self.carry(start, control, d[..., t:] if n else None, dt, xp), after, xp)
+        def moved(s: Array, xp: Any) -> Array:
+            return self.carry(s[..., :size], control, s[..., size:] if n else None, dt, xp)
 
-        _, both = jacobian(moved, xp.zeros((1, t + n), dtype=kind), xp)
+        after, both = linearised(moved, x[None, :], self.space, xp, seen=self.space, more=n)
         F, G = both[0, :, :t], both[0, :, t:]
         return after[0, :], F, None if D is None else G @ (D * _per_second(dt, kind, xp)) @ G.mT
 

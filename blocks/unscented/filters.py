@@ -26,8 +26,9 @@ import numpy.typing as npt
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, where_any
+from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, scaled, where_any
 from flowgraph.blocks.kalman.matrices import noise_matrix
+from flowgraph.blocks.kalman.robust import Robust, reweighted
 from flowgraph.blocks.kalman.triangles import covariance_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
@@ -158,6 +159,7 @@ def _shaken(noise: npt.ArrayLike, dt: Any, kind: Any, xp: Any) -> Array:
 def update_unscented(
     prior: Gaussian,
     measured: Vector | None,
+    scale: Any = None,
     *,
     observe: Callable[..., Array],
     R: npt.ArrayLike,
@@ -165,6 +167,7 @@ def update_unscented(
     measured_space: StateSpace | None = None,
     points: SigmaPoints = GAUSSIAN,
     gate: float | None = None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, KalmanInnovation | None]:
     """Correct with z = h(x) + noise, where there is a measurement; without one the prior passes through.
@@ -182,7 +185,7 @@ def update_unscented(
         R: as in `update_linear`, in the tangent space of z.
         space, measured_space: of the state and of z; without one it is a vector.
         points: the set of sigma points.
-        gate: when given, as in `update_linear`.
+        gate, robust, scale: as in `update_linear`.
 
     Returns:
         The posterior, and the innovation where there was one.
@@ -190,10 +193,12 @@ def update_unscented(
     if measured is None:
         return prior, None
     seen = lambda x, v: observe(x, xp)
-    noise = lambda m: noise_matrix(R, m, "update_unscented.R", kind=prior.mean.dtype, xp=xp)
+    kind = prior.mean.dtype
+    noise = lambda m: scaled(noise_matrix(R, m, "update_unscented.R", kind=kind, xp=xp), scale, xp)
     return through_observation(
         prior, measured, seen, noise, None,
-        space=space, measured_space=measured_space, points=points, gate=gate, xp=xp,
+        space=space, measured_space=measured_space, points=points, gate=gate, robust=robust,
+        xp=xp,
     )  # fmt: skip
 
 
@@ -208,6 +213,7 @@ def through_observation(
     measured_space: StateSpace | None,
     points: SigmaPoints,
     gate: float | None,
+    robust: Robust | None = None,
     xp: Any,
 ) -> tuple[Gaussian, Any]:
     """Correct with what is seen of a Gaussian, and the innovation, present where any entry was measured.
@@ -216,7 +222,7 @@ def through_observation(
         seen: `seen(x, v) -> z`, on x (..., k, size) and v (..., k, n_v), a point a row.
         added: the covariance of noise that is added, by the number of entries; None where it goes in.
         shaken: a root (n_v, n_v) of the covariance of v; None: v is None.
-        prior, measured, space, measured_space, points, gate: as in `update_unscented`.
+        prior, measured, space, measured_space, points, gate, robust: as in `update_unscented`.
     """
     x, P, kind = prior.mean, prior.covariance, prior.mean.dtype
     apart, v, scale = _placed(P, shaken, space, points, xp)
@@ -226,12 +232,17 @@ def through_observation(
     noise = xp.zeros((m, m), dtype=kind) if added is None else added(m)
     outer, noise = masked(z.outer.mT, noise, present, xp)
     around = Cluster(z.mean, outer.mT, z.centre * xp.astype(present, kind)[..., None, :])
-    S = points.covariance(around, around, scale) + noise
+    spread = points.covariance(around, around, scale)
+    S = spread + noise
     C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), around, scale)
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
+    parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
+    if robust is not None:
+        noise = reweighted(robust, spread, residual, noise, parts, xp)
+        solved = xp.linalg.solve(spread + noise, xp.concat([C.mT, column], axis=-1))
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)
@@ -245,7 +256,7 @@ def through_observation(
         residual=residual,
         covariance=S,
         nis=nis,
-        parts=xp.sum(xp.astype(present, P.dtype), axis=-1),
+        parts=parts,
         accepted=accepted,
     )
     return posterior, where_any(present, innovation, xp)

@@ -2,7 +2,7 @@
 
 A `World` answers for any times with a `Motion`: position and its derivatives, attitude and body rate, all
 exact. `thesis_flight` draws a random quadrotor flight, `Quadrotor` follows given key points, `RoundTrip`
-turns out and back in its place, `Hover` stays.
+turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`, and a block of a graph too.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join, primitive
-from flowgraph.blocks.world.motion import Motion, World
+from flowgraph.blocks.world.motion import Motion, World, world_motion
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
+from flowgraph.blocks.world.smooth import AT_REST, figure_motion, figure_shape, shaped, smooth_motion
 from flowgraph.blocks.world.thesis import thesis_flight
 
 __all__ = [
     "World",
     "Motion",
+    "world_motion",
     "KeyPoint",
     "Primitives",
     "join",
@@ -37,4 +39,9 @@ __all__ = [
     "Figures",
     "figures",
     "generator",
+    "AT_REST",
+    "figure_motion",
+    "figure_shape",
+    "shaped",
+    "smooth_motion",
 ]

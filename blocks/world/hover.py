@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flowgraph import Array
 from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.motion import Motion, World
 from flowgraph.blocks.world.quadrotor import carried_by_thrust
@@ -29,10 +31,10 @@ class Hover(World):
     drift: float = 0.0
     seed: int = 0
 
-    def _motion(self, seconds: np.ndarray) -> Motion:
+    def motion(self, seconds: Array, *, xp: Any) -> Motion:
         random = generator(self.seed, "hover")
         speed = 2.0 * np.pi * random.uniform(0.1, 0.5, (3, 3))
-        angle = speed * seconds[:, None, None] + random.uniform(0.0, 2.0 * np.pi, (3, 3))
+        angle = speed * seconds[..., None, None] + random.uniform(0.0, 2.0 * np.pi, (3, 3))
         size = self.drift * np.sqrt(2.0 / 3.0)
-        wave = lambda k: (size * speed**k * np.sin(angle + k * np.pi / 2.0)).sum(-1)
-        return carried_by_thrust(np.array(self.point) + wave(0), wave(1), wave(2), wave(3))
+        wave = lambda k: xp.sum(size * speed**k * xp.sin(angle + k * np.pi / 2.0), axis=-1)
+        return carried_by_thrust(np.array(self.point) + wave(0), wave(1), wave(2), wave(3), xp=xp)

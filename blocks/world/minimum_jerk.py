@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flowgraph import Array
 from flowgraph.errors import DeclarationError
 
 __all__ = ["KeyPoint", "Primitives", "join", "primitive"]
@@ -84,21 +86,20 @@ class Primitives:
         """s, of all of them."""
         return float(self.start[-1] + self.seconds[-1])
 
-    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position, velocity, acceleration and jerk (m, 3) at times (m,) in s."""
-        which = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
-        return self.within(which, t - self.start[which])
+    def at(self, t: Array, *, xp: Any = np) -> tuple[Array, Array, Array, Array]:
+        """Position, velocity, acceleration and jerk (..., 3) at times (...) in s."""
+        begins = xp.asarray(self.start, dtype=t.dtype)
+        which = xp.clip(xp.searchsorted(begins, t, side="right") - 1, 0, len(self.start) - 1)
+        return self.within(which, t - xp.take(begins, which, axis=0), xp=xp)
 
-    def within(
-        self, which: np.ndarray, s: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The same, at `s` (m,) seconds into the primitives `which` (m,)."""
-        derivative = np.moveaxis(self.coefficients[which], 1, 0)
+    def within(self, which: Array, s: Array, *, xp: Any = np) -> tuple[Array, Array, Array, Array]:
+        """The same, at `s` (...) seconds into the primitives `which` (...)."""
+        rows = xp.take(xp.asarray(self.coefficients, dtype=s.dtype), which, axis=0)
+        derivative = [rows[..., k, :] for k in range(self.coefficients.shape[1])]
         found = []
         for _ in range(4):
-            found.append(_horner(derivative, s[:, None]))
-            powers = np.arange(1, len(derivative))
-            derivative = derivative[1:] * powers[:, None, None]
+            found.append(_horner(derivative, s[..., None]))
+            derivative = [float(k) * derivative[k] for k in range(1, len(derivative))]
         return found[0], found[1], found[2], found[3]
 
     @property
@@ -110,11 +111,11 @@ class Primitives:
         return float(np.einsum("nki,nkl,nli->", j, weights, j))
 
 
-def _horner(coefficients: np.ndarray, s: np.ndarray) -> np.ndarray:
+def _horner(coefficients: Any, s: Array) -> Array:
     value = coefficients[-1]
     for c in coefficients[-2::-1]:
         value = value * s + c
-    return np.asarray(value)
+    return value
 
 
 def join(
@@ -174,8 +175,8 @@ def primitive(
     place = np.moveaxis(row, -2, 0)
     speed = place[1:] * np.arange(1, 6).reshape(5, *[1] * (place.ndim - 1))
     end = (
-        _horner(place, np.array(T)),
-        _horner(speed, np.array(T)),
+        np.asarray(_horner(place, np.array(T))),
+        np.asarray(_horner(speed, np.array(T))),
         a + gamma * T + beta * T**2 / 2.0 + alpha * T**3 / 6.0,
     )
     return row, np.stack(end, axis=-2)

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph import Array, block
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.signals import BodyMotion
 from flowgraph.errors import DataError
 
-__all__ = ["Motion", "World"]
+__all__ = ["Motion", "World", "world_motion"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +81,8 @@ class World(abc.ABC):
         """s: the world answers for 0 to this."""
 
     @abc.abstractmethod
-    def _motion(self, seconds: np.ndarray) -> Motion:
-        """The motion at (n,) seconds, all within 0 and `duration`."""
+    def motion(self, seconds: Array, *, xp: Any) -> Motion:
+        """The motion at (...) seconds, all within 0 and `duration`, written in the array API."""
 
     def at(self, seconds: npt.ArrayLike) -> Motion:
         """The motion at times (n,) in s.
@@ -97,4 +100,19 @@ class World(abc.ABC):
                 got=f"{t[outside][0]:g}",
                 fix="shorten the recording (until=), or make a longer world",
             )
-        return self._motion(np.minimum(t, self.duration))
+        return self.motion(np.minimum(t, self.duration), xp=np)
+
+
+@block
+def world_motion(*, world: World, t: Any, xp: Any) -> BodyMotion:
+    """Where the body of a world is at this tick, and how it moves; time counts from 0, and the world stands
+    before that and after its `duration`. Give it a clock: `world_motion(world=Hover(20.0), at=imu)`."""
+    seconds = xp.minimum(xp.maximum(xp.astype(t, xp.float64) * 1e-9, 0.0), world.duration)
+    moved = world.motion(seconds, xp=xp)
+    return BodyMotion(
+        position=moved.position,
+        velocity=moved.velocity,
+        acceleration=moved.acceleration,
+        attitude=moved.attitude,
+        rate=moved.rate,
+    )

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from flowgraph import Array
 from flowgraph.blocks.inertial.imu import GRAVITY
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join
@@ -50,20 +51,20 @@ class Quadrotor(World):
         """Whether thrust and body rate stay within the limits."""
         return feasible(self.primitives, limits)
 
-    def _motion(self, seconds: np.ndarray) -> Motion:
-        return carried_by_thrust(*self.primitives.at(seconds))
+    def motion(self, seconds: Array, *, xp: Any) -> Motion:
+        return carried_by_thrust(*self.primitives.at(seconds, xp=xp), xp=xp)
 
 
 def carried_by_thrust(
-    position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray
+    position: Array, velocity: Array, acceleration: Array, jerk: Array, *, xp: Any = np
 ) -> Motion:
-    """The motion of a quadrotor whose path has these derivatives, (n, 3) each; upside down it has none."""
+    """The motion of a quadrotor whose path has these derivatives, (..., 3) each; upside down it has none."""
     force = acceleration - np.array(GRAVITY)
-    strength = np.linalg.norm(force, axis=-1, keepdims=True)
+    strength = xp.sqrt(xp.sum(force * force, axis=-1, keepdims=True))
     n = force / strength
-    dn = (jerk - n * (n * jerk).sum(-1, keepdims=True)) / strength
-    (x, y, z), (dx, dy, dz) = n.T, dn.T
+    dn = (jerk - n * xp.sum(n * jerk, axis=-1, keepdims=True)) / strength
+    (x, y, z), (dx, dy, dz) = ([v[..., k] for k in range(3)] for v in (n, dn))
     up = 1.0 + z
-    attitude = np.stack([up, -y, x, 0.0 * z], axis=-1) / np.sqrt(2.0 * up)[:, None]
-    rate = np.stack([-dy + dz * y / up, dx - dz * x / up, (y * dx - x * dy) / up], axis=-1)
+    attitude = xp.stack([up, -y, x, 0.0 * z], axis=-1) / xp.sqrt(2.0 * up)[..., None]
+    rate = xp.stack([-dy + dz * y / up, dx - dz * x / up, (y * dx - x * dy) / up], axis=-1)
     return Motion(position, velocity, acceleration, jerk, attitude, rate)

@@ -11,9 +11,11 @@ A trip about x, then y, then z, each after a rest; then again from x.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flowgraph import Array
 from flowgraph.blocks.geometry.rotations import from_rotation_vector
 from flowgraph.blocks.world.motion import Motion, World
 
@@ -38,12 +40,13 @@ class RoundTrip(World):
     rest: float = 1.0
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def _motion(self, seconds: np.ndarray) -> Motion:
-        number, into = np.divmod(seconds, self.rest + self.trip)
-        phase = 2.0 * np.pi * np.maximum(into - self.rest, 0.0) / self.trip
-        axis = np.eye(3)[number.astype(int) % 3]
-        turn = axis * (0.5 * self.angle * (1.0 - np.cos(phase)))[:, None]
-        rate = axis * (np.pi / self.trip * self.angle * np.sin(phase))[:, None]
-        still = np.zeros_like(turn)
-        attitude = np.asarray(from_rotation_vector(turn, xp=np))
+    def motion(self, seconds: Array, *, xp: Any) -> Motion:
+        number, into = seconds // (self.rest + self.trip), seconds % (self.rest + self.trip)
+        phase = 2.0 * np.pi * xp.maximum(into - self.rest, 0.0) / self.trip
+        which = xp.astype(number % 3.0, xp.int32)
+        axis = xp.take(xp.asarray(np.eye(3), dtype=into.dtype), which, axis=0)
+        turn = axis * (0.5 * self.angle * (1.0 - xp.cos(phase)))[..., None]
+        rate = axis * (np.pi / self.trip * self.angle * xp.sin(phase))[..., None]
+        still = xp.zeros_like(turn)
+        attitude = from_rotation_vector(turn, xp=xp)
         return Motion(still + np.array(self.point), still, still, still, attitude, rate)

@@ -11,10 +11,12 @@ import sys
 
 from flowgraph.cli import (  # noqa: F401  each adds its commands
     bench,
+    cache,
     calibrate,
     contents,
     filters,
     lower,
+    quantise,
     study,
     tune,
     watch,

@@ -18,6 +18,7 @@ from flowgraph.cli.options import (
     SEED_HELP,
     AsJson,
     DataOrNone,
+    Formats,
     Name,
     NameOrNone,
     Seed,
@@ -29,7 +30,7 @@ from flowgraph.cli.options import (
     one_flight,
     with_file,
 )
-from flowgraph.cli.pages import runs_before, watcher_of, write_page
+from flowgraph.cli.pages import recorder_of, runs_before, shown_again, write_page
 from flowgraph.cli.resume import kept_in, resumed
 from flowgraph.cli.terminal import (
     err_console,
@@ -111,7 +112,9 @@ def run(
     data: DataOrNone = None,
     truth: Truth = None,
     engine: Annotated[str | None, typer.Option(help=", ".join(engine_names()), show_default="python")] = None,
-    dtype: Annotated[str | None, typer.Option(help="float64 or float32", show_default="float64")] = None,
+    dtype: Annotated[
+        str | None, typer.Option(help="float64, float32 or fixed", show_default="float64")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**64 - 1, help=SEED_HELP, show_default="0")] = None,
     settings: Settings = None,
     settings_file: SettingsFile = None,
@@ -135,6 +138,7 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Go on from a checkpoint; what is left out is as it was."),
     ] = None,
+    formats: Formats = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
@@ -157,13 +161,18 @@ def run(
 
     spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
-    watcher = watcher_of(case, engine) if html is not None and kept is None else None
+    recorder = recorder_of(case) if html is not None else None
+    watcher = recorder if engine == "python" and kept is None else None
     result, row = _measure(
-        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept
-    )
+        case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept,
+        formats=formats,
+    )  # fmt: skip
+    say(result.notes)
     say(case.remarks(result))
-    if html is not None and watcher is None:
-        say((note("info", f"the page has no values on the wires: engine={engine} does not show them"),))
+    if recorder is not None and watcher is None:
+        options = {"dtype": dtype, "seed": seed, "diverged": diverged}
+        recorder, words = shown_again(case, result, recorder, **options)
+        say((words,))
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
@@ -172,7 +181,11 @@ def run(
     if html is not None:
         title = ", ".join([graph, spec, *(settings or ()), f"seed {seed}", engine])
         with writing(html):
-            write_page(html, others, title, case, flight.truth, _recorded(case), result, watcher, report)
+            on_page = write_page(
+                html, others, title, case, flight.truth, case.recorded, result, recorder, report
+            )
+        say(tuple(on_page))
+        report["notes"] = list(dict.fromkeys((*report["notes"], *on_page)))
     if as_json:
         return print_json(report)
     out_console.print(runs_table([row]))
@@ -218,6 +231,7 @@ def _measure(
     diverged: str = "raise",
     watcher: Watcher | None = None,
     kept: Checkpoint | None = None,
+    formats: Path | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -228,7 +242,9 @@ def _measure(
     ):
         options: dict[str, Any] = {"dtype": dtype, "seed": seed, "progress": meter, "diverged": diverged}
         if watcher is None:
-            result = simulate(case.graph, case.inputs, engine=engine, checkpoint=kept, **options)
+            result = simulate(
+                case.graph, case.inputs, engine=engine, checkpoint=kept, formats=formats, **options
+            )
         else:
             result = simulate_watched(case.graph, case.inputs, watcher, **options)
     total = perf_counter() - start
@@ -244,12 +260,6 @@ def _measure(
                 fix="look at the settings and at the data: the filter divides by zero, or overflows",
             )
     return result, row
-
-
-def _recorded(case: Case) -> dict[str, Series]:
-    """What the graph was fed, by source, where it is recorded."""
-    inputs = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
-    return {name: s for name, s in inputs.items() if isinstance(s, Series) and name in case.graph.sources}
 
 
 def _write_report(
@@ -307,12 +317,14 @@ def _pictures(
         if residuals:
             found["innovations.png"] = lambda file: plot_states(residuals, file, heading=case.graph.name)
         return found
-    if "position" in estimate.leaves and estimate["position"].shape[-1] == 3:
-        seen = next((s for s in _recorded(case).values() if "position" in s.leaves and len(s)), None)
+    if "position" in estimate.leaves and estimate["position"].shape[-1] in (2, 3):
+        seen = next((s for s in case.recorded.values() if "position" in s.leaves and len(s)), None)
         found["navigation.png"] = lambda file: plot_navigation(
             estimate, flight.truth, file, observed=seen, order=case.order
         )
-        if seen is not None:
+        if estimate["position"].shape[-1] == 2:
+            found["outputs.png"] = lambda file: plot_result(result, file)
+        elif seen is not None:
             found["trajectory.png"] = lambda file: plot_space(estimate, flight.truth, seen, file)
     elif "attitude" in estimate.leaves:
         found["orientation.png"] = lambda file: plot_orientation(estimate, flight.truth, file)

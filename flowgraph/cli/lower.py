@@ -13,6 +13,7 @@ from flowgraph.cli.app import app
 from flowgraph.cli.options import (
     AsJson,
     DataOrNone,
+    Formats,
     Name,
     Seed,
     Settings,
@@ -27,6 +28,7 @@ from flowgraph.data.files import put
 from flowgraph.engines.registry import writers
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.block import NUMBERS
+from flowgraph.pipeline.format_files import load_formats, with_formats
 from flowgraph.pipeline.lowering import lower as lower_graph
 from flowgraph.pipeline.optimise import DEFAULT, PASSES
 from flowgraph.pipeline.optimise import without as passes_without
@@ -53,6 +55,7 @@ def lower(
     events: Annotated[
         Path | None, typer.Option(metavar="FILE", help="For c: write the data as the csv that it replays.")
     ] = None,
+    formats: Formats = None,
     report: Annotated[bool, typer.Option("--report", help="Write what it costs, as text and HTML.")] = False,
     without: Annotated[
         list[str] | None,
@@ -74,7 +77,18 @@ def lower(
             raise UnknownNameError(what, given, valid, path=f"--{what}")
     passes = passes_without(*(without or ()), passes=DEFAULT if engine is None else engine.passes)
     built, inputs = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
-    pipeline = lower_graph(built, dtype=dtype)
+    pipeline = lower_graph(built, dtype="float64" if formats is None else "fixed")
+    if formats is not None:
+        pipeline = with_formats(pipeline, load_formats(formats))
+    elif dtype == "fixed":
+        raise DeclarationError(
+            "there are no number formats for this graph",
+            path="--dtype fixed",
+            expected="formats that were found on flights",
+            got="none",
+            fix=f"flowgraph quantise {graph} --data SPEC -o DIR, then lower --formats DIR",
+        )
+    pipeline.need_numbers(dtype)
     if name is not None:
         pipeline = renamed(pipeline, name)
     pipeline.save(output)

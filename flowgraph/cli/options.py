@@ -63,6 +63,10 @@ SettingsFile = Annotated[
     Path | None,
     typer.Option("--settings", metavar="FILE", help="What tune or calibrate found; --set goes before it."),
 ]
+Formats = Annotated[
+    Path | None,
+    typer.Option("--formats", metavar="DIR", help="For fixed point: what flowgraph quantise wrote."),
+]
 Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flowgraph.data.notes import note
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
-from flowgraph.errors import DeclarationError
+from flowgraph.engines.watched import replayed
+from flowgraph.errors import DeclarationError, FlowgraphError, plain
 
 if TYPE_CHECKING:
     from flowgraph.drawing.recorder import Recorder
@@ -36,11 +38,24 @@ def runs_before(html: Path | None, beside: bool) -> list[dict[str, Any]]:
     return runs_of_page(html) if html.exists() else []
 
 
-def watcher_of(case: Case, engine: str) -> Recorder | None:
-    """Who records what is on the wires, in the engine that shows them."""
+def recorder_of(case: Case) -> Recorder:
+    """Who records what is on the wires."""
     from flowgraph.drawing.recorder import Recorder  # only who draws needs what draws
 
-    return Recorder(case.graph, case.inputs) if engine == "python" else None
+    return Recorder(case.graph, case.inputs)
+
+
+def shown_again(
+    case: Case, result: Result, recorder: Recorder, **options: Any
+) -> tuple[Recorder | None, str]:
+    """Who was shown the wires of a run of another engine, in the Python engine, and a note on it.
+
+    Nobody where that fails: it must not take the results with it.
+    """
+    try:
+        return recorder, note("info", replayed(case.graph, case.inputs, recorder, result, **options))
+    except FlowgraphError as error:
+        return None, note("skipped", f"the values on the wires: {plain(str(error))}")
 
 
 def write_page(
@@ -53,8 +68,8 @@ def write_page(
     result: Result,
     recorder: Recorder | None,
     report: Mapping[str, Any],
-) -> None:
-    """Write the page of this run, with `others` that were in it before."""
+) -> list[str]:
+    """Write the page of this run, with `others` that were in it before; returns the notes that are on it."""
     from flowgraph.drawing.run_page import describe_run, run_page  # only who draws needs what draws
 
     made = describe_run(
@@ -63,3 +78,5 @@ def write_page(
         figures={key: value for key, value in report.items() if key not in _NO_FIGURES},
     )  # fmt: skip
     run_page([*others, made], html)
+    found: list[str] = made["notes"]
+    return found

@@ -112,6 +112,10 @@ def report(
         list[str] | None,
         typer.Option(metavar="NAME", help="A setting of the flight in which pairs may differ; repeatable."),
     ] = None,
+    runs: Annotated[
+        int | None,
+        typer.Option(min=0, help="To run again and put in the page whole; 3 if left out and they are quick."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write what a study found as an HTML page and pictures, or compare two studies."""
@@ -129,8 +133,8 @@ def report(
     if compare is not None:
         page, rows, notes = write_comparison(*compare, out or compare[1], metric=metric, across=across or ())
     else:
-        found = write_report(folder or "", metric=metric)
-        page, rows = found.page, found.summary
+        found = write_report(folder or "", metric=metric, runs=runs)
+        page, rows, notes = found.page, found.summary, found.notes
     if as_json:
         return print_json({"page": str(page), "rows": rows, "notes": list(notes)})
     print_whole(table([{n: _short(v) for n, v in row.items()} for row in rows]))

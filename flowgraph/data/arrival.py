@@ -98,7 +98,7 @@ def delayed_flight(flight: Flight, settings: Mapping[str, Any], *, seed: int = 0
         streams[name] = delayed(streams[name], bounds if len(bounds) == 2 else bounds[0], seed=seed)
         text = " to ".join(f"{b * 1e-9:g}" for b in bounds)
         said.append(note("info", f"{name}: each value arrives {text} s after it was true"))
-    return replace(flight, streams=streams, notes=(*flight.notes, *said))
+    return replace(flight, streams=streams, notes=(*flight.notes, *said), experiment=None)
 
 
 def _seconds(key: str, given: Any) -> tuple[int, ...]:

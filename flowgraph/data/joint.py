@@ -190,7 +190,7 @@ def with_truth(flight: Flight, spec: str, other: Flight) -> Flight:
     whole = {**flight.streams, "truth": truth}
     said += _together([flight.name, spec], {**dict.fromkeys(flight.streams, 0), "truth": 1}, whole)
     notes = tuple(dict.fromkeys((*flight.notes, *other.notes, *said)))
-    return replace(flight, truth=truth, notes=notes)
+    return replace(flight, truth=truth, notes=notes, experiment=None)
 
 
 def _alike(a: Any, b: Any) -> bool:

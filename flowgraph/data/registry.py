@@ -15,16 +15,18 @@ import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from flowgraph.data.arrival import LATENCY, delayed_flight
+from flowgraph.data.consistency import far_nis, measured
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import said
 from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight
+from flowgraph.data.series import Flight, Series
 from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
@@ -59,10 +61,18 @@ class Case:
         """The convention in which roll, pitch and yaw are drawn."""
         return str(getattr(self.score, "order", "zyx"))
 
+    @property
+    def recorded(self) -> dict[str, Series]:
+        """What the graph is fed, by source, where it is recorded."""
+        inputs = self.inputs.streams if isinstance(self.inputs, Flight) else self.inputs
+        return {n: s for n, s in inputs.items() if isinstance(s, Series) and n in self.graph.sources}
+
     def remarks(self, result: Result) -> tuple[str, ...]:
-        """All notes on a run: the case's, the result's, and those of the score."""
+        """All notes on a run: the case's, the result's, those of the score, and where a NIS is far from 1."""
         tell = getattr(self.score, "remarks", None)
-        return said((*self.notes, *result.notes, *(tell(result) if tell is not None else ())))
+        told = tell(result) if tell is not None else ()
+        far = (far_nis(measured(name), s) for name, s in result.series.items() if "nis" in s.leaves)
+        return said((*self.notes, *result.notes, *told, *chain.from_iterable(far)))
 
 
 @dataclass(frozen=True)

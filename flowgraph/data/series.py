@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.experiment import Experiment
 from flowgraph.data.frames import frame_of, signal_of, stamps_of
 from flowgraph.data.notes import said
 from flowgraph.errors import DataError, UnknownNameError
@@ -389,6 +390,7 @@ class Flight:
         info: calibration and noise, by name.
         notes: what was dropped, shifted or assumed when it was read, a sentence each, which begins with a
             word of `flowgraph.data.notes`.
+        experiment: the graph of which a run is this flight; None of a recording.
 
     Raises:
         DeclarationError: for a note that does not.
@@ -399,6 +401,7 @@ class Flight:
     truth: Series | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    experiment: Experiment | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "notes", said(self.notes))

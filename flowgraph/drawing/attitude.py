@@ -100,7 +100,8 @@ def plot_comparison(
             axis.plot((series.time - start) * 1e-9, _broken(angle), label=name, **look)
     for k, axis in enumerate(axes):
         _name(axis, NAMES[k], "[deg]")
-    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), loc="upper right")
+    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    axes[0].legend(fontsize=8, frameon=False, ncols=len(shown), **place)
     axes[-1].set_xlabel("time since the start [s]")
     return canvas.save(figure, file)
 
@@ -128,6 +129,7 @@ def _draw_angles(
     sigmas = None if variances is None else canvas.deviation(variances)
     for k, axis in enumerate(axes):
         drawn = _broken(angles[:, k])
+        shown = [drawn]
         if sigmas is not None:
             band = 3.0 * sigmas[:, k]
             axis.fill_between(seconds, drawn - band, drawn + band, color=BAND, alpha=0.35, lw=0)
@@ -140,15 +142,19 @@ def _draw_angles(
             axis.plot(
                 (truth.time - start) * 1e-9, _broken(angle), color=TRUTH, lw=0.9, ls="--", label="truth"
             )
-            axis.legend(fontsize=7, frameon=False, loc="upper right")
-        shown = drawn[np.isfinite(drawn)]
-        room = max(0.08 * float(np.ptp(shown)), 1.0) if len(shown) else 1.0
+            seen = (truth.time >= estimate.time[0]) & (truth.time <= estimate.time[-1])
+            shown.append(angle[seen])
+            place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+            axis.legend(fontsize=canvas.SMALL, frameon=False, ncols=2, **place)  # beside the title
+        both = np.concatenate(shown)
+        both = both[np.isfinite(both)]
+        room = max(0.08 * float(np.ptp(both)), 1.0) if len(both) else 1.0
         if (
             sigmas is not None
         ):  # near the pole the band of roll and yaw has no bounds; it must not set the scale
             room = max(room, min(3.3 * float(np.nanmedian(sigmas[:, k])), 60.0))
-        if len(shown):
-            axis.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
+        if len(both):
+            axis.set_ylim(float(both.min()) - room, float(both.max()) + room)
         _name(axis, NAMES[k] + (", with 3σ" if sigmas is not None else ""), "[deg]")
 
 

@@ -154,6 +154,19 @@ def legend(axis: Axes, names: Sequence[str]) -> int:
     return 11
 
 
+def mark_ends(axis: Any, path: np.ndarray) -> None:
+    """Where a way (n, 2 or 3) starts and where it ends."""
+    there = path[np.isfinite(path).all(axis=1)]
+    if len(there):
+        axis.plot(*there[:1].T, "o", ms=5, mfc="white", mec=COLOURS[0], label="start")
+        axis.plot(*there[-1:].T, "s", ms=5, color=COLOURS[0], label="end")
+
+
+def dot(many: int) -> float:
+    """The size of a dot, in points, that is seen where there are few of them and hides nothing where many."""
+    return 3.5 if many <= 300 else 2.5 if many <= 1000 else 1.5
+
+
 def nothing_here(axis: Axes, values: np.ndarray) -> bool:
     """Say on an axis that none of its values is a number; False where one is."""
     if np.isfinite(values).any():

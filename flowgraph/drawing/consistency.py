@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from flowgraph.data.consistency import chi_square
 from flowgraph.data.series import Series
 from flowgraph.drawing.angles import between, turn_between
-from flowgraph.drawing.fields import STATES, find
+from flowgraph.drawing.fields import SIZES, STATES, find
 
 FAR = 2.0
 """A mean that is so many times too large or too small is worth a warning."""
@@ -41,7 +42,8 @@ def places(series: Series) -> dict[str, int]:
     elif size == position[0].shape[-1]:
         table = {"position": 0}
     else:
-        table = STATES if size in (6, 9, 15) else {}
+        more = size > 15 and find(series, "accelerometer_bias") is not None  # others stand behind the fifteen
+        table = STATES if size in SIZES or more else {}
     return {field: at for field, at in table.items() if at < size and find(series, field) is not None}
 
 
@@ -53,6 +55,12 @@ def covariance_of(series: Series, field: str) -> np.ndarray | None:
     own = find(series, field)
     k = 3 if field == "attitude" or own is None else own[0].shape[-1]
     return np.asarray(found[0][:, at : at + k, at : at + k], dtype=float)
+
+
+def variance_of(series: Series, field: str, k: int) -> np.ndarray | None:
+    """(n,) of the error of one component of a field, or None."""
+    spread = covariance_of(series, field)
+    return None if spread is None else spread[:, k, k]
 
 
 def error_of(estimate: Series, truth: Series, field: str) -> np.ndarray | None:
@@ -101,9 +109,7 @@ def _squared(error: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 def bounds(degrees: float, outside: float = 0.05) -> tuple[float, float]:
     """Between which a chi-squared variable lies but for a share of cases, half of them on each side."""
-    from scipy.special import gammaincinv  # SciPy is slow to import, and only needed here
-
-    low, high = (2.0 * float(gammaincinv(degrees / 2.0, p)) for p in (outside / 2, 1 - outside / 2))
+    low, high = (float(chi_square(p, degrees)) for p in (outside / 2, 1 - outside / 2))
     return low, high
 
 
@@ -113,4 +119,4 @@ def is_far(mean: float, degrees: float) -> bool:
     return not 1 / FAR < mean < FAR and not low < mean * degrees < high
 
 
-__all__ = ["bounds", "covariance_of", "error_of", "is_far", "nees", "places"]
+__all__ = ["bounds", "covariance_of", "error_of", "is_far", "nees", "places", "variance_of"]

@@ -39,14 +39,6 @@ def need(series: Series, field: str) -> tuple[np.ndarray, ArrayType]:
     return found
 
 
-def variance_of(series: Series, field: str, k: int) -> np.ndarray | None:
-    """(n,) the variance of one component of a quantity, where the covariance of the series holds it."""
-    found, place = find(series, "covariance"), STATES[field] + k
-    if found is None or found[0].shape[-1] not in SIZES or place >= found[0].shape[-1]:
-        return None
-    return np.asarray(found[0][:, place, place])
-
-
 def components(field: str, n: int) -> tuple[str, ...]:
     """The names of n components of a field: w, x, y, z of an attitude, else x, y, z or numbers."""
     if n == 4 and any(word in field for word in ("attitude", "quaternion", "orientation")):

@@ -176,6 +176,8 @@ class _Handler(BaseHTTPRequestHandler):
         writer.start()
         try:
             self._read(viewer)
+        except OSError:  # it has gone without a word
+            pass
         finally:
             live.left(viewer)
             viewer.queue.clear()
@@ -222,15 +224,21 @@ class Sender:
 
     Args:
         server: that sends it.
-        graph, inputs: of the run.
+        graph: of the run.
+        inputs: its recording; None for a live run.
         speed: how much faster than the events were the run may be; 0 for as fast as it can.
+
+    Attributes:
+        facts: asked for with each message: what else can be told of the run, texts by name.
     """
 
-    def __init__(self, server: LiveServer, graph: Graph, inputs: Inputs, speed: float = 1.0) -> None:
+    def __init__(self, server: LiveServer, graph: Graph, inputs: Inputs | None, speed: float = 1.0) -> None:
         self.server, self.speed, self.stride = server, speed, 1
+        self.facts: Callable[[], Mapping[str, str]] = dict
         self._recorder = Recorder(graph, inputs)
         self._begin: tuple[int, float] | None = None
         self._sent = -math.inf
+        self._unsent: tuple[int, int, Mapping[Wire, Any], Mapping[int, Any]] | None = None
         self.ticks = 0
 
     def see(
@@ -246,28 +254,82 @@ class Sender:
             if early > 0.002:
                 clock.sleep(early)
                 now += early
+        self._unsent = time, first, seen, read
         if now - self._sent >= EVERY:
             self._sent = now
-            self._send(time, first, seen, read)
+            self._send(*self._unsent)
 
     def _send(self, time: int, first: int, seen: Mapping[Wire, Any], read: Mapping[int, Any]) -> None:
+        self._unsent = None
         row = self._recorder.row(time, seen, read)
         wires = {
             key: [(at - first) * 1e-9, [float(f"{x:.6g}") if math.isfinite(x) else None for x in values]]
             for key, (at, values) in row.items()
         }
-        self.server.send({"t": (time - first) * 1e-9, "ticks": self.ticks, "wires": wires})
+        told = dict(self.facts())
+        self.server.send({"t": (time - first) * 1e-9, "ticks": self.ticks, "wires": wires, "facts": told})
 
     def took(self, blocks: Mapping[str, tuple[float, int]]) -> None:
+        if self._unsent is not None:  # how the run ended is shown, too
+            self._send(*self._unsent)
         each = {path: [1e6 * seconds / max(times, 1), times] for path, (seconds, times) in blocks.items()}
-        self.server.send({"ended": True, "ticks": self.ticks, "blocks": each})
+        self.server.send({"ended": True, "ticks": self.ticks, "blocks": each, "facts": dict(self.facts())})
 
 
-def live_page(graph: Graph, inputs: Inputs, title: str) -> Callable[[str], str]:
+class LiveView(Sender):
+    """A page on this machine in which a run is watched while it goes on; the watcher of that run.
+
+        with LiveView(graph) as view, Live(graph, watcher=view) as live:
+            print(view.url)  # open it, then push
+
+    Args:
+        graph: of the run.
+        inputs: its recording, for `simulate_watched`; left out for `Live`.
+        title: a line under the name of the graph; its documentation where there is none.
+        speed: with a recording, how much faster than the events were the run may be; 0 for as fast as it can.
+        port: of this machine; 0 for any that is free.
+
+    Raises:
+        OutputError: where the port is taken.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        inputs: Inputs | None = None,
+        *,
+        title: str = "",
+        speed: float = 1.0,
+        port: int = 0,
+    ) -> None:
+        server = LiveServer(live_page(graph, inputs, title), port)
+        super().__init__(server, graph, inputs, 0.0 if inputs is None else speed)
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return self.server.url
+
+    def wait(self, there: bool, seconds: float | None = None) -> bool:
+        """Wait until somebody looks, or with `there` False until nobody does; whether it came to that."""
+        return self.server.wait(there, seconds)
+
+    def close(self) -> None:
+        """Say goodbye to all viewers and give the port back."""
+        self.server.close()
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def live_page(graph: Graph, inputs: Inputs | None, title: str) -> Callable[[str], str]:
     """The page of a run that goes on, for the address that sends it."""
     data = {"graph": describe(graph), "parts": Recorder(graph, inputs).parts()}
     words = title or doc_words(graph.doc)
     return lambda host: page("live", graph.name, words, data, ("diagram", "live"), asks=f"ws://{host}")
 
 
-__all__ = ["LiveServer", "Sender", "live_page"]
+__all__ = ["LiveServer", "LiveView", "Sender", "live_page"]

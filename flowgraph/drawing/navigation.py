@@ -18,7 +18,8 @@ from flowgraph.data.series import Series
 from flowgraph.drawing import canvas
 from flowgraph.drawing.angles import angle_name, between, euler_angles, euler_variances, turn_between
 from flowgraph.drawing.canvas import BAND, COLOURS, TRUTH
-from flowgraph.drawing.fields import SIZES, STATES, find, need, unit_words, variance_of
+from flowgraph.drawing.consistency import covariance_of, variance_of
+from flowgraph.drawing.fields import STATES, find, need, unit_words
 from flowgraph.errors import DataError
 from flowgraph.types import ArrayType
 
@@ -62,9 +63,10 @@ def plot_navigation(
     """One page on a navigation filter: trajectory, errors, attitude and biases; only what exists is drawn.
 
     Args:
-        estimate: a series with `position`, and any of `velocity`, `attitude` (quaternion w, x, y, z, body to
-            world), `gyro_bias`, `accelerometer_bias` and `covariance` (15 x 15: position, velocity, attitude,
-            gyro bias, accelerometer bias; or 9 x 9 or 6 x 6: the first of them).
+        estimate: a series with `position`, in space or in the plane, and any of `velocity`, `attitude`
+            (quaternion w, x, y, z, body to world), `gyro_bias`, `accelerometer_bias` and `covariance` (15 x
+            15: position, velocity, attitude, gyro bias, accelerometer bias; or 9 x 9 or 6 x 6: the first of
+            them; or what `flowgraph.drawing.consistency` knows).
         truth: the same fields, at times of its own, or None.
         file: ending in .png, .svg or .pdf.
         observed: what a sensor said of the `position`, drawn as dots; or None.
@@ -76,7 +78,7 @@ def plot_navigation(
         UnknownNameError: where the estimate has no position, or for an unknown file ending.
         DataError: where an array of `extra` does not have one value a time.
     """
-    need(estimate, "position")
+    wide = need(estimate, "position")[0].shape[1]
     more = {words: np.asarray(array, dtype=float) for words, array in (extra or {}).items()}
     for words, array in more.items():
         if array.shape != (len(estimate),):
@@ -89,13 +91,14 @@ def plot_navigation(
     turned = "attitude" in fields and truth is not None and find(truth, "attitude") is not None
     if turned:
         fields.insert(fields.index("attitude") + 1, "attitude error")
-    rows = 2 + len(fields) + -(-len(more) // 3)
+    rows = 2 + len(fields) + -(-len(more) // wide)
     figure = canvas.new_figure(12, 1.75 * rows + 0.6)
-    grid = figure.add_gridspec(rows, 3)
-    _space(figure.add_subplot(grid[:2, :2], projection="3d"), estimate, truth)
-    _from_above(figure.add_subplot(grid[:2, 2]), estimate, truth, observed)
+    grid = figure.add_gridspec(rows, wide)
+    if wide == 3:
+        _space(figure.add_subplot(grid[:2, :2], projection="3d"), estimate, truth)
+    _from_above(figure.add_subplot(grid[:2, 2] if wide == 3 else grid[:2, :]), estimate, truth, observed)
     for row, field in enumerate(fields, start=2):
-        for k in range(3):
+        for k in range(wide):
             axis = figure.add_subplot(grid[row, k])
             if field == "attitude":
                 _angle(axis, estimate, truth, k, order)
@@ -107,10 +110,10 @@ def plot_navigation(
             else:
                 _value(axis, estimate, truth, field, k)
     for n, (words, array) in enumerate(more.items()):
-        axis = figure.add_subplot(grid[2 + len(fields) + n // 3, n % 3])
+        axis = figure.add_subplot(grid[2 + len(fields) + n // wide, n % wide])
         axis.plot(estimate.seconds, array, color=COLOURS[0], lw=1)
         canvas.title(axis, words)
-    for axis in figure.axes[-3:]:
+    for axis in figure.axes[-wide:]:
         axis.set_xlabel("time since the start [s]")
     return canvas.save(figure, file)
 
@@ -146,7 +149,7 @@ def _error(axis: Axes, estimate: Series, truth: Series, observed: Series | None,
     if observed is not None:
         seen = observed[:: max(len(observed) // _MOST_DOTS, 1)]
         off = seen["position"][:, k] - between(truth, field, seen.time)[:, k]
-        axis.plot(_since(seen, estimate), off, ".", ms=1.5, color=_SEEN, alpha=0.5, zorder=1)
+        axis.plot(_since(seen, estimate), off, ".", ms=canvas.dot(len(off)), color=_SEEN, alpha=0.7, zorder=1)
     axis.plot(seconds, error, color=COLOURS[0], lw=1.0)
     _label(axis, f"{field} error {'xyz'[k]}", type_, variance is not None)
     if not canvas.nothing_here(axis, error):
@@ -186,10 +189,9 @@ def _value(axis: Axes, estimate: Series, truth: Series | None, field: str, k: in
 def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, order: str) -> None:
     q = need(estimate, "attitude")[0]
     angle = euler_angles(q, order)[:, k]
-    found = find(estimate, "covariance")
-    banded = found is not None and found[0].shape[-1] in SIZES and found[0].shape[-1] >= 9
-    if found is not None and banded:
-        variance = euler_variances(q, found[0][:, 6:9, 6:9], order)[:, k]
+    spread = covariance_of(estimate, "attitude")
+    if spread is not None:
+        variance = euler_variances(q, spread, order)[:, k]
         _within(axis, estimate.seconds, angle, np.minimum(variance, _HALF_A_TURN**2))
     axis.plot(estimate.seconds, angle, color=COLOURS[k], lw=1.0)
     known = None if truth is None else find(truth, "attitude")
@@ -198,7 +200,7 @@ def _angle(axis: Axes, estimate: Series, truth: Series | None, k: int, order: st
         begin = np.interp(0, truth.time - estimate.time[0], right)
         right = right + 360 * np.round((angle[0] - begin) / 360)  # the same turn as the estimate
         axis.plot(_since(truth, estimate), right, color=TRUTH, lw=0.9, ls="--")
-    canvas.title(axis, angle_name(k, order) + (", with 3σ" if banded else ""))
+    canvas.title(axis, angle_name(k, order) + (", with 3σ" if spread is not None else ""))
     axis.set_ylabel("[deg]")
     canvas.nothing_here(axis, angle)
 
@@ -211,20 +213,12 @@ def _paths(estimate: Series, truth: Series | None) -> list[tuple[np.ndarray, dic
     return paths
 
 
-def _ends(axis: Any, path: np.ndarray) -> None:
-    """Where the estimate starts and where it ends."""
-    there = path[np.isfinite(path).all(axis=1)]
-    if len(there):
-        axis.plot(*there[:1].T, "o", ms=5, mfc="white", mec=COLOURS[0], label="start")
-        axis.plot(*there[-1:].T, "s", ms=5, color=COLOURS[0], label="end")
-
-
 def _space(axis: Any, estimate: Series, truth: Series | None) -> None:
     """The trajectory in space, to one scale on all axes; a flat one keeps some height."""
     paths = _paths(estimate, truth)
     for path, look in paths:
         axis.plot(*path.T, **look)
-    _ends(axis, paths[0][0])
+    canvas.mark_ends(axis, paths[0][0])
     points = np.concatenate([path for path, _ in paths])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -250,16 +244,18 @@ def _from_above(axis: Axes, estimate: Series, truth: Series | None, observed: Se
     paths = _paths(estimate, truth)
     if observed is not None:
         seen = observed["position"][:: max(len(observed) // _MOST_DOTS, 1)]
-        axis.plot(seen[:, 0], seen[:, 1], ".", ms=2, color=_SEEN, alpha=0.6, label="observed")
+        axis.plot(
+            seen[:, 0], seen[:, 1], ".", ms=canvas.dot(len(seen)), color=_SEEN, alpha=0.7, label="observed"
+        )
     for path, look in paths:
         axis.plot(path[:, 0], path[:, 1], **look)
-    _ends(axis, paths[0][0][:, :2])
+    canvas.mark_ends(axis, paths[0][0][:, :2])
     axis.set_aspect("equal", adjustable="datalim")
     canvas.title(axis, "from above")
     unit = need(estimate, "position")[1].unit
     axis.set_xlabel(f"x [{unit}]" if unit else "x")
     axis.set_ylabel(f"y [{unit}]" if unit else "y")
-    if observed is not None:
+    if observed is not None or len(paths[0][0].T) == 2:
         axis.legend(fontsize=canvas.SMALL, frameon=False, loc="best")
 
 

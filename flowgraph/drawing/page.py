@@ -56,12 +56,20 @@ def diagram_page(
 
 
 def page(
-    kind: str, title: str, words: str, data: Mapping[str, Any], scripts: tuple[str, ...], *, asks: str = ""
+    kind: str,
+    title: str,
+    words: str,
+    data: Mapping[str, Any],
+    scripts: tuple[str, ...],
+    *,
+    asks: str = "",
+    body: str = "",
 ) -> str:
     """A page of a kind that `front/src` knows, with its data as JSON by the id of the element.
 
     Args:
         asks: the one address that it may connect to.
+        body: HTML that stands in it without a script.
     """
     policy = f"{_POLICY}; connect-src {asks}" if asks else _POLICY
     stored = "\n".join(
@@ -81,7 +89,7 @@ def page(
 </head>
 <body data-page="{kind}">
 <header><h1>{html.escape(title)}</h1><p>{html.escape(words)}</p></header>
-<main></main>
+<main>{body}</main>
 <footer></footer>
 {stored}
 {code}

@@ -56,12 +56,14 @@ class Recorder:
 
     Args:
         graph: that is run.
-        inputs: what it is fed; of a source that is not recorded nothing is known.
+        inputs: what it is fed; of a source that is not recorded nothing is known. None for a live run, whose
+            events `see` is shown with the rest.
+        share: of what a page of one run holds, for one of several.
     """
 
-    def __init__(self, graph: Graph, inputs: Inputs) -> None:
+    def __init__(self, graph: Graph, inputs: Inputs | None, share: float = 1.0) -> None:
         self.graph = graph
-        streams: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs
+        streams: Mapping[str, Any] = inputs.streams if isinstance(inputs, Flight) else inputs or {}
         self._sources: dict[int, Series] = {}
         self._types: dict[str, tuple[int, Type]] = {}
         self._feeds: dict[int, tuple[str, Wire]] = {}
@@ -71,6 +73,8 @@ class Recorder:
             elif isinstance(node, SourceNode) and isinstance(streams.get(node.path), Series):
                 self._sources[index] = streams[node.path]
                 self._types[f"{index}.0"] = index, node.type
+            elif isinstance(node, SourceNode) and inputs is None:
+                self._types[f"{index}.0"] = index, node.type
             elif (
                 isinstance(node, RegisterNode) and node.feed is not None and node.role in ("latest", "delay")
             ):
@@ -78,7 +82,7 @@ class Recorder:
                 self._types[f"{index}.0"] = index, node.type
         self._parts = {key: _parts(type_) for key, (_, type_) in self._types.items()}
         size = sum(1 + sum(p.size for p in parts) for parts in self._parts.values())
-        self._most = int(np.clip(NUMBERS // max(size, 1), 120, 2000))
+        self._most = int(np.clip(share * NUMBERS / max(size, 1), 120, 2000))
         self.stride = max(self._ticks() // self._most, 1)
         self._times: list[int] = []
         self._rows: list[dict[str, tuple[int, np.ndarray]]] = []

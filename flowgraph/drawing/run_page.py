@@ -22,7 +22,7 @@ from flowgraph.drawing.fields import find
 from flowgraph.drawing.model import describe
 from flowgraph.drawing.page import page, written
 from flowgraph.drawing.recorder import Recorder, packed
-from flowgraph.drawing.scopes import Scopes, extremes
+from flowgraph.drawing.scopes import POINTS, Scopes, extremes
 from flowgraph.errors import DataError
 from flowgraph.language.graph import Graph
 
@@ -45,6 +45,7 @@ def describe_run(
     recorder: Recorder | None = None,
     figures: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
+    share: float = 1.0,
 ) -> dict[str, Any]:
     """One run in plain lists and texts, for `run_page`.
 
@@ -57,9 +58,10 @@ def describe_run(
         recorder: that watched the run.
         figures: the table of figures.
         notes: sentences.
+        share: of the points that a page of one run has, for one of several.
     """
     known = dict(inputs or {})
-    scopes = Scopes(result, estimate, truth, known, order)
+    scopes = Scopes(result, estimate, truth, known, order, int(share * POINTS))
     panels = scopes.panels()
     took = {} if recorder is None else recorder.blocks
     blocks = {path: [1e6 * seconds / max(times, 1), times] for path, (seconds, times) in took.items()}

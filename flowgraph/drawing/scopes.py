@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.consistency import far_nis, measured
 from flowgraph.data.notes import note
 from flowgraph.data.result import Result
 from flowgraph.data.series import Series
@@ -43,6 +44,7 @@ class Scopes:
         truth: or None.
         inputs: the recorded streams that were fed, by source.
         order: convention of roll, pitch and yaw.
+        points: of a line, at most.
     """
 
     def __init__(
@@ -52,8 +54,9 @@ class Scopes:
         truth: Series | None = None,
         inputs: Mapping[str, Series] | None = None,
         order: str = "zyx",
+        points: int = POINTS,
     ) -> None:
-        self.result, self.truth, self.order = result, truth, order
+        self.result, self.truth, self.order, self.points = result, truth, order, points
         self.inputs = dict(inputs or {})
         self.estimate = result.series.get(estimate)
         self.name = estimate
@@ -149,22 +152,42 @@ class Scopes:
         degrees = np.full(len(series), 1.0) if parts is None else np.asarray(parts[0], dtype=float)
         if parts is None and residual is not None:
             degrees *= residual[0].shape[-1]
+        self.notes += (far := far_nis(measured(name), series))
         yield from self._squared(
-            f"{_words(name)}: NIS", series.time, np.asarray(value[0], float), degrees, dots=True
+            f"{_words(name)}: NIS",
+            series.time,
+            np.asarray(value[0], float),
+            degrees,
+            wrong=bool(far),
+            dots=True,
         )
 
     def _nees(self, estimate: Series, truth: Series) -> Iterator[dict[str, Any]]:
         found = nees(estimate, truth) if len(truth) else None
         if found is not None:
             value, degrees = found
+            known = value[np.isfinite(value)]
+            mean = float(np.mean(known)) / degrees if len(known) else 1.0
+            title = f"{_words(self.name)}: NEES"
+            if wrong := is_far(mean, float(degrees * len(known))):
+                self.notes.append(
+                    note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
+                )
             yield from self._squared(
-                f"{_words(self.name)}: NEES", estimate.time, value, np.full(len(value), float(degrees))
+                title, estimate.time, value, np.full(len(value), float(degrees)), wrong=wrong
             )
 
     def _squared(
-        self, title: str, time: np.ndarray, value: np.ndarray, degrees: np.ndarray, *, dots: bool = False
+        self,
+        title: str,
+        time: np.ndarray,
+        value: np.ndarray,
+        degrees: np.ndarray,
+        *,
+        wrong: bool,
+        dots: bool = False,
     ) -> Iterator[dict[str, Any]]:
-        """A normalised square with what it should be, and a warning where its mean is far from that."""
+        """A normalised square with what it should be, marked where it is far from that."""
         known = np.isfinite(value) & (degrees > 0)
         if not known.any():
             return
@@ -173,11 +196,6 @@ class Scopes:
         low, high = bounds(max(typical, 1))
         inside = float(np.mean((value[known] >= low) & (value[known] <= high)))
         words = f"mean {mean:.3g} of 1 per number, {100 * inside:.0f} % inside (95 % is right)"
-        wrong = is_far(mean, float(degrees[known].sum()))
-        if wrong:
-            self.notes.append(
-                note("warning", f"{title} is {mean:.3g} per number on average, and should be 1")
-            )
         lines = {"value": np.where(known, value, np.nan), "expected": degrees}
         panel = self._panel("Consistency", title, "", time, lines, None, dots=dots)
         top = max(2.5 * high, float(np.quantile(value[known], 0.99)))
@@ -203,7 +221,7 @@ class Scopes:
         found = find(series, "position")
         if found is None or found[0].ndim != 2 or k >= found[0].shape[1] or not len(series):
             return None
-        some = slice(None, None, -(-len(series) // POINTS))
+        some = slice(None, None, -(-len(series) // self.points))
         return {"name": name, "t": self._seconds(series.time[some]), "y": packed(found[0][some, k])}
 
     def _unit(self, series: Series, field: str) -> tuple[str, float]:
@@ -239,7 +257,7 @@ class Scopes:
         if sigma is not None:
             middle = every["estimate"] if "estimate" in every else np.zeros(len(time))
             ends |= {"low": middle - sigma, "high": middle + sigma}
-        at = extremes(list(ends.values()), POINTS)
+        at = extremes(list(ends.values()), self.points)
         panel: dict[str, Any] = {
             "group": group, "title": title, "unit": unit, "dots": dots, "t": self._stored(time[at]),
             "lines": [{"name": n, "y": packed(v[at])} for n, v in every.items()],
@@ -262,7 +280,7 @@ def _scale(time: np.ndarray, lines: Sequence[np.ndarray], ends: Sequence[np.ndar
     if late[1] - late[0] > 12 * (own[1] - own[0]) > 0:  # a band so wide that it would hide what it is of
         room = 3 * (own[1] - own[0])
         late = max(late[0], own[0] - room), min(late[1], own[1] + room)
-    room = 0.06 * (late[1] - late[0]) or 1e-3 * max(abs(late[0]), 1e-9)
+    room = 0.06 * (late[1] - late[0]) or 0.1 * abs(late[0]) or 1.0
     low, high = late[0] - room, late[1] + room
     if low <= begun[0] and begun[1] <= high:
         return {"range": [low, high]}
@@ -305,4 +323,4 @@ def extremes(columns: Sequence[np.ndarray], most: int) -> np.ndarray:
     return np.unique(np.concatenate(found))
 
 
-__all__ = ["Scopes", "extremes"]
+__all__ = ["POINTS", "Scopes", "extremes"]

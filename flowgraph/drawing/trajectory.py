@@ -60,13 +60,14 @@ def plot_space(
     if observed is not None:
         _need_positions(observed)
         p = observed["position"][:: max(len(observed) // _MOST_POINTS, 1)]
-        axis.plot(*p.T, ".", ms=2, color=_SEEN, alpha=0.6, label="observed")
+        axis.plot(*p.T, ".", ms=canvas.dot(len(p)), color=_SEEN, alpha=0.7, label="observed")
     if truth is not None:
         _need_positions(truth)
         inside = _within(truth, estimate)
         axis.plot(*truth["position"][inside].T, color=TRUTH, lw=1.2, label="truth")
         spans.append(truth["position"][inside])
     axis.plot(*estimate["position"].T, color=COLOURS[0], lw=1.2, label="estimate")
+    canvas.mark_ends(axis, estimate["position"])
     points = np.concatenate(spans)
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,14 @@ class Outcome:
         cells: the register cells after the last tick, in order.
         outputs: for each output port its times (n,) int64 ns, and its leaves (n, ...).
         wall_s: seconds spent in the engine's loop, without set-up.
+        stats, notes: what the engine has counted, and has to say, for the result.
     """
 
     cells: list[Any]
     outputs: list[tuple[np.ndarray, list[np.ndarray]]]
     wall_s: float
+    stats: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -25,19 +25,22 @@ from flowgraph.data.percentiles import Durations
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
 from flowgraph.data.tape import merged
-from flowgraph.engines.entrance import Entrance
+from flowgraph.engines.contract import BlockEngine
+from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.mailbox import POLICIES, Event, Mailboxes, Order
 from flowgraph.engines.options import RunOptions
+from flowgraph.engines.registry import find_engine
 from flowgraph.engines.stepping import stepper
+from flowgraph.engines.watched import Watch, Watcher
 from flowgraph.errors import ClockError, DataError
 from flowgraph.language.clock import nanoseconds
-from flowgraph.language.graph import Graph
+from flowgraph.language.graph import Graph, SourceNode, Wire
 from flowgraph.types import flatten, unflatten
 
 RECORDED = ("all", "arrived", "nothing")
 """What is kept of a live run."""
 
-Watcher = Callable[[str, int, Any], object]
+OnOutput = Callable[[str, int, Any], object]
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,8 @@ class Live:
         record: what is kept of the run: what arrived and the outputs ("all"), the one ("arrived"), or
             neither ("nothing"), so that memory stays flat.
         on_output: called in the thread of the run with name, time and value of each output as it is made.
+        watcher: who is shown what is on the wires (`flowgraph.LiveView` for a browser), in the thread of the
+            run; of an engine other than Python's the events and the outputs.
 
     Raises:
         DeclarationError: for an engine that makes no single ticks; UnknownNameError: for another policy.
@@ -94,7 +99,8 @@ class Live:
         deadline: str | int | None = None,
         not_finite: str = "raise",
         record: str = "all",
-        on_output: Watcher | None = None,
+        on_output: OnOutput | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         self.graph, self._engine = graph, engine
         rule_of("full", full, POLICIES)
@@ -108,8 +114,14 @@ class Live:
                 fix="leave it out for 1024",
             )
         options = RunOptions(engine=engine, dtype=dtype, init=init, state=state, seed=seed)
-        self._steps = stepper(graph, options)
+        self._watch = None if watcher is None else Watch(graph, watcher)
+        self._blocks = self._watch is not None and isinstance(find_engine(engine), BlockEngine)
+        self._steps = stepper(
+            self._watch.graph if self._watch is not None and self._blocks else graph, options
+        )
         self._names = list(graph.sources)
+        places = {node.path: Wire(k, 0) for k, node in enumerate(graph.nodes) if isinstance(node, SourceNode)}
+        self._wires = [places[node.path] for node in graph.sources.values()]
         self._types = [node.type for node in graph.sources.values()]
         self._outputs = [(c.name, graph.port(c.wire).type) for c in graph.collected]
         last = {n: int(t) for n, t in self._steps.state["sources"].items()}
@@ -126,7 +138,9 @@ class Live:
             [Columns(t, n, gaps=gaps) for n, t in zip(self._names, self._types, strict=True)],
             [Columns(t, n, gaps=True) for n, t in self._outputs],
         )
-        self._record, self._watch = record, on_output
+        self._record, self._on_output = record, on_output
+        if watcher is not None and hasattr(watcher, "facts"):
+            watcher.facts = self._facts
         self._error: BaseException | None = None
         self._notes: dict[str, str] = {}
         self._wall, self._alone = 0.0, RLock()
@@ -206,6 +220,8 @@ class Live:
                 if not events:  # nothing has come for as long as anything may be late
                     self._ticks(self._order.ready(everything=True), perf_counter_ns())
             self._ticks(self._order.ready(everything=True), perf_counter_ns())
+            if self._watch is not None:
+                self._watch.end()
         except BaseException as error:
             self._error = error
             self._boxes.close()
@@ -242,13 +258,36 @@ class Live:
             if leaves is not None:
                 if self._record == "all":
                     columns.add(stamp, leaves)
-                if self._watch is not None:
-                    self._watch(name, stamp, unflatten(type_, iter(leaves)))
+                if self._on_output is not None:
+                    self._on_output(name, stamp, unflatten(type_, iter(leaves)))
+        if self._watch is not None:
+            self._show(self._watch, stamp, admitted, made)
         ended = perf_counter_ns()
         self._wall += (ended - begun) * 1e-9
         for kept, since in zip(self._times, (max(e.arrived for e in events), complete, begun), strict=True):
             kept.add(ended - since)
         self._missed += self._deadline is not None and ended - complete > self._deadline
+
+    def _show(self, watch: Watch, stamp: int, admitted: Admitted, made: list[tuple[Any, ...] | None]) -> None:
+        """Let the watcher see a tick."""
+        given = {self._wires[k]: value for k, value in admitted.values}
+        if not self._blocks:
+            for collected, (_, type_), leaves in zip(self.graph.collected, self._outputs, made, strict=True):
+                if leaves is not None:
+                    given[collected.wire] = unflatten(type_, iter(leaves))
+        watch.after(stamp, given)
+
+    def _facts(self) -> dict[str, str]:
+        """What a watcher is told with the wires: what became of the events, and how long ticks took."""
+        times = self.latencies
+        told = {name.replace(".", " "): str(n) for name, n in self.counts.items() if n}
+        if self._times[1].count:
+            told |= {
+                f"{what} {p}": f"{1e3 * of[p]:.3g} ms"
+                for what, of in (("arrival to end", times.arrival), ("work", times.work))
+                for p in ("p50", "p99", "max")
+            }
+        return told | ({"deadline missed": str(self._missed)} if self._deadline is not None else {})
 
     # -- what comes out ----------------------------------------------------------------------------------
 

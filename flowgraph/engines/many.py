@@ -80,7 +80,8 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
     seeds = _checked_seeds(graph, inputs, seeds, options)
     engine = find_engine(options.engine)
     engine.check(options)
-    if not engine.takes_many or lower(graph, dtype=options.dtype).host:  # the host has its part in every run
+    alone = not engine.takes_many or options.dtype == "fixed"
+    if alone or lower(graph, dtype=options.dtype).host:  # the host has its part in every run
         return _one_by_one(graph, inputs, seeds, keep, options)
     assert isinstance(engine, PipelineEngine)
     engine.need()

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.optimise import check_passes
 from flowgraph.recorder.random import seed_words
 
 DTYPES = ("float64", "float32")
+KINDS = (*DTYPES, "fixed")
 RUNS_AT_ONCE = 64
 DIVERGED = ("raise", "count")
 
@@ -61,7 +63,7 @@ class RunOptions:
 
     Args:
         engine: its name.
-        dtype: what `real` is, "float64" or "float32".
+        dtype: what `real` is, "float64", "float32" or "fixed".
         init: other initial values, by register path; for many runs also a function of the seed or a list.
         state: a `run.state` or `result.state` to go on from.
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
@@ -71,6 +73,7 @@ class RunOptions:
         runs_at_once: of many runs, how many go in one call where the engine does them in chunks.
         diverged: what an output or register that is no longer finite does: "raise", or "count" it and go on.
         checkpoint: how the run is kept, and from where it goes on.
+        formats: number formats for fixed point, or the folder that `quantise` wrote them to.
 
     Raises:
         UnknownNameError: for another dtype, pass or way of `diverged`.
@@ -88,10 +91,19 @@ class RunOptions:
     runs_at_once: int = RUNS_AT_ONCE
     diverged: str = "raise"
     checkpoint: Checkpoint | None = None
+    formats: Formats | str | Path | None = None
 
     def __post_init__(self) -> None:
-        if self.dtype not in DTYPES:
-            raise UnknownNameError("dtype", self.dtype, DTYPES)
+        if self.dtype not in KINDS:
+            raise UnknownNameError("dtype", self.dtype, KINDS)
+        if self.formats is not None and self.checkpoint is not None:
+            raise DeclarationError(
+                "a run in fixed point keeps no checkpoints",
+                path="checkpoint",
+                expected="formats or a checkpoint",
+                got="both",
+                fix="leave the checkpoint out",
+            )
         if self.diverged not in DIVERGED:
             raise UnknownNameError("way of diverged", self.diverged, DIVERGED)
         if self.passes is not None:

@@ -17,6 +17,9 @@ from flowgraph.engines.options import Checkpoint, Meter, RunOptions
 from flowgraph.engines.registry import find_pipeline_engine
 from flowgraph.engines.subject import LoadedPipeline, Start, Subject
 from flowgraph.engines.trouble import Playback, cells_of, gaps_of, overflow, settled
+from flowgraph.errors import DeclarationError
+from flowgraph.pipeline.format_files import load_formats, with_formats
+from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.optimise import check_passes, usable
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.random import seed_words
@@ -32,7 +35,7 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     """Play what was lowered over its inputs to their end."""
     engine = find_pipeline_engine(options.engine)
     engine.check(options)
-    pipeline = subject.pipeline
+    pipeline = _formatted(subject.pipeline, options)
     start = subject.start(options)
     events = subject.tape(inputs, start.last)
     pipeline.need_numbers(options.dtype)
@@ -43,7 +46,7 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
 
     def played(tape: Tape, progress: Meter | None = None, start: Start = start) -> Result:
         outcome = player.play(tape, start.cells, words, progress)
-        return _result(subject, outcome, tape, start, options.engine)
+        return _result(subject, pipeline, outcome, tape, start, options.engine)
 
     def kept(asked: Checkpoint) -> Result:
         begun = (start.cells, start.last)
@@ -78,8 +81,9 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     return settled(result, run, options.diverged, error)
 
 
-def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engine: str) -> Result:
-    pipeline = subject.pipeline
+def _result(
+    subject: Subject, pipeline: Pipeline, outcome: Outcome, events: Tape, start: Start, engine: str
+) -> Result:
     series = {
         port.name: Series(times, unflatten(type_, iter(leaves)), type=type_, name=port.name)
         for port, type_, (times, leaves) in zip(pipeline.outputs, subject.types, outcome.outputs, strict=True)
@@ -97,7 +101,29 @@ def _result(subject: Subject, outcome: Outcome, events: Tape, start: Start, engi
         for name, count in state["registers"][r.path].items()
         if name.startswith(COUNTED)
     }
-    return Result(pipeline.name, engine, series, state, stats, len(events.time), outcome.wall_s)
+    stats |= outcome.stats
+    ticks = len(events.time)
+    return Result(pipeline.name, engine, series, state, stats, ticks, outcome.wall_s, outcome.notes)
+
+
+def _formatted(pipeline: Pipeline, options: RunOptions) -> Pipeline:
+    """The pipeline with the number formats that the options have.
+
+    Raises:
+        DeclarationError: for formats where the run is not in fixed point, or of another pipeline.
+    """
+    formats = options.formats
+    if formats is None:
+        return pipeline
+    if options.engine != "fixed" and options.dtype != "fixed":
+        raise DeclarationError(
+            "number formats are for a run in fixed point",
+            path="formats",
+            expected='engine="fixed", or engine="c" with dtype="fixed"',
+            got=f"engine={options.engine!r}, dtype={options.dtype!r}",
+            fix="choose one of these, or leave formats out",
+        )
+    return with_formats(pipeline, formats if isinstance(formats, Formats) else load_formats(formats))
 
 
 def chosen_passes(engine: PipelineEngine, options: RunOptions) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from flowgraph.data.batch import Batch
@@ -14,6 +15,7 @@ from flowgraph.engines.options import Checkpoint, Meter, RunOptions
 from flowgraph.engines.parts import run_graph
 from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import Graph
+from flowgraph.pipeline.formats import Formats
 
 
 @typing.overload
@@ -31,6 +33,7 @@ def simulate(
     passes: Collection[str] | None = ...,
     diverged: str = ...,
     checkpoint: Checkpoint | None = ...,
+    formats: Formats | str | Path | None = ...,
 ) -> Result: ...
 @typing.overload
 def simulate(
@@ -47,6 +50,7 @@ def simulate(
     passes: Collection[str] | None = ...,
     diverged: str = ...,
     checkpoint: Checkpoint | None = ...,
+    formats: Formats | str | Path | None = ...,
 ) -> Batch: ...
 def simulate(
     graph: Graph,
@@ -62,6 +66,7 @@ def simulate(
     passes: Collection[str] | None = None,
     diverged: str = "raise",
     checkpoint: Checkpoint | None = None,
+    formats: Formats | str | Path | None = None,
 ) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
@@ -70,9 +75,10 @@ def simulate(
         inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of
             `(time, value)`.
         engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy),
-            "xla" (the same instructions in one compiled scan; needs JAX) or "c" (generated, compiled by the
-            system's C compiler and called in this process).
-        dtype: what `real` is, "float64" or "float32"; the Python engine has float64 only.
+            "xla" (the same instructions in one compiled scan; needs JAX), "c" (generated, compiled by the
+            system's C compiler and called in this process) or "fixed" (in integers, in number formats).
+        dtype: what `real` is, "float64" or "float32", for "c" also "fixed"; the Python engine has float64
+            only.
         init: other initial values, by register path.
         state: a `run.state` or `result.state` to go on from.
         seed: of the random numbers, 0 .. 2^64 - 1; a `state` brings its own.
@@ -84,6 +90,7 @@ def simulate(
             it in the result's `stats` and `notes` and go on.
         checkpoint: `Checkpoint(file, every=10.0)` keeps the run in a file now and then;
             `Checkpoint(resume=file)` goes on from one, to the same bits. Of one run alone.
+        formats: for fixed point, the number formats, or the folder that `flowgraph quantise` wrote.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
@@ -93,7 +100,7 @@ def simulate(
     """
     options = RunOptions(
         engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes,
-        diverged=diverged, checkpoint=checkpoint,
+        diverged=diverged, checkpoint=checkpoint, formats=formats,
     )  # fmt: skip
     if seeds is None:
         need_inputs(graph, inputs)

@@ -3,7 +3,8 @@
 A result holds what a graph collects. Who looks for the block that goes wrong wants the rest as well, which
 would be gigabytes if all of it were kept. So the Python engine hands every value on every wire to a watcher,
 which keeps what it can show. The blocks are those of the graph, each with a clock around its step; the values
-are the same to the bit.
+are the same to the bit. Other engines have no wires: their run is shown by the same events in the Python
+engine once more (`replayed`), and how far the two are apart is told.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import perf_counter
 from typing import Any, Protocol
+
+import numpy as np
 
 from flowgraph.data.inputs import Inputs, need_inputs
 from flowgraph.data.result import Result
@@ -58,28 +61,92 @@ def simulate_watched(graph: Graph, inputs: Inputs, watcher: Watcher, **options: 
         What `simulate` raises.
     """
     need_inputs(graph, inputs)
-    watch = _Watch(graph, watcher, options.get("progress"))
-    return ENGINE.driven(watch.graph, inputs, RunOptions(engine="python", **options), watch.drive)
+    watch = Watch(graph, watcher)
+    meter = options.get("progress")
+
+    def drive(run: Run) -> None:
+        done = 0
+        while run.step():
+            done += 1
+            watch.after(run.time)
+            if meter is not None and done % _TOLD == 0:
+                meter.update(done, run.time)
+        if meter is not None:
+            meter.update(run.ticks, run.time)
+        watch.end()
+
+    return ENGINE.driven(watch.graph, inputs, RunOptions(engine="python", **options), drive)
 
 
-class _Watch:
-    def __init__(self, graph: Graph, watcher: Watcher, meter: Any) -> None:
-        self.watcher, self.meter = watcher, meter
-        self.fired: list[tuple[int, Any]] = []
-        self.seconds: dict[int, float] = {index: 0.0 for index, _ in graph.calls}
-        self.times: dict[int, int] = {index: 0 for index, _ in graph.calls}
+def replayed(graph: Graph, inputs: Inputs, watcher: Watcher, result: Result, **options: Any) -> str:
+    """Show a watcher what was on the wires in a run of another engine: the same events in the Python engine.
+
+    Args:
+        result: of that run.
+        options: as of `simulate_watched`, those of that run.
+
+    Returns:
+        A sentence: whose the values are, and by how much the outputs of the two runs differ at most.
+
+    Raises:
+        What `simulate` raises.
+    """
+    again = simulate_watched(graph, inputs, watcher, **options)
+    apart, where = farthest(result, again)
+    told = "are the same to the bit" if apart == 0.0 else f"differ by {apart:.2g} in {where}"
+    return (
+        "the values on the wires, the clouds and the times of blocks are the Python engine's, run again"
+        f" over the same events; the outputs {told}"
+    )
+
+
+def farthest(one: Result, other: Result) -> tuple[float, str]:
+    """The largest difference between two results, of all entries max(1, |x|), and in which output it is; an
+    output that is not at the same times in both, or is a number in one only, differs without bound."""
+    most, where = 0.0, ""
+    for name, series in one.series.items():
+        there = other.series[name]
+        for leaf, array in series.leaves.items():
+            second = np.asarray(there.leaves[leaf])
+            if array.shape != second.shape or not np.array_equal(series.time, there.time):
+                return float("inf"), name
+            x, y = np.asarray(array, dtype=float), np.asarray(second, dtype=float)
+            if (np.isnan(x) != np.isnan(y)).any():
+                return float("inf"), f"{name}.{leaf}"
+            gap = np.nan_to_num(np.abs(x - y) / np.maximum(1.0, np.abs(x)))
+            if gap.size and gap.max() > most:
+                most, where = float(gap.max()), f"{name}.{leaf}"
+    return most, where
+
+
+class Watch:
+    """A graph whose blocks tell what they give, and when a watcher sees it.
+
+    Args:
+        graph: to be watched; `graph` of this is what is run instead.
+        watcher: who is shown the run.
+    """
+
+    def __init__(self, graph: Graph, watcher: Watcher) -> None:
+        self.watcher = watcher
+        self._fired: list[tuple[int, Any]] = []
+        self._seconds: dict[int, float] = {index: 0.0 for index, _ in graph.calls}
+        self._times: dict[int, int] = {index: 0 for index, _ in graph.calls}
         nodes = list(graph.nodes)
         for index, call in graph.calls:
-            nodes[index] = replace(call, block=self.timed(index, call.block))
+            nodes[index] = replace(call, block=self._timed(index, call.block))
         self.graph = replace(graph, nodes=tuple(nodes), plans={})
-        self.feeds = {
+        self._gives = {index: _outputs(call, index) for index, call in graph.calls}
+        self._feeds = {
             index: node.feed
             for index, node in enumerate(graph.nodes)
             if isinstance(node, RegisterNode) and node.role == "delay" and node.feed is not None
         }
+        self._seen: dict[Wire, tuple[int, Any]] = {}
+        self._done = 0
 
-    def timed(self, index: int, block: Block[Any]) -> Block[Any]:
-        step, fired, seconds, times = block.step, self.fired.append, self.seconds, self.times
+    def _timed(self, index: int, block: Block[Any]) -> Block[Any]:
+        step, fired, seconds, times = block.step, self._fired.append, self._seconds, self._times
 
         def watched(*args: Any, **keywords: Any) -> Any:
             start = perf_counter()
@@ -93,32 +160,32 @@ class _Watch:
         made.step = watched
         return made
 
-    def drive(self, run: Run) -> None:
-        seen: dict[Wire, tuple[int, Any]] = {}
-        done = 0
-        gives = {
-            index: _outputs(call, index) for index, call in self.graph.calls
-        }  # what a step's result holds of each output
-        while run.step():
-            done += 1
-            now = run.time
-            looks = done % self.watcher.stride == 0
-            read = {i: seen[feed] for i, feed in self.feeds.items() if feed in seen} if looks else {}
-            for index, result in self.fired:
-                for wire, take in gives[index]:
-                    there, value = presence(take(result))
-                    if there:
-                        seen[wire] = now, value
-            self.fired.clear()
-            if looks:
-                self.watcher.see(now, seen, read)
-            if self.meter is not None and done % _TOLD == 0:
-                self.meter.update(done, now)
-        if self.meter is not None:
-            self.meter.update(run.ticks, run.time)
-        self.watcher.took(
-            {call.path: (self.seconds[index], self.times[index]) for index, call in self.graph.calls}
-        )
+    def after(self, now: int, given: Mapping[Wire, Any] | None = None) -> None:
+        """A tick at `now` was made.
+
+        Args:
+            given: by wire, what no block gave: the events of sources, for a watcher without a recording of
+                them.
+        """
+        self._done += 1
+        looks = self._done % self.watcher.stride == 0
+        seen = self._seen
+        read = {i: seen[feed] for i, feed in self._feeds.items() if feed in seen} if looks else {}
+        for index, result in self._fired:
+            for wire, take in self._gives[index]:
+                there, value = presence(take(result))
+                if there:
+                    seen[wire] = now, value
+        self._fired.clear()
+        for wire, value in (given or {}).items():
+            seen[wire] = now, value
+        if looks:
+            self.watcher.see(now, seen, read)
+
+    def end(self) -> None:
+        """The run has ended."""
+        calls = self.graph.calls
+        self.watcher.took({call.path: (self._seconds[k], self._times[k]) for k, call in calls})
 
 
 def _outputs(call: CallNode, index: int) -> list[tuple[Wire, Callable[[Any], Any]]]:
@@ -135,4 +202,4 @@ def _outputs(call: CallNode, index: int) -> list[tuple[Wire, Callable[[Any], Any
     return [(Wire(index, k), taker(k)) for k in range(len(call.outputs))]
 
 
-__all__ = ["Seen", "Watcher", "simulate_watched"]
+__all__ = ["Seen", "Watch", "Watcher", "farthest", "replayed", "simulate_watched"]

@@ -131,6 +131,10 @@ class Builder:
             self._stamps[firing] = self.add(node)
         return self._stamps[firing]
 
+    def stamp_of(self, firing: Clock) -> int | None:
+        """The register that keeps when a clock last ticked, where there is one."""
+        return self._stamps.get(firing)
+
     def random_streams(self, prefix: str, path: str) -> str:
         """Claim the names that begin with `prefix` for one node: no two nodes draw the same numbers."""
         if prefix in self._draws:

@@ -248,7 +248,7 @@ def firing_order(nodes: list[Node], lines: Mapping[int, str | None] | None = Non
                 path=nodes[index].path,
                 expected="at least one delay in each cycle",
                 got=chain,
-                fix="read the value of the tick before: delay(init) in place of latest(init=...)",
+                fix="read the value of the tick before: delay(init), not latest(init=...); or use moore(...)",
             )
             error.line = next((lines[i] for i, _ in loop if lines and i in lines), None)
             raise error

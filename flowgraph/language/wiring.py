@@ -258,10 +258,13 @@ def _variants(
     """Record the step once for each possible presence of its optional streams."""
     options = [s for p, s in clocked if p.optional]
     found: dict[tuple[bool, ...], StepTrace | LoweringError] = {}
-    for choice in itertools.product((True, False), repeat=len(options)):
-        tick = both(firing, *_literals(options, choice))
-        if options and clocks.disjoint(tick, tick):
-            continue  # such a tick cannot come, so the step need not cope with it
+    choices = sorted(
+        itertools.product((True, False), repeat=len(options)),
+        key=lambda choice: bool(options) and _never(firing, options, choice),
+    )
+    for choice in choices:
+        if options and _never(firing, options, choice) and not _untyped(found):
+            break  # such ticks cannot come, so the step need not cope with them
         present = iter(choice)
         types = [
             None if v is None or (isinstance(v, Stream) and p.optional and not next(present)) else v.type
@@ -283,6 +286,21 @@ def _variants(
                 raise
             found[choice] = error
     return found
+
+
+def _never(firing: Clock, options: list[Stream[Any]], choice: tuple[bool, ...]) -> bool:
+    tick = both(firing, *_literals(options, choice))
+    return clocks.disjoint(tick, tick)
+
+
+def _untyped(found: Mapping[tuple[bool, ...], StepTrace | LoweringError]) -> bool:
+    """Whether an output has no value in any of the ticks that can come, so that others tell its type."""
+    steps = [v for v in found.values() if isinstance(v, StepTrace)]
+    if len(steps) < len(found):
+        return False
+    return not steps or any(
+        all(o.type is None for o in of) for of in zip(*(v.outputs for v in steps), strict=True)
+    )
 
 
 def _literals(options: list[Stream[Any]], choice: tuple[bool, ...]) -> list[Clock]:

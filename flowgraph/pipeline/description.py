@@ -16,12 +16,14 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from flowgraph.errors import PipelineError
+from flowgraph.errors import DeclarationError, PipelineError
 from flowgraph.language.block import Limit
 from flowgraph.language.clock import Timing
 from flowgraph.pipeline.evaluate import evaluate
+from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.pipeline import (
     FORMAT,
+    READ,
     VERSION,
     Cell,
     Fault,
@@ -76,6 +78,7 @@ def to_json(pipeline: Pipeline) -> dict[str, Any]:
         "faults": [_plain(f) for f in pipeline.faults],
         "random": [_plain(r) for r in pipeline.random],
         "limits": [{**limit._asdict(), "numbers": list(limit.numbers)} for limit in pipeline.limits],
+        **({} if pipeline.formats is None else {"formats": pipeline.formats.to_json()}),
         **({"host": [_plain(stage) for stage in pipeline.host]} if pipeline.host else {}),
         "totals": pipeline.totals(),
         "latency": pipeline.latency(),
@@ -181,11 +184,22 @@ def from_json(data: Any, *, path: str = "pipeline") -> Pipeline:
             HostStage(**{**r, "reads": tuple(r["reads"]), "feeds": tuple(r["feeds"])})
             for r in data.get("host", ())
         ),
+        formats=_read_formats(data.get("formats"), path),
     )
     _check_ports(pipeline, path)
     _check_values(pipeline, path)
+    _check_formats(pipeline, path)
     _check_sums(pipeline, data, path)
     return pipeline
+
+
+def _read_formats(r: Mapping[str, Any] | None, path: str) -> Formats | None:
+    if r is None:
+        return None
+    try:
+        return Formats.from_json(r)
+    except (KeyError, TypeError, ValueError, DeclarationError) as error:
+        _refuse("the number formats are malformed", f"{path}: formats", "formats of quantise", error)
 
 
 def _read_port(r: Mapping[str, Any], path: str) -> Port:
@@ -256,11 +270,11 @@ def _array(data: Any, shape: list[int], dtype: str, where: str) -> np.ndarray:
 
 
 def _check_version(data: Any, path: str) -> None:
-    if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+    if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") not in READ:
         raise PipelineError(
             "this is not a pipeline of a known version",
             path=path,
-            expected=f"format {FORMAT!r}, version {VERSION}",
+            expected=f"format {FORMAT!r}, version {VERSION} or before",
             got={k: data.get(k) for k in ("format", "version")}
             if isinstance(data, dict)
             else type(data).__name__,
@@ -349,6 +363,19 @@ def _check_values(pipeline: Pipeline, path: str) -> None:
                 "a register cell that exists and holds one int64",
                 f"{fault.register}, {fault.cell}",
             )
+
+
+def _check_formats(pipeline: Pipeline, path: str) -> None:
+    """Formats are of real values, and broadcast to their shapes."""
+    formats = pipeline.formats
+    for n, fraction in {} if formats is None else formats.fractions.items():
+        spec = pipeline.specs.get(n, Spec((), "none"))
+        try:
+            fits = np.broadcast_shapes(fraction.shape, spec.shape) == spec.shape and spec.dtype == "real"
+        except ValueError:
+            fits = False
+        if not fits:
+            _refuse("a number format fits no value", f"{path}: formats, value {n}", spec, fraction.shape)
 
 
 def _check_size(where: str, values: Iterable[tuple[int, Spec]]) -> None:

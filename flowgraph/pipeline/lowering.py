@@ -174,9 +174,12 @@ class _Lowering(StageList):
         if stamp not in self.durations:
             (last,) = self.reads[stamp]
             first = self.emit("equal", last, self.constant(np.int64(NEVER)))
-            gap = self.emit("astype", self.emit("subtract", self.time, last), dtype="real")
-            seconds = self.emit("multiply", gap, self.constant(np.float64(1e-9)))
-            self.durations[stamp] = self.emit("where", first, self.constant(np.float64(0.0)), seconds)
+            since = self.emit(
+                "subtract", self.time, last
+            )  # chosen among integers: what is no duration is no real
+            gap = self.emit("where", first, self.constant(np.int64(0)), since)
+            seconds = self.emit("astype", gap, dtype="real")
+            self.durations[stamp] = self.emit("multiply", seconds, self.constant(np.float64(1e-9)))
         return self.durations[stamp]
 
     def registers(self) -> list[Register]:

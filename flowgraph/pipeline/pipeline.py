@@ -22,6 +22,7 @@ from flowgraph.data.files import content_of, put_new, text_of
 from flowgraph.errors import LoweringError, PipelineError, UnknownNameError
 from flowgraph.language.block import NUMBERS, Limit
 from flowgraph.language.clock import Timing
+from flowgraph.pipeline.formats import Formats
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
@@ -32,7 +33,9 @@ if TYPE_CHECKING:
     from flowgraph.data.result import Result
     from flowgraph.data.series import Flight
 
-FORMAT, VERSION = "flowgraph-pipeline", 1
+FORMAT, VERSION = "flowgraph-pipeline", 2
+READ = (1, 2)
+"""The versions that are read: 1 has no formats."""
 _FILE = "pipeline.json"
 _SCHEMA = Path(__file__).with_name("pipeline.schema.json")
 
@@ -158,6 +161,7 @@ class Pipeline:
         seed: number of the value that holds the run's seed (two uint32 words, low first).
         inputs, outputs, registers, constants, stages, faults, random, limits: see their classes.
         host: what the graph does outside the pipeline, in firing order; a pipeline alone does not run it.
+        formats: how real values are kept as whole numbers, where that was decided.
     """
 
     name: str
@@ -173,6 +177,7 @@ class Pipeline:
     random: tuple[RandomSite, ...] = ()
     limits: tuple[Limit, ...] = ()
     host: tuple[HostStage, ...] = ()
+    formats: Formats | None = None
 
     def need_numbers(self, kind: str) -> None:
         """Refuse a kind of number, "float64", "float32" or "fixed", in which a block must not be computed.

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from flowgraph.pipeline.pipeline import Pipeline, work
-from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.ops import ELEMENTWISE, Spec
 from flowgraph.recorder.trace import Instruction
 
 
@@ -44,6 +45,20 @@ class Program:
     lanes: frozenset[int] = frozenset()
     origin: Mapping[int, int] = field(default_factory=dict)
     elements: Mapping[int, np.ndarray] = field(default_factory=dict)
+
+    @cached_property
+    def surely(self) -> tuple[frozenset[int], tuple[Instruction, ...]]:
+        """The values that every tick needs, and backwards the instructions that may need others."""
+        sure = set(self.writes)
+        for flag, leaves in self.outputs:
+            if flag is not None:
+                sure.add(flag)
+                sure.update(leaves if flag in self.constants else ())
+        for i in reversed(self.instructions):
+            if i.out in sure:
+                sure.update(i.args[:1] if i.op == "where" else i.args)
+        others = (i for i in reversed(self.instructions) if i.op == "where" or i.out not in sure)
+        return frozenset(sure), tuple(others)
 
     @property
     def work(self) -> int:
@@ -132,6 +147,45 @@ def _fold(
         unknown = [a for a, f in zip(args, facts, strict=True) if f is None]
         return (not ends) if not unknown else unknown[0] if len(unknown) == 1 else None
     return None
+
+
+def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
+    """Which elements of each value bear on an output or a register in this tick: a mask, or True for all.
+
+    A selection needs what it takes: the quotient beside a guard `where(small, 1.0, x / y)` may be of any
+    size.
+    """
+    sure, others = program.surely
+    taken: dict[int, Any] = dict.fromkeys(sure, True)
+    for flag, leaves in program.outputs:
+        if flag is not None and env.get(flag, True):
+            taken.update(dict.fromkeys(leaves, True))
+    for i in others:
+        mask = taken.get(i.out)
+        if mask is None:
+            continue
+        if i.op == "where":
+            chosen = np.asarray(env[i.args[0]], bool)
+            masks = [mask, chosen & mask, ~chosen & mask]
+        else:
+            masks = [mask if i.op in ELEMENTWISE else True] * len(i.args)
+        for a, m in zip(i.args, masks, strict=True):
+            before = taken.get(a)
+            if before is True:
+                continue
+            if m is not True:
+                m = _reduced(np.broadcast_to(m, i.spec.shape), np.shape(env[a]))
+                if not m.any():
+                    continue
+            taken[a] = m if before is None else True if m is True else before | m
+    return taken
+
+
+def _reduced(mask: Any, shape: tuple[int, ...]) -> Any:
+    """A mask of a result for an argument that was broadcast to it."""
+    mask = np.any(mask, axis=tuple(range(mask.ndim - len(shape))))
+    wide = tuple(a for a, n in enumerate(shape) if n == 1 and mask.shape[a] != 1)
+    return np.any(mask, axis=wide, keepdims=True) if wide else mask
 
 
 def _live(instructions: list[Instruction], wanted: list[int]) -> tuple[tuple[Instruction, ...], set[int]]:

@@ -64,6 +64,8 @@ def jacobian(
         given = along if isinstance(along, list | tuple) else [along]
         parts = [_directions(xp.asarray(d), x, xp) for d in given]
     inner = Duals(xp)
+    if len(parts) > 1 and not inner.sparse:  # zeros are not looked for: side by side they are one
+        parts = [xp.concat(_alike(parts, xp), axis=0)]
     k = sum(d.shape[0] for d in parts)
     if inner.sparse and k <= MOST_APART:
         parts = [d[i : i + 1, ...] for d in parts for i in range(d.shape[0])]
@@ -105,6 +107,12 @@ def _directions(along: Any, x: Any, xp: Any) -> Any:
     front = xp.permute_dims(along, (rank - 1, *range(rank - 1)))
     ones = (1,) * (len(x.shape) - (rank - 1))
     return xp.reshape(front, (shape[-1], *ones, *front.shape[1:])) if ones else front
+
+
+def _alike(parts: list[Any], xp: Any) -> list[Any]:
+    """The parts of directions with axes of one size, but for the first."""
+    sizes = [max(d.shape[a] for d in parts) for a in range(1, len(parts[0].shape))]
+    return [spread(xp, d, sizes, range(len(sizes))) for d in parts]
 
 
 def _assembled(y: Dual, k: int, xp: Any) -> Any:
@@ -267,16 +275,10 @@ def _applied(
         joined: whether it takes its arrays as one list.
         placed: whether it takes its attributes by their place.
     """
-    values, tangents, found = [], [], False
-    for a in args:
-        if type(a) is Dual and a.xp is duals:
-            values.append(a.value)
-            tangents.append(a.tangent)
-            found = True
-        else:
-            values.append(a)
-            tangents.append(_NONE)
-    if found:
+    own = [type(a) is Dual and a.xp is duals for a in args]
+    if True in own:
+        values = [a.value if mine else a for a, mine in zip(args, own, strict=True)]
+        tangents = [a.tangent if mine else _NONE for a, mine in zip(args, own, strict=True)]
         return duals.made(*RULES[name](duals.below, values, tangents, **attrs))
     function = plain(duals.below, name)
     if joined:

@@ -42,8 +42,10 @@ def _weighted(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], slope
             g = 1.0 if slope is None else slope()
             if type(g) in (int, float) and not g:
                 continue  # 0.0 * x, as written to give a constant the shape of x
-            wide = {key: lifted(xp, d, rank) for key, d in t.items()}
-            scaled = wide if slope is None else {key: d * g for key, d in wide.items()}
+            scaled = {}
+            for key, d in t.items():
+                wide = d if len(d.shape) > rank else lifted(xp, d, rank)
+                scaled[key] = wide if slope is None else wide * g
             out = added(xp, out, scaled) if out else scaled
     return out
 

@@ -103,12 +103,17 @@ def _broadcast_to(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], *
     return y, mapped(tangents[0], lambda d: lifted(xp, d, len(shape_of(y))))
 
 
+_ALL = slice(None)
+
+
 def _getitem(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], *, index: Any) -> Made:
     (x,), (t,) = values, tangents
     shape = shape_of(x)
 
     def piece(d: Any) -> Any:
-        entries, axis = [slice(None)], 0
+        if d.shape[1:] == shape:
+            return d[(_ALL, *index)]
+        entries, axis = [_ALL], 0
         for e in index:
             if e is not None:
                 if d.shape[1 + axis] != shape[axis]:  # the same all along

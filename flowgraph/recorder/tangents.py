@@ -34,7 +34,7 @@ def plain(xp: Any, name: str) -> Any:
 
 def shape_of(x: Any) -> tuple[int, ...]:
     """The shape of an array or number."""
-    return tuple(getattr(x, "shape", ()))
+    return x.shape if type(x) is np.ndarray else tuple(getattr(x, "shape", ()))
 
 
 def mapped(tangent: Tangent, function: Callable[[Any], Any]) -> Tangent:

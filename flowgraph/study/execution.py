@@ -95,6 +95,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
         for data in study.data:
             for parameters in study.combinations(graph):
                 identity, seeded, described, program = flights.described(graph, data, parameters)
+                whole = together and not study.keep and flights.made(data, parameters)
                 watcher.planning(len(runs) // len(study.each_seed), total)
                 common = {
                     "graph": [graph, described, code],
@@ -105,7 +106,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
                 }
                 for seed in study.each_seed:
                     key = keys.run_key({**common, "seed": seed})
-                    runs.append(RunSpec(graph, data, seed, parameters, key, seeded))
+                    runs.append(RunSpec(graph, data, seed, parameters, key, seeded, whole))
                     programs.append(program)
     return Plan(tuple(runs), tuple(programs))
 
@@ -133,6 +134,11 @@ class _Flights:
             described, program = keys.failure_digest(error), ""
         beside = digests.python_digest(case.graph, every=not program)
         return identity, seeded, digests.digest((described, beside)) if beside else described, program
+
+    def made(self, data: str, parameters: Mapping[str, Value]) -> bool:
+        """Whether its flights, one a seed, are runs of a graph."""
+        flight = self._flight(data, parameters)[0]
+        return self._many and isinstance(flight, Flight) and flight.experiment is not None
 
     def _flight(self, data: str, parameters: Mapping[str, Value]) -> tuple[Flight | Exception, str, bool]:
         settings = {n: text(v) for n, v in flight_part(data, parameters).items()}

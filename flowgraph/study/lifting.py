@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.language.graph import CallNode, Graph, RegisterNode, join_states
+from flowgraph.pipeline.digests import is_table
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Cell, Pipeline, Register
 from flowgraph.types import ArrayType, flatten
@@ -39,7 +40,7 @@ def lifted(graph: Graph) -> Graph:
         cell = Cell("value", number, number, array.shape, "real", array, axes=unnamed)
         registers.append(Register(path, "delay", (cell,)))
         nodes.append(RegisterNode(path, "delay", ArrayType(array.shape, "real"), array))
-    rest = {n: a for n, a in pipeline.constants.items() if a.dtype.kind != "f"}
+    rest = {n: a for n, a in pipeline.constants.items() if n not in real_constants(pipeline.constants)}
     moved = replace(pipeline, registers=(*pipeline.registers, *registers), constants=rest)
     return replace(graph, nodes=(*graph.nodes, *nodes), plans={"pipeline": moved})
 
@@ -101,5 +102,5 @@ def _skeleton(graph: Graph) -> list[Any]:
 
 
 def real_constants(constants: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """Those constants of a pipeline that are lifted."""
-    return {n: a for n, a in constants.items() if a.dtype.kind == "f"}
+    """Those constants of a pipeline that are lifted; tables stay (`digests.is_table`)."""
+    return {n: a for n, a in constants.items() if a.dtype.kind == "f" and not is_table(a)}

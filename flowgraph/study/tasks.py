@@ -34,6 +34,7 @@ from flowgraph.pipeline.digests import structure
 from flowgraph.study.lifting import Lowered, lifted, start_of
 from flowgraph.study.spec import Value
 from flowgraph.study.store import pack_trajectory
+from flowgraph.study.whole import whole_case
 from flowgraph.types import unflatten
 
 _FLIGHTS_KEPT = 2
@@ -43,7 +44,8 @@ _PROGRAMS_KEPT = 4
 @dataclass(frozen=True)
 class RunSpec:
     """One run: what is run, and the key of its result. `seeded` is false where the flight is the same for
-    all seeds."""
+    all seeds; `whole` is true where it need not be written down to be filtered, if the filter lets it (see
+    `whole`)."""
 
     graph: str
     data: str
@@ -51,6 +53,7 @@ class RunSpec:
     parameters: Mapping[str, Value]
     key: str
     seeded: bool = True
+    whole: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,7 @@ def flight_part(data: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
 _flights: OrderedDict[Any, Flight] = OrderedDict()
 _steps: OrderedDict[Any, Any] = OrderedDict()
 _lowered = Lowered()
+_wholes: OrderedDict[Any, Case | None] = OrderedDict()
 
 
 def _flight(run: RunSpec) -> Flight:
@@ -165,6 +169,8 @@ def run_task(task: Task) -> list[Done]:
 
 def _ready(run: RunSpec) -> _Lane:
     start = perf_counter()
+    if run.whole and (whole := _whole(run)) is not None:
+        return _Lane(run, whole, {"load_s": 0.0, "setup_s": perf_counter() - start})
     flight = _flight(run)
     loaded = perf_counter()
     with remembering(_steps):
@@ -177,6 +183,23 @@ def _alone(task: Task, lane: _Lane) -> Done:
     result = run_graph(lane.case.graph, lane.case.inputs, task.options.but(seed=lane.run.seed))
     lane.times["run_s"] = perf_counter() - start
     return _scored(task, lane, result)
+
+
+def _whole(run: RunSpec) -> Case | None:
+    """The experiment of a run's filter as one case for all seeds, where there is one; found once."""
+    which = (run.graph, run.data, tuple(sorted(run.parameters.items())))
+    if which not in _wholes:
+        found = []
+        for seed in (0, 1):
+            flight = loaded(run.data, seed, run.parameters)
+            with remembering(_steps):
+                found.append((prepared(run.graph, run.data, seed, run.parameters, flight)[0], flight))
+        made_by = found[0][1].experiment
+        _wholes[which] = None if made_by is None else whole_case(made_by, *found)
+        while len(_wholes) > _PROGRAMS_KEPT:
+            _wholes.popitem(last=False)
+    _wholes.move_to_end(which)
+    return _wholes[which]
 
 
 _programs: OrderedDict[str, list[tuple[Any, Graph]]] = OrderedDict()
@@ -228,8 +251,13 @@ def simulate_together(
     Only the streams of `options.keep` come back.
     """
     graph = _program(cases[0].graph.name, program, cases[0].graph)
-    streams = [_streams(case, graph) for case in cases]
-    batch = run_many(graph, streams, seeds, options.but(init=[start_of(case.graph) for case in cases]))
+    streams: Any = [_streams(case, graph) for case in cases]
+    start: Any = None
+    if all(case is cases[0] for case in cases):
+        streams, start = streams[0], start_of(cases[0].graph)
+    batch = run_many(
+        graph, streams, seeds, options.but(init=start or [start_of(case.graph) for case in cases])
+    )
     return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
 
 

@@ -7,7 +7,7 @@ makes too). What a fault is like is said once, here: how long, how large, how of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,18 +15,22 @@ import numpy as np
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
-from flowgraph.blocks.scoring.readings import CONTROLS, MEASURED
+from flowgraph.blocks.scoring.readings import AIDS, CONTROLS
 from flowgraph.blocks.signals import MagneticField
 from flowgraph.types import StructType, unflatten
 
-__all__ = ["Fault", "faults_of"]
+__all__ = ["HOUR", "Fault", "aids_of", "controls_of", "faults_of", "faulty", "gap", "jump", "nan", "spikes"]
 
 HOUR = 3600.0
 SPIKES = {"gyro": 20.0, "rate": 20.0, "specific_force": 150.0, "force": 150.0, "acceleration": 150.0}
 """What a spike adds to each axis of a control, rad/s and m/s^2; a measurement's are below."""
 
-FAR, TURNED = 10.0, 1.0
-"""By how much a spike of a measurement is off: m (or what its unit is), and rad."""
+FAR, TURNED, METRE = 10.0, 1.0, 1.6e-7
+"""By how much a spike of a measurement is off: m (or what its unit is), and rad; how much of a latitude one
+metre is, rad."""
+
+TOLD = ("covariance", "deviation", "interval")
+"""What a reading tells of itself, which no fault changes."""
 
 Make = Callable[[Flight, float], Flight]
 
@@ -50,13 +54,12 @@ class Fault:
 
 def faults_of(flight: Flight) -> Iterator[Fault]:
     """All faults that the streams of a flight can have."""
-    controls = {n for n, s in flight.streams.items() if _class(s) in CONTROLS}
-    measured = {n for n, s in flight.streams.items() if _class(s) in MEASURED}
-    for name in (*sorted(controls), *sorted(measured)):
+    measured = aids_of(flight)
+    for name in (*controls_of(flight), *measured):
         for length in (1.0, 10.0, 30.0):
-            yield Fault(f"dropout {name} {length:g} s", _of(name, _gap, length), length)
-        yield Fault(f"nan {name} 0.5 s", _of(name, _nan, 0.5), 0.5)
-        yield Fault(f"spikes {name}", _of(name, _spikes), 1.0)
+            yield Fault(f"dropout {name} {length:g} s", _of(name, gap, length), length)
+        yield Fault(f"nan {name} 0.5 s", _of(name, nan, 0.5), 0.5)
+        yield Fault(f"spikes {name}", _of(name, spikes), 1.0)
         yield Fault(f"stuck {name} 2 s", _of(name, _stuck, 2.0), 2.0)
         yield Fault(f"duplicates {name}", _of(name, _twice), 1.0)
         yield Fault(f"noise x10 {name}", _of(name, _noisy))
@@ -66,7 +69,7 @@ def faults_of(flight: Flight) -> Iterator[Fault]:
                 yield Fault(f"late {name} {late:g} s", _of(name, _late, late))
         if _class(flight.streams[name]) is MagneticField:
             yield Fault(f"disturbance {name} 3 s", _of(name, _disturbed, 3.0), 3.0)
-    yield Fault("time jumps 1 h", _jump)
+    yield Fault("time jumps 1 h", jump)
     yield Fault("start heading 90 deg off", lambda flight, _: flight, settings=("start_heading",))
     yield Fault("singular start covariance", lambda flight, _: flight, settings=("singular",))
 
@@ -75,15 +78,36 @@ def _class(series: Series) -> type | None:
     return series.type.cls if isinstance(series.type, StructType) else None
 
 
-def _of(name: str, change: Callable[..., Series], *sizes: float) -> Make:
-    def make(flight: Flight, begins: float) -> Flight:
-        series = flight.streams[name]
-        first = min(int(s.time[0]) for s in flight.streams.values() if len(s))
-        seconds = (series.time - first) * 1e-9
-        changed = change(series, seconds, begins, *sizes)
-        return replace(flight, streams={**flight.streams, name: changed})
+def controls_of(flight: Flight) -> list[str]:
+    """The streams of a flight that say how the body moves."""
+    return sorted(n for n, s in flight.streams.items() if _class(s) in CONTROLS)
 
-    return make
+
+def aids_of(flight: Flight) -> list[str]:
+    """The streams of a flight that correct."""
+    return sorted(n for n, s in flight.streams.items() if _class(s) in AIDS)
+
+
+def faulty(
+    flight: Flight, names: Iterable[str], change: Callable[..., Series], begins: float, *sizes: float
+) -> Flight:
+    """The flight whose streams of these names have a fault.
+
+    Args:
+        change: `gap`, `nan`, `spikes` or another `(series, t, begins, *sizes)` of this module.
+        begins: s after the first reading.
+        sizes: of the fault.
+    """
+    streams = dict(flight.streams)
+    first = min(int(s.time[0]) for s in streams.values() if len(s))
+    for name in names:
+        series = streams[name]
+        streams[name] = change(series, (series.time - first) * 1e-9, begins, *sizes)
+    return replace(flight, streams=streams)
+
+
+def _of(name: str, change: Callable[..., Series], *sizes: float) -> Make:
+    return lambda flight, begins: faulty(flight, [name], change, begins, *sizes)
 
 
 def _with(
@@ -95,12 +119,14 @@ def _with(
     return Series(stamps, values, type=series.type, name=series.name, gaps=gaps or series.gaps)
 
 
-def _gap(series: Series, t: np.ndarray, begins: float, length: float) -> Series:
+def gap(series: Series, t: np.ndarray, begins: float, length: float) -> Series:
+    """No reading for so many seconds."""
     kept: Series = series[(t < begins) | (t >= begins + length)]
     return kept
 
 
-def _nan(series: Series, t: np.ndarray, begins: float, length: float) -> Series:
+def nan(series: Series, t: np.ndarray, begins: float, length: float) -> Series:
+    """Readings that are no numbers, for so many seconds."""
     there = (t >= begins) & (t < begins + length)
     leaves = {n: np.array(a) for n, a in series.leaves.items()}
     for array in leaves.values():
@@ -109,18 +135,20 @@ def _nan(series: Series, t: np.ndarray, begins: float, length: float) -> Series:
     return _with(series, leaves=leaves, gaps=True)
 
 
-def _spikes(series: Series, t: np.ndarray, begins: float) -> Series:
-    """Five, or as many as there are readings, within a second."""
+def spikes(series: Series, t: np.ndarray, begins: float, count: float = 5, times: float = 1.0) -> Series:
+    """So many, or as many as there are readings, within a second; so many times as large as usual ones."""
     rows = np.flatnonzero((t >= begins) & (t < begins + 1.0))
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(5, len(rows)), dtype=int))]
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(int(count), len(rows)), dtype=int))]
     leaves = {n: np.array(a) for n, a in series.leaves.items()}
     for name, array in leaves.items():
         if name == "attitude":
             turn = from_rotation_vector(np.array([0.0, 0.0, TURNED]), xp=np)
             array[rows] = multiply(array[rows], np.broadcast_to(turn, array[rows].shape), xp=np)
-        elif array.dtype.kind == "f":
-            array[rows] += SPIKES.get(
-                name, max(FAR, 3.0 * float(np.abs(array).max()) if name == "field" else FAR)
+        elif name == "field":
+            array[rows] += 3.0 * float(np.abs(array).max())
+        elif array.dtype.kind == "f" and name not in TOLD:
+            array[rows] += (
+                times * SPIKES.get(name, FAR) * (METRE if name in ("latitude", "longitude") else 1.0)
             )
     return _with(series, leaves=leaves)
 
@@ -146,7 +174,7 @@ def _noisy(series: Series, t: np.ndarray, begins: float) -> Series:
     leaves = {n: np.array(a) for n, a in series.leaves.items()}
     there = t >= begins
     for name, array in leaves.items():
-        if array.dtype.kind != "f" or len(array) < 4:
+        if array.dtype.kind != "f" or len(array) < 4 or name in TOLD:
             continue
         spread = np.sqrt(99.0) * np.median(np.abs(np.diff(array, 2, axis=0)), axis=0) / 0.6745 / np.sqrt(6.0)
         if name == "attitude":
@@ -177,7 +205,8 @@ def _disturbed(series: Series, t: np.ndarray, begins: float, length: float) -> S
     return _with(series, leaves=leaves)
 
 
-def _jump(flight: Flight, begins: float) -> Flight:
+def jump(flight: Flight, begins: float) -> Flight:
+    """From then on all stamps are an hour later, those of the truth as well."""
     first = min(int(s.time[0]) for s in flight.streams.values() if len(s))
 
     def later(series: Series) -> Series:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ from flowgraph.blocks.signals import Attitude, Belief, Gaussian, PoseEstimate
 from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
 from flowgraph.graphs.benches import engine_of
-from flowgraph.graphs.benches.thesis_picture import draw
+from flowgraph.graphs.benches.thesis_picture import draw, write_page
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.graphs.rbpf_indoor import rbpf_indoor
@@ -253,8 +254,15 @@ def thesis(
         for name in better:
             errors = smoothed_errors(name, flown, noise, engine)
             rows.append(_row(code, f"{name}_smoothed", errors, least))
-    figures = {"thesis.png": lambda path: draw(rows, path)}
-    return Report(rows, figures, (f"{flights} flights of {duration:g} s, {particles} particles, {engine}",))
+    words = f"{flights} flights of {duration:g} s, {particles} particles, {engine}"
+
+    def page(path: Path) -> None:
+        noise = Noise.of(codes[0])
+        flight = fly(seed, noise, duration=duration)
+        trials = {name: FILTERS[name](flight, noise, particles) for name in names}
+        write_page(rows, path, words=words, flight=flight, trials=trials)
+
+    return Report(rows, {"thesis.png": lambda path: draw(rows, path), "thesis.html": page}, (words,))
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def _row(graph: Any, share: float, duration: float, repeats: int) -> Row:
         return len(events.time) / (perf_counter() - start)
 
     def several() -> float:
-        memory = lanes.state([cells])
+        memory = lanes.state([cells], [seed_words(0)])
         start = perf_counter()
         lanes.advance(memory, events.time, events.key, abreast, [none] * WIDTH)
         return WIDTH * len(events.time) / (perf_counter() - start)

@@ -145,9 +145,14 @@ def recorded(runs: int, sample: int, duration: float, chunk: int, repeats: int) 
 
 
 def whole(runs: int, sample: int, duration: float, chunk: int) -> Row:
-    """A study from nothing to its table, in C; what either spends on making flights is in it."""
+    """A study from nothing to its table, in C; what either spends on making flights is in it.
+
+    Ours flies `sim:figure`, where world, filter and score are one graph and start alike; the peer's flights
+    are the same figures by the loader of `sim`, whose share of a run is `peer_load_share`.
+    """
+    parameters = {"duration": duration, "start": "truth"}
     study = Study(
-        graphs=["ekf"], data=["sim"], seeds=runs, engine="c", chunk=chunk, parameters={"duration": duration}
+        graphs=["ekf"], data=["sim:figure"], seeds=runs, engine="c", chunk=chunk, parameters=parameters
     )
     before = _pool(sample, duration)
     with tempfile.TemporaryDirectory() as folder:
@@ -160,6 +165,11 @@ def whole(runs: int, sample: int, duration: float, chunk: int) -> Row:
     parts: dict[str, Any] = {
         n: float(np.mean([r[n] for r in done.rows])) for n in ("load_s", "setup_s", "run_s", "score_s")
     }
+    begun = perf_counter()
+    flight_of(runs, duration)
+    loaded = perf_counter() - begun
+    scored(runs, duration)
+    parts["peer_load_share"] = loaded / (perf_counter() - begun - loaded)
     parts |= {"peer_before": before, "peer_after": after}
     name = f"{runs:,} seeds of ekf, {duration:g} s, whole study, c"
     against = f"filterpy in {WORKERS} processes, from 2 x {sample} runs"

@@ -55,9 +55,13 @@ def test_runs_stand_beside_each_other_and_change_no_figure(tmp_path: Path) -> No
     assert done.exit_code == 0, done.output
     titles = [run["title"] for run in runs_in(file)]
     assert titles == [first["title"], first["title"].replace("python", "reference")]
-    said = "info: the page has no values on the wires: engine=reference does not show them"
+    said = (
+        "info: the values on the wires, the clouds and the times of blocks are the Python engine's, run again"
+        " over the same events; the outputs are the same to the bit"
+    )
     assert said in json.loads(done.stdout)["notes"]
-    assert runs_in(file)[1]["watch"] is None
+    assert said in runs_in(file)[1]["notes"]
+    assert runs_in(file)[1]["watch"] == first["watch"]
     assert call(*SHORT, "--html", str(file)).exit_code == 0
     assert len(runs_in(file)) == 1
 
@@ -82,3 +86,39 @@ def test_a_run_to_watch_says_where_and_ends_by_itself_where_nobody_is_waited_for
     assert done.exit_code == 0, done.output
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\n", done.stdout)
     assert "ended: 201 ticks" in done.stderr
+
+
+@pytest.mark.parametrize("engine", ["python", "c"])
+def test_a_flight_is_pushed_live_to_who_watches(engine: str) -> None:
+    done = call("watch", "ins_eskf", "--data", "sim", "--set", "duration=0.4", "--live", "--engine", engine,
+                "--no-wait")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "ended: 81 ticks" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--engine", "c"], "the Python engine alone shows what is on the wires as they go on"),
+        (["--live", "--speed", "0"], "events that are pushed have a pace"),
+    ],
+)
+def test_a_run_that_cannot_be_watched_so(more: list[str], words: str) -> None:
+    done = call("watch", "ins_eskf", "--data", "sim", "--no-wait", *more)
+    assert done.exit_code == 2
+    assert words in done.stderr
+
+
+def test_what_a_page_warns_of_stands_in_the_terminal(tmp_path: Path) -> None:
+    """A filter that is told far too small a noise: its NIS is far from 1, on the page and in the notes."""
+    file = tmp_path / "run.html"
+    wrong = ["--set", "position_noise=0.001", "--html", str(file)]
+    done = call("run", "ins_eskf", "--data", "sim", "--set", "duration=3", *wrong, "--json")
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)["notes"]
+    (run,) = runs_in(file)
+    warned = [words for words in run["notes"] if words.startswith("warning: ")]
+    assert any("the NIS is far from 1" in words for words in warned)
+    assert set(warned) <= set(told)
+    assert all(f"note: {words}" in done.stderr for words in warned)
+    assert any(panel.get("wrong") for panel in run["panels"] if panel["title"].endswith("NIS"))

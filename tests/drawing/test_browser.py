@@ -6,6 +6,7 @@ They need Chromium and its driver, and Selenium; what accessibility asks is aske
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import time
@@ -17,8 +18,9 @@ import cv2
 import numpy as np
 import pytest
 
+from flowgraph import Scalar, Stream, block, delay, graph, match, periodic
 from flowgraph.cli.options import case_of
-from flowgraph.cli.pages import watcher_of, write_page
+from flowgraph.cli.pages import recorder_of, write_page
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
@@ -27,6 +29,9 @@ from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.run_page import describe_run, run_page, runs_of_page
 from flowgraph.engines.watched import simulate_watched
 from flowgraph.pipeline.costs.places import costs_by_path
+from flowgraph.study import Study, run_study
+from flowgraph.study.report import write_comparison, write_report
+from tests.drawing.test_page import _Reader
 from tests.drawing.test_run_page import flown, result_of
 from tests.test_house import ROOT
 
@@ -48,6 +53,21 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="no chromium with chromedriver on PATH"),
 ]
+
+
+@block
+def total(before: Scalar, value: Scalar) -> Scalar:
+    """The sum."""
+    return before + value
+
+
+@graph
+def paired(a: Stream[Scalar], b: Stream[Scalar]):
+    """Two sensors of one rate, paired, and a sum."""
+    before = delay(7.25, name="held")
+    now = total(before, a)
+    before.feed(now)
+    return {"sum": now, "pairs": match(a, b, tolerance="6ms", size=4, name="pairs")}
 
 
 class Page:
@@ -133,6 +153,10 @@ class Page:
         return found
 
 
+def reader_of(file: Path) -> _Reader:
+    return _Reader(file.read_text())
+
+
 @pytest.fixture(scope="module")
 def chrome() -> Iterator[Chrome]:
     options = ChromeOptions()
@@ -169,8 +193,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Pat
         case, flight = case_of(name, spec, settings, 0)
         diagram, run = folder / f"{name}.html", folder / f"{name}_run.html"
         diagram_page(case.graph, diagram, costs=costs_by_path(case.graph))
-        recorder = watcher_of(case, "python")
-        assert recorder is not None
+        recorder = recorder_of(case)
         result = simulate_watched(case.graph, case.inputs, recorder)
         streams = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
         recorded = {k: s for k, s in streams.items() if isinstance(s, Series)}
@@ -234,6 +257,58 @@ def test_graphs_fold_and_unfold_by_mouse_and_by_key(page, pages) -> None:
     )
     page.until("return document.querySelector('.selected text.name')?.textContent === 'pose'")
     assert page.texts(".frame.shut") == []
+    page.is_quiet()
+
+
+def test_a_diagram_is_moved_enlarged_and_read_by_keys(page, pages) -> None:
+    """Arrows, + and - and 0; the legend's colour is the wire's, and who points at a clock sees its wires."""
+    look(page, "light")
+    page.open(pages["ins_eskf"][0], "[data-drawn]")
+    place = "return document.querySelector('svg.diagram > g').getAttribute('transform')"
+    frame = page.find("svg.diagram")
+    page.ask("document.querySelector('svg.diagram').focus()")
+    places = [page.ask(place)]
+    for key in (Keys.ARROW_RIGHT, "+", "-", Keys.ARROW_DOWN):
+        frame.send_keys(key)
+        places.append(page.ask(place))
+    assert all(a != b for a, b in itertools.pairwise(places))
+    frame.send_keys("0")
+    fitted = page.ask(place)
+    frame.send_keys("+")
+    frame.send_keys("0")
+    assert page.ask(place) == fitted
+    colours = page.ask(
+        "return [...document.querySelectorAll('.legend .clock')].map(b =>"
+        " getComputedStyle(b.querySelector('.swatch')).backgroundColor)"
+    )
+    drawn = page.ask(
+        "return [...document.querySelectorAll('.line .stroke')].map(l => getComputedStyle(l).stroke)"
+    )
+    assert len(set(colours)) == len(colours) > 3
+    assert set(drawn) == set(colours)
+    clock = page.chrome.find_elements(By.CSS_SELECTOR, ".legend .clock")[1]
+    ActionChains(page.chrome).move_to_element(clock).perform()
+    page.until("return document.querySelectorAll('.line.faint').length > 0")
+    alone = page.ask(
+        "return [...document.querySelectorAll('.line:not(.faint) .stroke')]"
+        ".map(l => getComputedStyle(l).stroke)"
+    )
+    assert set(alone) == {colours[1]}
+
+
+def test_memory_is_shown_where_it_is(page, tmp_path) -> None:
+    """The bound of a queue, and the role and first value of a register, in the picture and on a click."""
+    graph_ = paired.build(a=periodic("10ms"), b=periodic("10ms", phase="5ms"))
+    diagram_page(graph_, tmp_path / "paired.html")
+    page.open(tmp_path / "paired.html", "[data-drawn]")
+    chips = page.texts("text.chip")
+    assert any("queue" in words for words in chips), chips
+    register = next(words for words in page.texts(".box.register") if "held" in words)
+    assert "delay" in register
+    page.find(".box.register .body").send_keys(Keys.ENTER)
+    details = page.until("return document.querySelector('.details').innerText")
+    assert "Register, delay" in details
+    assert "7.25" in details
     page.is_quiet()
 
 
@@ -304,6 +379,10 @@ def test_run(name, scheme, page, pages) -> None:
     wires = page.texts("text.value")
     assert len(wires) > 5
     assert all(w for w in wires)
+    wide = "return [...document.querySelectorAll('text.value')].map(t => t.getBBox().width)"
+    for share in (0.1, 0.4, 0.6):
+        page.slide(share)
+        assert max(page.ask(wide)) <= 120.0  # the room that is left beside a wire
     imu = page.ask("const d = diagram.options.values(0, 0); return [d.short, d.lines[0], d.lines[1]]")
     stamp = float(imu[1].split()[1])
     streams = case.inputs["imu"]
@@ -358,6 +437,99 @@ def test_a_way_far_from_the_origin_is_in_the_picture(page, pages, tmp_path) -> N
     assert blue > 100
 
 
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The page of a study with two of its runs, and of its comparison with itself."""
+    pytest.importorskip("pyarrow")
+    folder = tmp_path_factory.mktemp("study")
+    noises = [0.005, 0.01, 0.05]
+    study = Study(
+        graphs=["ekf", "ins_eskf"], data=["sim"], seeds=2,
+        parameters={"duration": 1.5, "imu.rate": 50, "position_noise": noises},
+    )  # fmt: skip
+    run_study(study, folder)
+    return {
+        "study": write_report(folder, runs=3).page,
+        "comparison": write_comparison(folder, folder, folder / "both").page,
+    }
+
+
+def test_a_report_leads_to_its_runs(page: Page, reports: dict[str, Path]) -> None:
+    assert reports["study"].stat().st_size < 10_000_000
+    look(page, "dark")
+    page.open(reports["study"], "[data-shown]")
+    assert page.ask("return [...document.querySelectorAll('.chart canvas')].length") == 2
+    assert page.ask("return getComputedStyle(document.querySelector('figure img')).display") == "none"
+    titles = page.texts("select[aria-label=Run] option")
+    assert len(titles) == 3
+    chart = reader_of(reports["study"]).data("charts")[0]
+    dot = next(d for s in chart["series"] for d in s["dots"] if d["run"] not in (0, None))
+    place = page.ask(
+        "const [x, y] = arguments, plot = document.querySelector('.chart .u-over');"
+        "plot.scrollIntoView({block: 'center'}); const box = plot.getBoundingClientRect();"
+        "return [box.width, box.height]",
+        dot["x"], dot["y"],
+    )  # fmt: skip
+    assert place[0] > 600
+    found = page.ask(
+        "const plot = document.querySelector('.chart .u-over'), box = plot.getBoundingClientRect();"
+        "const told = document.querySelector('.chart .words');"
+        "for (let y = 0; y < box.height; y += 3) for (let x = 0; x < box.width; x += 6) {"
+        "  const at = {clientX: box.left + x, clientY: box.top + y, bubbles: true};"
+        "  plot.dispatchEvent(new MouseEvent('mousemove', at));"
+        "  if (told.textContent === arguments[0]) {"
+        "    for (const kind of ['mousedown', 'mouseup', 'click'])"
+        "      plot.dispatchEvent(new MouseEvent(kind, at));"
+        "    return true; } }"
+        "return false",
+        dot["words"],
+    )
+    assert found
+    page.until("return document.querySelector('main').dataset.shown === arguments[0]", str(dot["run"]))
+    assert page.ask("return document.querySelector('select[aria-label=\"Compare with\"]').value") == "0"
+    assert len(page.texts(".figures thead th")) == 2
+    page.slide(0.5)
+    assert len(page.texts("text.value")) > 5
+
+    heads = page.texts(".table button.sort")
+    column = heads.index("q50")
+    page.ask("document.querySelectorAll('.table button.sort')[arguments[0]].click()", column)
+    sorted_ = [float(x) for x in page.texts(f".table table tr td:nth-child({column + 1})")[: len(titles)]]
+    assert sorted_ == sorted(sorted_)
+    assert page.ask("return document.querySelector('th[aria-sort]').textContent") == "q50"
+    page.is_accessible()
+    page.is_quiet()
+
+
+def test_a_comparison_has_its_names_whole(page: Page, reports: dict[str, Path]) -> None:
+    look(page, "light")
+    page.open(reports["comparison"], "[data-charted]")
+    names = reader_of(reports["comparison"]).data("charts")[0]["y"]["names"]
+    assert len(names) > 10
+    page.until("return document.querySelectorAll('.chart canvas').length === 1")
+    longest = page.ask(
+        "const c = document.createElement('canvas').getContext('2d'); c.font = '11px system-ui';"
+        "return Math.max(...arguments[0].map(n => c.measureText(n).width))",
+        names,
+    )
+    room = page.ask(
+        "const p = document.querySelector('.chart .u-over').getBoundingClientRect(),"
+        " h = document.querySelector('.chart .canvas').getBoundingClientRect(); return p.left - h.left"
+    )
+    assert longest < room - 8
+    page.is_accessible()
+    page.is_quiet()
+
+
+def test_a_report_prints_with_its_pictures(page: Page, reports: dict[str, Path]) -> None:
+    page.open(reports["comparison"], "[data-charted]")
+    page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    style = "return getComputedStyle(document.querySelector(arguments[0])).display"
+    assert page.ask(style, "figure img") == "block"
+    assert page.ask(style, ".chart") == "none"
+    page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
 def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:
     case = pages["ins_eskf"][2]
     look(page, "light")
@@ -367,7 +539,7 @@ def test_a_run_is_watched_while_it_goes_on(page, pages) -> None:
         assert server.wait(True, 30.0)
         simulate_watched(case.graph, case.inputs, Sender(server, case.graph, case.inputs, speed=2.0))
         page.until("return document.querySelector('[data-ended]') !== null")
-        assert page.find("output").text.startswith("ended at 2.9")
+        assert page.find("output").text.startswith("ended at 3.000 s")
         assert len(page.texts("text.value")) > 5
         assert all(page.texts("text.value"))
         assert any(words.startswith("belief: position [m]") for words in page.texts(".scope h4"))

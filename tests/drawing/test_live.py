@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import OutputError
+from flowgraph import Live, LiveView, OutputError, simulate
 from flowgraph.drawing import live
 from flowgraph.drawing.live import LiveServer, Sender, frame, live_page
 from flowgraph.engines.watched import simulate_watched
 from tests.drawing.test_page import _Reader
 from tests.engines.test_watched import INPUTS, built
+from tests.support import MS, same_state
 
 
 @pytest.fixture
@@ -177,10 +178,57 @@ def test_a_run_is_sent_as_it_is(server: LiveServer, monkeypatch: pytest.MonkeyPa
     assert viewer.message()["ended"] is True
 
 
+def test_how_a_run_ended_is_sent(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a run that is over before a second message was due, the first tick and the last."""
+    monkeypatch.setattr(live, "EVERY", 1e9)
+    viewer = Viewer(server)
+    one = built()
+    result = simulate_watched(one, INPUTS, Sender(server, one, INPUTS, speed=0))
+    assert [viewer.message()["ticks"] for _ in range(2)] == [1, result.ticks]
+    assert viewer.message()["ended"] is True
+
+
 def test_a_run_keeps_to_the_time(server: LiveServer) -> None:
     start = time.monotonic()
     simulate_watched(built(), INPUTS, Sender(server, built(), INPUTS, speed=0.1))
     assert 0.25 <= time.monotonic() - start < 5.0  # 25 ms of events
+
+
+@pytest.mark.parametrize("engine", ["python", "c"])
+def test_a_live_run_is_sent_with_its_events(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is pushed, what blocks make of it, and what became of the events; in C events and outputs."""
+    monkeypatch.setattr(live, "EVERY", 0.0)
+    one = built()
+    place = {node.path: k for k, node in enumerate(one.nodes)}
+    with LiveView(one, title="as it comes") as view:
+        viewer = Viewer(view.server)
+        assert view.wait(True, 5.0)
+        with Live(one, engine=engine, watcher=view) as run:
+            for time_, name, value in ((5, "a", 3.0), (7, "b", 4.0), (6, "b", 9.0), (10, "a", 1.0)):
+                run.push(time_ * MS, **{name: np.float64(value)})
+        result = run.result()
+        got = [viewer.message() for _ in range(result.ticks)]
+        end = viewer.message()
+    assert [m["t"] for m in got] == [0.0, 0.002, 0.005]
+    assert [m["wires"][f"{place['a']}.0"] for m in got] == [[0.0, [3.0]], [0.0, [3.0]], [0.005, [1.0]]]
+    assert [m["wires"].get(f"{place['b']}.0") for m in got] == [None, [0.002, [4.0]], [0.002, [4.0]]]
+    wire = next(c.wire for c in one.collected if c.name == "both")
+    assert [m["wires"][f"{wire.node}.{wire.output}"][1][0] for m in got] == result["both"]["value"].tolist()
+    assert (f"{place['total']}.0" in got[0]["wires"]) is (engine == "python")
+    assert (end["ended"], end["ticks"]) == (True, 3)
+    assert (end["facts"]["a taken"], end["facts"]["b late"]) == ("2", "1")
+    assert end["facts"]["work p50"].endswith(" ms")
+    assert set(end["blocks"]) == {call.path for _, call in one.calls}
+
+
+def test_a_live_run_that_is_watched_is_the_same_to_the_bit() -> None:
+    one = built()
+    with LiveView(one) as view, Live(one, watcher=view) as run:
+        for time_, name, value in ((5, "a", 3.0), (7, "b", 4.0), (10, "a", 1.0)):
+            run.push(time_ * MS, **{name: np.float64(value)})
+    again, live_result = simulate(one, run.arrived), run.result()
+    assert live_result["both"]["value"].tolist() == again["both"]["value"].tolist()
+    same_state(live_result.state, again.state)
 
 
 def test_the_page_may_connect_to_its_server_alone() -> None:

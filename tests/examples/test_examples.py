@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 from flowgraph import aperiodic, periodic, simulate
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-FILES = sorted(f for f in EXAMPLES.glob("*.py") if f.stem != "udp_live")  # it has a test of its own
+OWN = ("udp_live", "watched_live")
+"""Those with arguments, which have tests of their own."""
+
+FILES = sorted(f for f in EXAMPLES.glob("*.py") if f.stem not in OWN)
 
 
 def run(name: str) -> dict[str, Any]:
@@ -133,6 +137,14 @@ def test_live_run_shows_each_distance(capsys: pytest.CaptureFixture[str]) -> Non
     ]
     # 2 m/s over 1 s, 3 m/s over 1 s, a mark at 5.25, a mark at 7, 1 m/s over 1 s
     assert shown == ["0.00", "2.00", "5.00", "5.25", "7.00", "8.00"]
+
+
+def test_a_live_run_in_the_browser_says_where(capsys: pytest.CaptureFixture[str]) -> None:
+    found = runpy.run_path(str(EXAMPLES / "watched_live.py"))
+    found["main"](["--seconds", "0.5"])
+    first, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"open http://127\.0\.0\.1:\d+/ in a browser on this machine", first)
+    assert last.startswith("50 ticks, last place 0.")
 
 
 @pytest.mark.slow

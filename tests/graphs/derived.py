@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Stream, block, collect, delay, graph, jacobian, latest, lower
-from flowgraph.blocks.geometry.manifold import StateSpace
+from flowgraph import Array, Stream, block, collect, delay, graph, latest, lower
+from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.filters import update_extended
 from flowgraph.blocks.models.pose import POSE, between_imu, pose_belief, predict_pose, update_pose
@@ -23,18 +23,6 @@ from flowgraph.pipeline.costs import Costs
 from flowgraph.pipeline.optimise import COMPILED
 
 Function = Callable[[Array, Any], Array]
-
-
-def in_tangent_space(f: Function, space: StateSpace, seen: StateSpace, x: Array, xp: Any, more: int) -> Any:
-    """f(x) and its derivative from the tangent space at x, and by `more` numbers, to that at f(x)."""
-    t = space.tangent
-    y = f(xp.concat([x, xp.zeros((more,), dtype=x.dtype)], axis=-1), xp)
-
-    def moved(d: Array, xp: Any) -> Array:
-        start = xp.concat([space.plus(x, d[..., :t], xp), d[..., t:]], axis=-1)
-        return seen.minus(f(start, xp), y, xp)
-
-    return y, jacobian(moved, xp.zeros((t + more,), dtype=x.dtype), xp)[1]
 
 
 def moving(control: Imu, dt: Any, gravity: tuple[float, float, float] = GRAVITY) -> Function:
@@ -52,15 +40,10 @@ def predict_derived(
     dt: float,
     xp: Any,
 ) -> Gaussian:
-    after, J = in_tangent_space(moving(control, dt, gravity), STATE, STATE, belief.mean, xp, 6)
+    after, J = linearised(moving(control, dt, gravity), belief.mean, STATE, xp, seen=STATE, more=6)
     F, G = J[..., :9], J[..., 9:]
     P = F @ belief.covariance @ F.mT + G @ xp.asarray(imu_density(noise), dtype=F.dtype) @ G.mT * dt
     return Gaussian(mean=STATE.plus(after, xp.zeros((9,)), xp), covariance=0.5 * (P + P.mT))
-
-
-def see_derived(lever: tuple[float, float, float]) -> Callable[..., tuple[Array, Array]]:
-    observe = see_pose(lever)
-    return lambda x, xp: in_tangent_space(observe, STATE, POSE, x, xp, 0)
 
 
 @graph
@@ -82,7 +65,7 @@ def derived_ekf(
     posterior, innovation = update_extended(
         prior,
         vicon.map(stacked_pose, name="pose"),
-        observe=see_derived(lever),
+        observe=see_pose(lever),
         R=np.diag([position_noise**2] * 3 + [attitude_noise**2] * 3),
         space=STATE,
         measured_space=POSE,

@@ -182,18 +182,6 @@ def test_a_smoother_is_better_than_the_filter(settings):
     assert ("smoothed_nees_mean" in score) == ("smooth" in settings)
 
 
-def test_the_jacobian_between_tangent_spaces_is_that_of_small_errors():
-    state, imu = a_state(2)
-    moved = np.concatenate(x.move(state[:3], state[3:6], state[6:], imu, DT, np))
-    found = x.tangent_jacobian(state[6:], moved[6:], imu, DT, np)
-    for k, error in enumerate(np.eye(9) * 1e-6):
-        q = multiply(state[6:], from_rotation_vector(error[6:], xp=np), xp=np)
-        v, p, q = x.move(state[:3] + error[3:6], state[3:6] + error[:3], q, imu, DT, np)
-        turn = to_rotation_vector(multiply(moved[6:] * [1, -1, -1, -1], q, xp=np), xp=np)
-        column = np.concatenate([p - moved[3:6], v - moved[:3], turn]) / 1e-6
-        np.testing.assert_allclose(found[:, k], column, atol=1e-5)
-
-
 def test_settings_that_make_no_sense_are_refused():
     flight = thesis(1, 3.0)
     with pytest.raises(DeclarationError, match=r"'smooth' has no such value[\s\S]*none or rts"):

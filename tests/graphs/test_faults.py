@@ -7,7 +7,6 @@ tests/graphs/test_faults.py` plays the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -29,12 +28,14 @@ from flowgraph.blocks.models.pose import start_pose
 from flowgraph.blocks.signals import Imu, Pose
 from flowgraph.cli.options import case_of
 from flowgraph.data.registry import graph_names
+from flowgraph.graphs.benches import fault_kinds as kinds
+from flowgraph.graphs.benches.fault_kinds import HOUR
 from flowgraph.types import unflatten
 from tests.graphs.estimation import engines_agree
 from tests.graphs.library import OWN
 
-BEGINS, OVER, LASTS, HOUR = 2.0, 6.0, 9.0, 3600.0
-"""s after the first reading: the fault, from when on errors count, the end; and by how much stamps jump."""
+BEGINS, OVER, LASTS = 2.0, 6.0, 9.0
+"""s after the first reading: the fault, from when on errors count, and the end."""
 
 NOT_INERTIAL = {"tag_pose", "particle", "imu_calibration", "attitude_mekf", "tracker"}
 """They take images, velocities in the plane, counts of converters, and commanded rates, ranges."""
@@ -48,7 +49,6 @@ GRAPHS = [
     for name in graph_names()
     if name not in NOT_INERTIAL
 ]
-CONTROLS = ("imu", "gyro", "accelerometer", "coordinate_acceleration", "thrust", "velocity")
 
 
 @cache
@@ -65,60 +65,25 @@ def with_leaves(series: Series, leaves: dict[str, np.ndarray], *, gaps: bool = F
     return Series(series.time, values, type=series.type, name=series.name, gaps=gaps)
 
 
-def since(flight: Flight, series: Series) -> np.ndarray:
-    """Seconds of a series after the first reading of the flight."""
-    return (series.time - min(int(s.time[0]) for s in flight.streams.values())) * 1e-9
-
-
-def of_one(flight: Flight, change: Callable[[str, np.ndarray], None], *, gaps: bool = False) -> Flight:
-    """The flight with one reading of each control changed."""
-    streams = dict(flight.streams)
-    for name in set(CONTROLS) & set(streams):
-        series = streams[name]
-        row = int(np.searchsorted(since(flight, series), BEGINS))
-        leaves = {field: np.array(values) for field, values in series.leaves.items()}
-        for field, values in leaves.items():
-            change(field, np.reshape(values[row : row + 1], -1))
-        streams[name] = with_leaves(series, leaves, gaps=gaps)
-    return replace(flight, streams=streams)
-
-
 def spike(flight: Flight) -> Flight:
-    def change(field: str, row: np.ndarray) -> None:
-        row += 200.0 if field in ("gyro", "rate") else 2000.0
-
-    return of_one(flight, change)
+    """One reading of each control that is off by 200 rad/s, and by some hundreds of m/s^2."""
+    return kinds.faulty(flight, kinds.controls_of(flight), kinds.spikes, BEGINS, 1, 10.0)
 
 
 def nan(flight: Flight) -> Flight:
-    def change(field: str, row: np.ndarray) -> None:
-        row[0] = np.nan
-
-    return of_one(flight, change, gaps=True)
+    return kinds.faulty(flight, kinds.controls_of(flight), kinds.nan, BEGINS, 0.01)
 
 
-def gap(flight: Flight, *, length: float = 1.0, of_controls: bool = True) -> Flight:
-    streams = dict(flight.streams)
-    for name in set(streams):
-        if (name in CONTROLS) == of_controls:
-            t = since(flight, streams[name])
-            streams[name] = streams[name][(t < BEGINS) | (t >= BEGINS + length)]
-    return replace(flight, streams=streams)
+def gap(flight: Flight, *, length: float = 1.0) -> Flight:
+    return kinds.faulty(flight, kinds.controls_of(flight), kinds.gap, BEGINS, length)
 
 
 def aid(flight: Flight) -> Flight:
-    return gap(flight, length=3.0, of_controls=False)
+    return kinds.faulty(flight, kinds.aids_of(flight), kinds.gap, BEGINS, 3.0)
 
 
 def jump(flight: Flight, *, at: float = BEGINS) -> Flight:
-    def later(series: Series) -> Series:
-        time = series.time + np.where(since(flight, series) >= at, round(HOUR * 1e9), 0)
-        return Series(time, series.values, type=series.type, name=series.name, gaps=series.gaps)
-
-    assert flight.truth is not None
-    return replace(
-        flight, streams={n: later(s) for n, s in flight.streams.items()}, truth=later(flight.truth)
-    )
+    return kinds.jump(flight, at)
 
 
 SAID = {

@@ -19,6 +19,7 @@ from flowgraph.blocks.geometry.rotations import (
     rotate,
     to_matrix,
 )
+from flowgraph.blocks.kalman.filters import observed
 from flowgraph.blocks.outdoor.belief import (
     FLOW,
     OUTDOOR,
@@ -110,11 +111,11 @@ def test_a_jacobian_is_the_derivative(observe, space):
     x[6:10], x[13:17] = (1.0, 0.2, -0.3, 0.4), (1.0, -0.1, 0.2, 0.3)
     for at in (slice(6, 10), slice(13, 17)):
         x[at] /= np.linalg.norm(x[at])
-    h, H = observe(x, np)
+    h, H = observed(observe, x, OUTDOOR, space, np)
     minus = (lambda a, b: a - b) if space is None else (lambda a, b: space.minus(a, b, np))
     step = 1e-6
     for k, d in enumerate(np.eye(15) * step):
-        slope = minus(observe(OUTDOOR.plus(x, d, np), np)[0], observe(OUTDOOR.plus(x, -d, np), np)[0])
+        slope = minus(observe(OUTDOOR.plus(x, d, np), np), observe(OUTDOOR.plus(x, -d, np), np))
         np.testing.assert_allclose(H[:, k], slope / (2.0 * step), atol=1e-6 * max(1.0, np.abs(h).max()))
 
 

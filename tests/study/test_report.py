@@ -13,7 +13,10 @@ from flowgraph import DataError, UnknownNameError
 from flowgraph.cli import app
 from flowgraph.study import Study, run_study
 from flowgraph.study.report import write_comparison, write_report
+from flowgraph.study.shown import chosen, shown_again
 from flowgraph.study.statistics import compared, differing, quantiles, summarised
+from flowgraph.study.store import read_table
+from tests.drawing.test_page import _Reader
 
 pytest.importorskip("pyarrow")
 FLIGHT = {"duration": 1.5, "imu.rate": 50}
@@ -39,11 +42,63 @@ def test_the_page_holds_all_and_needs_nothing_else(folder):
     page = found.page.read_text()
     for part in ("Summary by setting", "Worst runs by position_rmse_m", "Failed runs (3)", "ins_eskf"):
         assert part in page
-    assert "<script" not in page
+    assert "default-src 'none'" in page
     assert not re.findall(r'(?:src|href)="https?:', page)
     assert page.count('src="data:image/png;base64,') == 2
     assert [f.name for f in found.figures] == ["boxes.png", "against-position-noise.png"]
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in found.figures)
+
+
+def test_charts_say_what_their_pictures_show(folder):
+    charts = _Reader(write_report(folder).page.read_text()).data("charts")
+    rows = read_table(folder)
+    boxes, against = charts
+    assert boxes["x"]["names"] == ["sim"]
+    assert [s["name"] for s in boxes["series"]] == ["ekf", "ins_eskf", "orientation_complementary"]
+    mine = [r["position_rmse_m"] for r in rows if r["graph"] == "ekf"]
+    five = boxes["series"][0]["boxes"][0]
+    np.testing.assert_allclose(five[1:4], np.quantile(mine, [0.25, 0.5, 0.75]), rtol=1e-6)
+    assert sorted(d["y"] for d in boxes["series"][0]["dots"]) == pytest.approx(sorted(mine))
+    assert (against["x"]["label"], against["x"]["log"]) == ("position_noise", True)
+    line = against["series"][0]
+    assert line["x"] == [0.005, 0.01, 0.05]
+    assert line["low"][0] <= line["y"][0] <= line["high"][0]
+
+
+def test_some_runs_are_in_the_page_whole(folder):
+    """The worst first and the middle one last, run again: the same figures, and rims in the chart."""
+    found = write_report(folder, runs=2)
+    reader = _Reader(found.page.read_text())
+    ranked = sorted(
+        (r for r in read_table(folder) if r.get("error") is None), key=lambda r: -(r["position_rmse_m"])
+    )
+    runs = reader.data("runs")
+    assert [dict(run["figures"])["position_rmse_m"] for run in runs] == [
+        f"{r['position_rmse_m']:.6g}" for r in (ranked[0], ranked[len(ranked) // 2])
+    ]
+    assert runs[0]["title"].startswith(f"{ranked[0]['graph']}, sim, duration=1.5, imu.rate=50")
+    assert runs[0]["notes"][0] == "info: run again for this page, in the Python engine"
+    assert not any("in the study's table" in words for words in runs[0]["notes"])
+    assert all(run["watch"]["wires"] for run in runs)
+    dots = [d for s in reader.data("charts")[0]["series"] for d in s["dots"]]
+    assert sorted(d["run"] for d in dots if d["run"] is not None) == [0, 1]
+    assert found.notes == ()
+
+
+def test_a_run_that_cannot_be_run_again_is_said(folder, tmp_path):
+    said: list[str] = []
+    row = {"graph": "ekf", "data": f"csv:{tmp_path}/gone.csv", "seed": 0, "e": 1.0}
+    assert shown_again(row, [], "e", share=1.0, dtype="float64", say=said.append) is None
+    assert said[0].startswith(f"skipped: the run ekf, csv:{tmp_path}/gone.csv, seed 0 is not on the page: ")
+
+
+def test_which_runs_are_shown():
+    rows = [run("x", k, float(k), wall_s=0.1 if k % 2 else 50.0) for k in range(9)]
+    assert [r["seed"] for r in chosen(rows, "e", 3, "python")] == [8, 7, 4]
+    assert [r["seed"] for r in chosen(rows, "e", 1, "python")] == [8]
+    assert [r["seed"] for r in chosen(rows, "e", None, "python")] == [7, 5, 3]  # those that are quick
+    assert chosen(rows, "e", None, "c") == []
+    assert chosen([{**rows[0], "error": "no"}, run("x", 1, None)], "e", 3, "python") == []
 
 
 def test_the_worst_runs_are_linked_and_can_be_run_again(folder):

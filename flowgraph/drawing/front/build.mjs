@@ -5,7 +5,7 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 
 const out = process.argv[2];
-const used = { diagram: ["elkjs"], run: ["uplot", "three"], live: ["uplot"] };
+const used = { diagram: ["elkjs"], run: ["uplot", "three"], live: ["uplot"], report: ["uplot"] };
 for (const name of Object.keys(used)) {
   await build({
     entryPoints: [`src/${name}_page.ts`],

@@ -109,7 +109,9 @@ class _Abreast(_Singly):
 
     def _together(self, block: Sequence[int], tapes: Mapping[int, Tape]) -> None:
         lanes, first = self.lanes, self.many.first
-        memory = lanes.state([self.many.cells(n) for n in block])
+        memory = lanes.state(
+            [self.many.cells(n) for n in block], [seed_words(self.many.seeds[n]) for n in block]
+        )
         given = self._shared or lanes.rows([self._leaves(tapes[n]) for n in block])
         rooms = [[output.room(n, lanes, first) for output in self.outputs] for n in block]
         played = lanes.advance(memory, first.time, first.key, given, rooms)

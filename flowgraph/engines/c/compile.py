@@ -13,6 +13,8 @@ import ctypes
 import functools
 import hashlib
 import os
+import platform
+import re
 import shlex
 import shutil
 import signal
@@ -22,16 +24,15 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from flowgraph.data.files import content_of, lock, put
 from flowgraph.errors import FlowgraphError, MissingDependencyError, OutputError, writes
 
-FLAGS = (
+_COMMON = (
     "-std=c99",
     "-O3",
-    "-fno-tree-slp-vectorize",  # gcc 12.2 with AVX-512 puts elements of one row into the next by it
-    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -39,10 +40,25 @@ FLAGS = (
     "-fopenmp-simd",
     "-DFLOWGRAPH_SIMD",
 )
-"""What `engine="c"` compiles with; none of them changes what NaN or infinity mean."""
+_NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AMD64") else ()
+
+FLAGS = (*_COMMON, *_NARROW)
+"""What `engine="c"` compiles with; none of them changes what NaN or infinity mean.
+
+Straight code is packed into vectors, of half the length where a processor has AVX-512: with whole ones
+gcc 12.2 puts elements of one row into the next.
+"""
+
+LOOPS = (
+    *_COMMON,
+    "-fno-tree-slp-vectorize",  # so loops may have whole vectors, see above
+    "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
+)
+"""The flags for a filter whose time goes into long loops, as over particles."""
 
 _MARK = b"\nflowgraph library, sha256 "
 _WORK = "work-"
+_NAME = re.compile(r"(?:(.*)-)?[0-9a-f]{40}")
 
 
 class CompileError(FlowgraphError):
@@ -227,7 +243,8 @@ def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
     said = "\0".join(
         [*command, _version(tuple(command)), *flags, *(f"{n}\0{t}" for n, t in sorted(files.items()))]
     )
-    name = f"{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
+    stem = next((n[:-2] for n in files if n.endswith(".c")), "code")
+    name = f"{stem}-{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
     refused: OutputError | None = None
     for folder in _places():
         target = folder / name
@@ -310,6 +327,53 @@ def _workplace(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(work, ignore_errors=True)
         os.close(descriptor)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A compiled filter in the cache.
+
+    Args:
+        file: of the library.
+        filter: whose it is.
+        bytes: its size.
+        made: when, in seconds since 1970.
+    """
+
+    file: Path
+    filter: str
+    bytes: int
+    made: float
+
+
+def kept(folder: Path) -> list[Kept]:
+    """The compiled filters in a cache folder, the newest first."""
+    found = []
+    for file in folder.glob("*.so"):
+        name = _NAME.fullmatch(file.stem)
+        with suppress(OSError):
+            if name:  # not a library of the user's own
+                status = file.stat()
+                found.append(Kept(file, name[1] or "unnamed", status.st_size, status.st_mtime))
+    return sorted(found, key=lambda k: -k.made)
+
+
+def clear(folder: Path) -> int:
+    """Remove what is kept in a cache folder, and nothing else that may lie there; returns the bytes freed.
+
+    A process that has loaded a library keeps it.
+
+    Raises:
+        OutputError: for a library that cannot be removed.
+    """
+    freed = 0
+    if folder.is_dir():
+        _sweep(folder)
+    for one in kept(folder):
+        with writes(one.file):
+            one.file.unlink(missing_ok=True)
+        freed += one.bytes
+    return freed
 
 
 def _sweep(folder: Path) -> None:

@@ -13,6 +13,7 @@ from flowgraph.data.inputs import Inputs
 from flowgraph.data.tape import Tape
 from flowgraph.engines.c.batch import threaded
 from flowgraph.engines.c.compile import compiler
+from flowgraph.engines.c.fixed import CompiledIntegers
 from flowgraph.engines.c.harness import write_c, write_events
 from flowgraph.engines.c.library import Compiled, compiled
 from flowgraph.engines.c.step import SingleTicks
@@ -25,7 +26,9 @@ from flowgraph.engines.contract import (
     Player,
     real_leaves,
 )
-from flowgraph.engines.options import Meter, RunOptions
+from flowgraph.engines.fixed.engine import need_formats
+from flowgraph.engines.fixed.files import write_fixed
+from flowgraph.engines.options import KINDS, Meter, RunOptions
 from flowgraph.engines.stretches import joined
 from flowgraph.pipeline.optimise import COMPILED
 from flowgraph.pipeline.pipeline import Pipeline
@@ -58,6 +61,7 @@ class CEngine(PipelineEngine):
     """Generated C99, compiled by the system's C compiler; many runs go as many threads."""
 
     name = "c"
+    dtypes = KINDS
     passes = COMPILED
     takes_many = True
     writes = True
@@ -68,11 +72,15 @@ class CEngine(PipelineEngine):
     def prepare(
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
+        if dtype == "fixed":
+            return CompiledIntegers(need_formats(pipeline), patterns)
         return _Loaded(compiled(pipeline, np.dtype(dtype), patterns, passes))
 
     def stepper(
         self, pipeline: Pipeline, cells: list[Any], seed: int, dtype: str, passes: tuple[str, ...]
-    ) -> CellStepper:
+    ) -> CellStepper | None:
+        if dtype == "fixed":
+            return None
         every = range(1, 2 ** min(len(pipeline.inputs), 8))  # beyond some patterns, presence is data
         return SingleTicks(compiled(pipeline, np.dtype(dtype), every, passes), cells, seed_words(seed))
 
@@ -82,6 +90,8 @@ class CEngine(PipelineEngine):
     def write(
         self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
     ) -> Mapping[str, Path]:
+        if dtype == "fixed":
+            return write_fixed(pipeline, folder)
         return write_c(pipeline, folder, dtype, passes=passes)
 
     def write_events(self, pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: Path) -> int:

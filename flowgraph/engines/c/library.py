@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, load
+from flowgraph.engines.c.compile import FLAGS, LOOPS, load
 from flowgraph.engines.c.loop import loop_text
 from flowgraph.engines.c.source import every_pattern, generate
 from flowgraph.pipeline.optimise import optimise
@@ -23,6 +23,8 @@ from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
 _CHUNK_BYTES = 16 * 2**20
 _MOST_TICKS = 65536
+_LONG = 512
+"""Turns of a loop: more than the entries of a covariance, so particles."""
 Structs = list[np.ndarray]
 Room = list[np.ndarray | None]
 
@@ -126,7 +128,7 @@ class Compiled(Outputs):
         pipeline: what to play.
         real: float64 or float32.
         keys: the patterns of present inputs that come.
-        flags: of the compiler.
+        flags: of the compiler; those that suit the pipeline if left out.
         passes: of the optimiser.
 
     Raises:
@@ -138,7 +140,7 @@ class Compiled(Outputs):
         pipeline: Pipeline,
         real: Any,
         keys: Sequence[int],
-        flags: tuple[str, ...] = FLAGS,
+        flags: tuple[str, ...] | None = None,
         passes: tuple[str, ...] = (),
     ) -> None:
         every = every_pattern(pipeline) is not None
@@ -156,7 +158,7 @@ class Compiled(Outputs):
             f"{m}.c": self.source.source,
             "fg_loop.c": loop_text(pipeline, self.source),
         }
-        self._library = load(files, flags)
+        self._library = load(files, flags or (LOOPS if source.longest >= _LONG else FLAGS))
         self.play_ticks = self._library.fg_play
         self.play_ticks.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self.play_ticks.restype = None

@@ -161,3 +161,68 @@ def test_what_a_gate_refused_is_not_judged_twice():
     accepted = nis < 100.0
     (said,) = nis_remarks("position", judged(nis, accepted=accepted))
     assert said.startswith("refused: position: 10 measurements in a row")
+
+
+def drawn(seed: int, n: int = 400, m: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(n, m))
+
+
+def whitened(white: np.ndarray, *, scale: float = 2.0, accepted: np.ndarray | None = None) -> Series:
+    """Innovations whose residuals are so many of their own deviations; the covariance is no diagonal."""
+    n, m = white.shape
+    root = scale * (np.eye(m) + 0.3 * np.eye(m, k=-1))
+    return Series(
+        np.arange(n) * 100_000_000,
+        KalmanInnovation(
+            residual=white @ root.T,
+            covariance=np.tile(root @ root.T, (n, 1, 1)),
+            nis=(white**2).sum(axis=-1),
+            parts=np.full(n, float(m)),
+            accepted=np.ones(n, dtype=bool) if accepted is None else accepted,
+        ),
+    )
+
+
+def test_innovations_that_know_nothing_of_each_other_are_no_remark():
+    for seed in range(30):
+        for m in (1, 3, 6):
+            assert nis_remarks("position", whitened(drawn(seed, m=m))) == ()
+    assert nis_remarks("position", whitened(drawn(0, n=15))) == ()
+
+
+def test_innovations_that_are_alike_are_said_though_each_is_small():
+    """Each is as large as expected; over the whole run, and over a part of it."""
+    white = drawn(3)
+    for k in range(1, len(white)):
+        white[k] = 0.5 * white[k - 1] + np.sqrt(0.75) * white[k]
+    (said,) = nis_remarks("vicon", whitened(white))
+    assert said.startswith("warning: vicon: one innovation is like the next: 0.4")
+    assert nis_remarks("vicon", whitened(white), loose=True) == ()
+    part = drawn(3)
+    part[100:130] = np.sqrt(0.5) * part[100:130] + 1.1
+    (said,) = nis_remarks("", whitened(part))
+    assert said.startswith(
+        (
+            "warning: one innovation is like the next, from 9.",
+            "warning: one innovation is like the next, from 10",
+        )
+    )
+
+
+def test_innovations_that_lean_one_way_are_said():
+    white = drawn(5, m=6)
+    white[200:260] += 0.7
+    (said,) = nis_remarks("gnss", whitened(white))
+    assert said.startswith("warning: gnss: the mean of 40 innovations is not 0, from ")
+
+
+def test_a_gate_that_refuses_more_than_chance_does_is_said():
+    white = drawn(7)
+    limit = 16.27  # 99.9 % of three numbers
+    honest = (white**2).sum(axis=-1) < limit
+    assert nis_remarks("leica", whitened(white, accepted=honest)) == ()
+    white[::40] += 4.0
+    refused = (white**2).sum(axis=-1) < limit
+    (said,) = nis_remarks("leica", whitened(white, accepted=refused))
+    assert said.startswith("refused: leica: ")
+    assert f"{int((~refused).sum())} of 400 measurements; chance has 0.00" in said

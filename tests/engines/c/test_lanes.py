@@ -35,13 +35,13 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C co
 
 MS = 1_000_000
 APART = {
-    "ins_particle": "uint64",
-    "particle": "uint64",
-    "rbpf_indoor": "uint64",
+    "ins_particle": "cumulative_sum",
+    "particle": "cumulative_sum",
+    "rbpf_indoor": "argmax",
     "outdoor_eskf": "9 patterns",
     "rbpf_outdoor": "9 patterns",
 }
-"""Graphs whose runs go singly: those that draw, and those of many patterns of sources."""
+"""Graphs whose runs go singly: those that resample, and those of many patterns of sources."""
 
 QUICK = ("async_kalman", "complementary", "kalman", "roll_pitch")
 
@@ -189,3 +189,30 @@ def test_only_what_is_kept_is_written(built):
     np.testing.assert_allclose(
         batch["now"].place[1], simulate(built, data(1), engine="c", diverged="count")["now"].place, rtol=1e-12
     )
+
+
+@block
+def looked_up(a: Three, *, draw, xp) -> Three:
+    """Draws, and entries of a table and of what was computed, at places that the lanes do not share."""
+    table = xp.asarray(np.linspace(-1.0, 1.0, 11))
+    drawn = draw.normal("noise", (3,)) + draw.uniform("even", (3,))
+    place = xp.astype(xp.clip(10.0 * xp.abs(a.value), 0.0, 10.0), xp.int64)
+    return Three(value=drawn + xp.take(table, place) + xp.take(drawn, place % 3))
+
+
+@graph
+def drawing(a: Stream[Three]):
+    """Noise and look-ups."""
+    return {"out": looked_up(a)}
+
+
+def test_each_lane_draws_its_own_numbers_and_looks_up_its_own_places():
+    built = drawing.build()
+    inputs = [{"a": data(k)["a"]} for k in range(WIDTH + 1)]
+    seeds = [3, 1, 4, 1, 5]
+    subject = LoweredGraph(built, dtype="float64")
+    assert lanes_of(subject.pipeline, np.float64, subject.tape(inputs[0]).patterns, COMPILED) is not None
+    batch = many(built, inputs, seeds, engine="c")
+    for k, seed in enumerate(seeds):
+        compare(batch, k, simulate(built, inputs[k], engine="c", seed=seed), tolerance=1e-12)
+    assert (batch["out"].value[1] != batch["out"].value[0]).all()

@@ -9,6 +9,7 @@ from flowgraph.blocks.geometry.rotations import conjugate, multiply, to_rotation
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.graphs import rbpf_indoor
 from flowgraph.graphs.benches.thesis import SETTINGS, Noise, fly, thesis
+from tests.drawing.test_page import _Reader
 
 KEYS = {
     *("setting", "filter", "position_rmse_m", "attitude_rmse_deg", "thesis_metric_position"),
@@ -55,3 +56,35 @@ def test_our_filters_are_below_the_figures_of_the_thesis_and_reach_the_bound():
         for key in ("position_rmse_m", "attitude_rmse_deg"):
             assert 0.98 < np.mean([row[key] / row[f"bound_{key}"] for row in mine]) < 1.03, name
         assert 0.95 < np.mean([row["nees_mean"] / 9.0 for row in mine]) < 1.05, name
+
+
+@pytest.mark.slow
+def test_the_page_has_the_table_as_charts_and_the_filters_on_one_flight(tmp_path):
+    found = thesis(
+        flights=1, duration=1.0, settings="HHH,LLL", filters="ekf,eskf", smoothed="", engine="python"
+    )
+    assert list(found.figures) == ["thesis.png", "thesis.html"]
+    file = tmp_path / "thesis.html"
+    found.figures["thesis.html"](file)
+    page = _Reader(file.read_text())
+    position, *_, metric = page.data("charts")
+    assert position["x"]["names"] == ["HHH", "LLL"]
+    for bars in position["series"]:
+        mine = [row for row in found.rows if row["filter"] == bars["name"]]
+        assert bars["y"] == [row["position_rmse_m"] for row in mine]
+        assert bars["low"] == [row["position_rmse_low_m"] for row in mine]
+    assert [mark["y"] for mark in position["marks"]] == [
+        row["bound_position_rmse_m"] for row in found.rows if row["filter"] == "ekf"
+    ]
+    assert metric["y"]["log"] is True
+    assert metric["series"][-1]["y"] == [
+        row["thesis_attitude"] for row in found.rows if row["thesis_attitude"]
+    ]
+    runs = page.data("runs")
+    assert [run["title"] for run in runs] == ["ekf", "eskf"]
+    for run in runs:  # the flight of the first setting, the same that is in the table
+        (row,) = [r for r in found.rows if (r["filter"], r["setting"]) == (run["title"], "HHH")]
+        assert float(dict(run["figures"])["position_rmse_m"]) == pytest.approx(
+            row["position_rmse_m"], rel=1e-4
+        )
+    assert "<td" in file.read_text()

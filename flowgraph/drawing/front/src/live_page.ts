@@ -4,14 +4,14 @@ import uPlot from "uplot";
 import type { Shown } from "./diagram";
 import type { Graph, Part } from "./model";
 import { colour } from "./numbers";
-import { lines as linesOf, shortOf } from "./watch";
+import { lines as linesOf, ROOM, shortOf } from "./watch";
 
 const { Diagram, legend, tools, details, dom, given } = window.flowgraph;
 const { html } = dom;
 const KEPT = 1200, MOST = 6, HEIGHT = 140;
 
-type Message = { t: number; ticks: number; wires: Record<string, [number, (number | null)[]]> }
-  | { ended: true; ticks: number; blocks: Record<string, [number, number]> };
+type Message = { t: number; ticks: number; wires: Record<string, [number, (number | null)[]]>; facts: Record<string, string> }
+  | { ended: true; ticks: number; blocks: Record<string, [number, number]>; facts: Record<string, string> };
 
 const graph = given<Graph>("graph"), parts = given<Record<string, Part[]>>("parts");
 const main = document.querySelector("main")!, footer = document.querySelector("footer")!;
@@ -31,11 +31,22 @@ const values = (from: number, out: number): Shown | undefined => {
 };
 
 const sheet = html("div", { class: "sheet" });
-const diagram = new Diagram(graph, sheet, { down: true, labels: 122, values });
+const diagram = new Diagram(graph, sheet, { down: true, labels: ROOM, values });
 
 interface Trace { plot: uPlot; key: string; first: number; size: number }
 const traces: Trace[] = [];
 const scopes = html("div", { class: "scopes", tabindex: "0", role: "region", "aria-label": "Outputs over time" }, html("h3", {}, "Outputs"));
+
+/** What is told beside the wires: of a live run, what became of its events. */
+const facts = html("table", {}), told = html("section", { class: "figures facts" }, html("h3", {}, "Events and times"), facts);
+let shownFacts = "";
+function tell(found: Record<string, string>): void {
+  const words = JSON.stringify(found);
+  if (words === shownFacts) return;
+  shownFacts = words;
+  if (!told.isConnected) scopes.append(told);
+  facts.replaceChildren(html("tbody", {}, ...Object.entries(found).map(([name, value]) => html("tr", {}, html("th", { scope: "row" }, name), html("td", {}, value)))));
+}
 
 /** A plot for each small part of what the graph gives. */
 function plots(): void {
@@ -63,11 +74,18 @@ function plot(host: HTMLElement, size: number): uPlot {
   const series: uPlot.Series[] = [{}], paths = uPlot.paths.stepped!({ align: 1 }); // a value holds until the next
   for (let k = 0; k < size; k++) series.push({ stroke: () => colour(`clock-${k}`), width: 1.2, paths, points: { show: false } });
   const made = new uPlot({
-    width: Math.max(host.clientWidth, 300), height: HEIGHT, series, legend: { show: false }, scales: { x: { time: false } },
+    width: Math.max(host.clientWidth, 300), height: HEIGHT, series, legend: { show: false }, scales: { x: { time: false }, y: { range: (_, low, high) => span(low, high) } },
     axes: [{ ...axis, size: 26 }, { ...axis, size: 56, space: 26 }], cursor: { show: false },
   }, [[], ...Array.from({ length: size }, () => [])] as uPlot.AlignedData, host);
   new ResizeObserver(() => made.setSize({ width: Math.max(host.clientWidth, 120), height: HEIGHT })).observe(host);
   return made;
+}
+
+/** What a plot shows of values from `low` to `high`; of one that stays, something around it. */
+function span(low: number | null, high: number | null): [number, number] {
+  if (low === null || high === null) return [0, 1];
+  const room = 0.08 * (high - low) || 0.1 * Math.abs(low) || 1;
+  return [low - room, high + room];
 }
 
 function draw(): void {
@@ -83,6 +101,7 @@ function draw(): void {
 
 function take(message: Message): void {
   ticks = message.ticks;
+  if (Object.keys(message.facts).length) tell(message.facts);
   if ("ended" in message) {
     state.textContent = `ended at ${t.toFixed(3)} s, ${ticks} ticks`;
     main.dataset.ended = "";

@@ -56,3 +56,12 @@ export interface Run {
   title: string; graph: Graph; engine: string; ticks: number; end: number; figures: Pair[]; notes: string[];
   times: Packed[]; panels: Panel[]; watch: Watch | null; blocks: Record<string, [number, number]>; way: Way | null;
 }
+
+export interface Axis { label: string; log?: boolean; names?: string[] | null }
+export interface ChartSeries {
+  name: string; kind: "box" | "bar" | "dots" | "line" | "dash"; x: number[]; y: number[]; width?: number;
+  low?: number[] | null; high?: number[] | null; boxes?: number[][]; words?: string[]; runs?: (number | null)[];
+  dots?: { x: number; y: number; words: string; run: number | null }[];
+}
+export interface Mark { name: string; x?: number; y?: number; from?: number; to?: number }
+export interface Chart { title: string; words: string; x: Axis; y: Axis; series: ChartSeries[]; marks: Mark[] }

@@ -4,6 +4,8 @@ import type { Shown, Values } from "./diagram";
 import { unpack, type Part, type Run } from "./model";
 import { before, short } from "./numbers";
 
+const { textWidth } = window.flowgraph.dom;
+
 interface Wire { at: Float32Array; values: Float32Array; parts: Part[]; size: number }
 
 function partLine(part: Part, values: Float32Array): string {
@@ -20,10 +22,19 @@ export function lines(parts: Part[], values: Float32Array): string[] {
   return parts.map((part) => partLine(part, values.subarray(place, (place += part.size))));
 }
 
-/** The first numbers of a value, for a wire. */
+/** The room beside a wire for what it carries, in pixels. */
+export const ROOM = 122;
+
+/** The first numbers of a value, for a wire: as many and as exact as there is room for. */
 export function shortOf(parts: Part[], values: Float32Array): string {
-  const first = parts[0], some = Array.from(values.subarray(0, Math.min(first?.size ?? 0, 3)), (x) => short(x, 3));
-  return some.join(first?.way === "range" ? "…" : " ");
+  const first = parts[0], size = first?.size ?? 0, between = first?.way === "range" ? "…" : " ";
+  let words = "";
+  for (const [most, figures] of [[3, 3], [3, 2], [2, 3], [2, 2], [1, 3]]) {
+    const some = Array.from(values.subarray(0, Math.min(size, most)), (x) => short(x, figures));
+    words = some.join(between) + (most < Math.min(size, 3) ? " …" : "");
+    if (textWidth(words, "11px") <= ROOM - 6) break;
+  }
+  return words;
 }
 
 export class Watched {

@@ -34,6 +34,7 @@ _JOINED = {
     "logical_xor": "^",
     "bitwise_xor": "^",
 }
+_SHIFTS = {"bitwise_left_shift": "<<", "bitwise_right_shift": ">>"}
 _SIGNS = {"add": "+", "subtract": "-", "multiply": "*"}
 _EACH = (FUNCTIONS | {"floor", "ceil", "trunc"}) - {"remainder", "floor_divide", "pow"}
 
@@ -128,6 +129,8 @@ class LaneExpressions(Expressions):
             return self._size(dtype, a)
         if op in ("round", "floor", "ceil", "trunc") and dtype != "real":
             return a
+        if op == "float32_bits":
+            return self.each(op, self.helper("fg_float_bits"), dtype, node, args)
         if op == "sqrt":
             return f"fg_real_root({a})"
         if op in _EACH and dtype == "real":
@@ -137,6 +140,10 @@ class LaneExpressions(Expressions):
         if op == "sign" and dtype == "real":
             up, down = (f"((fg_mask)({a} {s} {self.splat('real', '0.0')}) & 1)" for s in "><")
             return self.pick(dtype, f"(fg_mask)({a} != {a})", a, self._turned(f"{up} - {down}", dtype))
+        shift = _SHIFTS.get(op)
+        if shift and node.args[1].op == "const" and 0 <= node.args[1].extra[0] < int(dtype.lstrip("uint")):
+            wide = TYPES[dtype if op == "bitwise_right_shift" else f"u{dtype.lstrip('u')}"]
+            return f"({TYPES[dtype]})(({wide}){a} {shift} {int(node.args[1].extra[0])})"
         if op in ("remainder", "floor_divide", "pow"):
             return self._quotient(op, dtype, node, args)
         raise no_lanes(f"{op} on {dtype}", origin)
@@ -166,6 +173,25 @@ class LaneExpressions(Expressions):
             )
 
         return f"{self.function(('each', call, dtype, kinds), op, make)}({', '.join(args)})"
+
+    def gathered(self, buffer: Buffer, place: str, at: str, kind: str, step: int, size: int) -> str:
+        """An element of a buffer that is another in each lane; `place` is where those begin, `at` which."""
+        alike = buffer.kind == "const"
+        self.helper("fg_clip")
+
+        def make(name: str) -> str:
+            table = ctype(buffer.dtype, self.real) if alike else TYPES[buffer.dtype]
+            return f"""static FG_INLINE {TYPES[buffer.dtype]} {name}(const {table} *table, fg_long at) {{
+    union {{ {TYPES[buffer.dtype]} all; {_element(buffer.dtype)} one[FG_LANES]; }} made;
+    for (int32_t l = 0; l < FG_LANES; l++)
+        made.one[l] = table[{step} * fg_clip(at[l], {size})]{"" if alike else "[l]"};
+    return made.all;
+}}
+"""
+
+        name = self.function(("gather", alike, buffer.dtype, step, size), "gather", make)
+        long = at if kind == "int64" else f"__builtin_convertvector({at}, fg_long)"
+        return f"{name}({place}, {long})"
 
     def _sum(self, op: str, dtype: str, args: Sequence[str]) -> str:
         """Whole numbers wrap around, as in NumPy, so they go through unsigned ones."""

@@ -17,8 +17,7 @@ from flowgraph.engines.c.source import every_pattern
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
-_FLAGS = tuple(f for f in FLAGS if not f.startswith("--param=max-completely-peeled"))
-"""Loops of vectors are worth writing out: a third faster."""
+_SEED = Cell("fg_seed", -1, -1, (2,), "uint32", np.zeros(2, np.uint32))
 
 
 class Lanes(Outputs):
@@ -37,7 +36,7 @@ class Lanes(Outputs):
     def __init__(self, pipeline: Pipeline, keys: Sequence[int], passes: tuple[str, ...]) -> None:
         source = generate_lanes(pipeline, keys, lambda program: optimise(program, passes))
         super().__init__(pipeline, np.float64, source)
-        self._library = load({"lanes.c": source.text}, _FLAGS)
+        self._library = load({f"{source.names.module}_lanes.c": source.text}, FLAGS)
         self._library.fg_play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 6]
         self._library.fg_play.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
@@ -47,7 +46,8 @@ class Lanes(Outputs):
             self._lanes(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)
         ]
         self._held = [c for r in pipeline.registers for c in r.cells]
-        self._cells = self._lanes(self._held, [n for r in names.registers for n in r])
+        cells = [n for r in names.registers for n in r]
+        self._cells = self._lanes([*self._held, _SEED], [*cells, "fg_seed"])
 
     def _lanes(self, leaves: Sequence[Leaf | Cell], names: Sequence[str]) -> np.dtype[Any]:
         """The struct that C lays out, as NumPy sees it: each number a lane for each run."""
@@ -87,12 +87,14 @@ class Lanes(Outputs):
             made.append(rows)
         return made
 
-    def state(self, cells: Sequence[Sequence[Any]]) -> np.ndarray:
-        """What the runs remember, with the cells of each; lanes without a run have the last one's."""
+    def state(self, cells: Sequence[Sequence[Any]], seeds: Sequence[np.ndarray]) -> np.ndarray:
+        """What the runs remember, with the cells and (2,) uint32 seed of each; lanes without a run have the
+        last one's."""
         memory = _aligned(1, np.dtype((np.void, self.size)))
         seen = memory.view(np.uint8)[: self._cells.itemsize].view(self._cells)
         for lane in range(WIDTH):
             run = cells[min(lane, len(cells) - 1)]
+            seen["fg_seed"][0, :, lane] = seeds[min(lane, len(cells) - 1)]
             for name, cell, value in zip(self._cells.names or (), self._held, run, strict=False):
                 if math.prod(cell.shape):
                     seen[name][0, :, lane] = _signed(np.asarray(value)).ravel()

@@ -22,7 +22,7 @@ def write_lane_macro(w: LaneWriter, m: Macro) -> None:
     Raises:
         NoLanesError: for one that has no form in lanes.
     """
-    made = {"matmul": _matmul, "cholesky": _cholesky, "solve": _solve, "reduce": _reduce}.get(m.kind)
+    made = _MACROS.get(m.kind)
     if made is None or (m.output.buffer.dtype != "real" and m.kind != "reduce"):
         raise no_lanes(m.kind, m.origin)
     made(w, m)
@@ -147,6 +147,48 @@ def _reduce(w: LaneWriter, m: Macro) -> None:
         w.depth -= 1
         w.line("}")
 
+
+def _random(w: LaneWriter, m: Macro) -> None:
+    draws, blocks = m.extra["draws"], m.output.buffer.size // 4
+    for needed in ("fg_philox", f"fg_one_{draws}"):
+        w.write.helper(needed)
+    name = w.write.function(
+        ("random", draws), draws, lambda name: RANDOM.replace("NAME", name).replace("KIND", draws)
+    )
+    seed = w.names(m.inputs[0].buffer)
+    w.line(f"{name}({w.names(m.output.buffer)}, {blocks}, UINT32_C({m.extra['hash']}), time, {seed});")
+
+
+_MACROS = {
+    "matmul": _matmul,
+    "cholesky": _cholesky,
+    "solve": _solve,
+    "reduce": _reduce,
+    "random": _random,
+}
+
+RANDOM = """\
+/* 4 n random numbers of a name (its hash) at a time, in each lane those of its own seed */
+static inline void NAME(fg_real *restrict out, int32_t n, uint32_t hash, int64_t time, const fg_uint *seed) {
+    const uint32_t low = (uint32_t)(uint64_t)time, high = (uint32_t)((uint64_t)time >> 32);
+    for (int32_t i = 0; i < n; i++) {
+        union { fg_real all; double one[FG_LANES]; } a, b, c, d;
+        FG_SIMD(omp simd)
+        for (int32_t l = 0; l < FG_LANES; l++) {
+            uint32_t even[2] = {(uint32_t)i, low}, odd[2] = {hash, high};
+            fg_philox(even, odd, seed[0][l], seed[1][l]);
+            a.one[l] = fg_one_KIND(even[0]);
+            b.one[l] = fg_one_KIND(even[1]);
+            c.one[l] = fg_one_KIND(odd[0]);
+            d.one[l] = fg_one_KIND(odd[1]);
+        }
+        out[i] = a.all;
+        out[n + i] = b.all;
+        out[2 * n + i] = c.all;
+        out[3 * n + i] = d.all;
+    }
+}
+"""
 
 CHOLESKY = """\
 /* lower factor in place, of the lower triangle; NaN in lanes where that is not positive definite */

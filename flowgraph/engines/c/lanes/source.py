@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from flowgraph.engines.c.entry import reaction_name
+from flowgraph.engines.c.file import File
 from flowgraph.engines.c.helpers import helper_text
 from flowgraph.engines.c.lanes.expressions import TYPES, LaneExpressions, no_lanes
 from flowgraph.engines.c.lanes.writer import LaneWriter
 from flowgraph.engines.c.names import Names, given, made
-from flowgraph.engines.c.nodes import Node, Tape
+from flowgraph.engines.c.nodes import Node
 from flowgraph.engines.c.preamble import MACROS, REFUSED
-from flowgraph.engines.c.source import MOST_PATTERNS, File, every_pattern
+from flowgraph.engines.c.source import MOST_PATTERNS, every_pattern
 from flowgraph.engines.c.statements import Writer
-from flowgraph.engines.c.values import Value
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.replay import Case
@@ -69,9 +69,6 @@ class _LaneFile(File):
     def turn(self, name: str, case: Case, sizes: tuple[int, int]) -> str:
         raise no_lanes("a replay", self.pipeline.name)
 
-    def _drawn(self, tape: Tape, site: Any, seed: Value) -> Value:
-        raise no_lanes("random numbers", site.name)
-
     def told(self, writer: Writer, flags: list[tuple[int, Node]]) -> list[str]:
         assert isinstance(writer, LaneWriter)
         lines = ["    fg_mask made = fg_mask_of(0);"]
@@ -121,7 +118,7 @@ class _LaneFile(File):
         lines += [_member(n, c) for n, c in zip(self._cell_names(), cells, strict=True)]
         sizes = [(d, k, n) for d, slots in sorted(self.pool.items()) for k, n in enumerate(slots)]
         lines += [f"    {TYPES[d]} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
-        return "\n".join([*lines, "    fg_mask fg_end;", f"}} {m}_state;", ""])
+        return "\n".join([*lines, "    fg_uint seed[2];", f"}} {m}_state;", ""])
 
     def _loop(self) -> str:
         """What plays a stretch of ticks, and writes what is wanted of each lane to its own place."""

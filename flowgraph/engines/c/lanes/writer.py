@@ -61,8 +61,15 @@ class LaneWriter(Writer):
         return self.promoted(item.node)
 
     def expression(self, node: Node) -> str:
-        if node.op == "search" or (node.op == "gather" and self.write.varies(node.args[0])):
-            raise no_lanes("a look-up", node.origin)
+        if node.op == "search":
+            raise no_lanes("a search", node.origin)
+        if node.op == "gather" and self.write.varies(node.args[0]):
+            buffer, offset, strides, step, size = node.extra
+            if buffer.dtype == "bool":
+                raise no_lanes("a look-up of truths", node.origin)
+            place = f"{'&' if buffer.bare else ''}{self.names(buffer)} + {self.index(offset, strides)}"
+            (at,) = node.args
+            return self.write.gathered(buffer, place, self.ref(at), at.dtype, step, size)
         if node.op in ("load", "iota", "gather") or not self.write.varies(node):
             return super().expression(node)
         return self.write.write(node, [self.promoted(a) for a in node.args])

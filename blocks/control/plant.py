@@ -1,0 +1,44 @@
+"""A plant: what a controller moves. Its state goes by a model of motion, over the time since it last fired.
+
+Between two ticks it is told what it was last told: the input is held, as a digital controller's is. A
+`LinearModel` is exact then, and `runge_kutta` of `statespace` makes a model of a differential equation. The
+output of a tick is where the inputs before it led, so a loop closes through a plant without a delay of its
+own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Array, block
+from flowgraph.blocks.statespace import Motion
+from flowgraph.language.moore import Moore, moore
+
+__all__ = ["plant"]
+
+
+@block
+def moved(state, command, *, model, start, dt, xp):  # type: ignore[no-untyped-def]
+    """x' = model.carry(x, command, dt); x where it fires first."""
+    new = model.carry(state[None, :], command, None, dt, xp)[0]
+    return new, new
+
+
+@moved.init
+def _(command: Any, *, model: Motion, start: Any) -> Array:
+    return np.asarray(start, dtype=float)
+
+
+def plant(model: Motion, *, start: Any, command: Any, at: object, name: str = "plant") -> Moore:
+    """A plant in a loop: read its state at `output`, and `feed` it what it is told.
+
+    Args:
+        model: how it moves, without noise: `MotionModel`, `LinearModel`, or another of `statespace`.
+        start: the state (size) where it fires first.
+        command: what it is told before it is told anything; says the type of its input too.
+        at: when its state is read, a stream or clock.
+        name: of the node.
+    """
+    return moore(moved, init=command, at=at, name=name, model=model, start=np.asarray(start, dtype=float))

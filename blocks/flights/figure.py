@@ -1,0 +1,126 @@
+"""`sim:figure`: the smooth figure, flown in a graph: world and sensors are blocks, a flight is a run of them.
+
+The motion is that of `sim`; its waves and all noise are drawn in the graph, by the counter-based generator,
+from the seed. So this flight is the same whether it is written down first, as `load` does by a run of the
+graph, or made tick by tick in front of a filter, as a study of many seeds does; see `Experiment`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from flowgraph import Flight, Graph, Stream, Tick, graph, latest, simulate, ticks
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.sensors import bias_at_start, drift, read_imu, read_pose, true_state
+from flowgraph.blocks.signals import FigureShape, Vector
+from flowgraph.blocks.world import AT_REST, figure_motion, figure_shape
+from flowgraph.data.experiment import Experiment
+from flowgraph.data.inputs import clocks_of
+from flowgraph.data.notes import note
+from flowgraph.engines.registry import find_engine
+from flowgraph.errors import MissingDependencyError
+
+__all__ = ["figure", "load_figure"]
+
+
+@graph
+def figure(
+    start: Stream[Tick], imu: Stream[Tick], vicon: Stream[Tick], *, rate: float, noise: ImuNoise,
+    gyro_bias: float, accelerometer_bias: float, position_noise: float, attitude_noise: float,
+):  # fmt: skip
+    """A body on a smooth figure, with an inertial unit at `rate` Hz and a motion capture.
+
+    `start` ticks once, at 0: there the figure and the constant biases are drawn. There is a truth at every
+    reading of either.
+    """
+    shape = latest(figure_shape(at=start), init=_NO_SHAPE, name="shape")
+    motion = figure_motion(shape, at=imu | vicon)
+    biases = {}
+    for part, deviation, walk in (
+        ("gyro", gyro_bias, noise.gyro_bias),
+        ("accelerometer", accelerometer_bias, noise.accelerometer_bias),
+    ):
+        first = bias_at_start(at=start, deviation=deviation, name=f"{part}_start", draws=f"{part}_start")
+        held = latest(first, init=Vector(vector=np.zeros(3)), name=f"{part}_bias")
+        biases[part] = drift(held, at=imu, walk=walk, name=f"{part}_drift", draws=f"{part}_drift")
+    reading = read_imu(
+        motion, biases["gyro"], biases["accelerometer"], at=imu, gyro=noise.gyro * math.sqrt(rate),
+        accelerometer=noise.accelerometer * math.sqrt(rate), draws="imu",
+    )  # fmt: skip
+    pose = read_pose(
+        motion, at=vicon, position_noise=position_noise, attitude_noise=attitude_noise, draws="vicon"
+    )
+    now = {n: latest(b, init=Vector(vector=np.zeros(3)), name=f"{n}_now") for n, b in biases.items()}
+    truth = true_state(motion, now["gyro"], now["accelerometer"])
+    return {"imu": reading, "vicon": pose, "truth": truth}
+
+
+_NO_SHAPE = FigureShape(
+    **{n: np.zeros((3, 3)) for n in ("sizes", "frequencies", "phases", "origin")},
+    **{n: np.zeros(2) for n in ("yaw_phases", "yaw_origin")},
+)
+
+
+def load_figure(*, seed: int, settings: Mapping[str, float]) -> Flight:
+    """Make a flight by a run of the graph, in C where there is a compiler, else block by block.
+
+    Args:
+        seed: of the figure and of all noise.
+        settings: those of `simulated.DEFAULTS`.
+
+    Returns:
+        A `Flight` as of `sim`, with its `experiment`.
+    """
+    world = _world(tuple(settings.items()))
+    told = world.settings
+    flown = simulate(_built(tuple(settings.items())), world.ticks, engine=_engine(), seed=seed)
+    return Flight(
+        name=f"sim-figure-{seed}",
+        streams={name: flown[name] for name in ("imu", "vicon")},
+        truth=flown["truth"],
+        info={
+            "imu_noise": told["noise"],
+            "position_noise": told["position_noise"],
+            "attitude_noise": told["attitude_noise"],
+            "imu_period_ns": round(1e9 / settings["imu.rate"]),
+            "vicon_period_ns": round(1e9 / settings["vicon.rate"]),
+            "still": AT_REST,
+        },
+        notes=(note("info", f"simulated with seed {seed}: 1 s at rest, then a smooth figure"),),
+        experiment=world,
+    )
+
+
+@lru_cache(maxsize=8)
+def _world(settings: tuple[tuple[str, float], ...]) -> Experiment:
+    s = dict(settings)
+    end, period = round(s["duration"] * 1e9), round(1e9 / s["imu.rate"])
+    clocks = ("start", end + 1), ("imu", period), ("vicon", round(1e9 / s["vicon.rate"]))
+    told: dict[str, Any] = {
+        "rate": 1e9 / period,
+        "noise": ImuNoise(s["gyro.noise"], s["accelerometer.noise"], s["gyro.walk"], s["accelerometer.walk"]),
+        "gyro_bias": s["gyro.bias"],
+        "accelerometer_bias": s["accelerometer.bias"],
+        "position_noise": s["position.noise"],
+        "attitude_noise": s["attitude.noise"],
+    }
+    return Experiment(figure, {n: ticks(each, until=end + 1, name=n) for n, each in clocks}, told)
+
+
+@lru_cache(maxsize=8)
+def _built(settings: tuple[tuple[str, float], ...]) -> Graph:
+    world = _world(settings)
+    return figure.build(**clocks_of(world.ticks), **world.settings)
+
+
+def _engine() -> str:
+    try:
+        find_engine("c").need()
+    except MissingDependencyError:
+        return "python"
+    return "c"

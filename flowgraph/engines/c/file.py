@@ -1,0 +1,401 @@
+"""One file of C in the making: a reaction for each pattern of present inputs, and what they need.
+
+Each pattern of present inputs has a reaction of its own, in which everything that depends on presence is
+folded away; or there is one reaction in which presence is data.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flowgraph.engines.c.entry import entry_text, reaction_name
+from flowgraph.engines.c.expand import Expander
+from flowgraph.engines.c.expressions import Expressions
+from flowgraph.engines.c.header import header
+from flowgraph.engines.c.helpers import helper_text
+from flowgraph.engines.c.names import Names, given, made, names_of
+from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
+from flowgraph.engines.c.preamble import MACROS, REFUSED
+from flowgraph.engines.c.schedule import schedule
+from flowgraph.engines.c.statements import Writer
+from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.engines.c.values import Value, row_major
+from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline, kind_of
+from flowgraph.pipeline.program import Program, specialise
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.replay import Case
+from flowgraph.recorder.trace import Instruction
+
+_LOCAL_BYTES = 512
+_BYTES = {"bool": 1, "int32": 4, "uint32": 4, "int64": 8, "uint64": 8}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Generated C.
+
+    Args:
+        names: of everything in it.
+        real: "double" or "float".
+        header, source: the texts of the two files.
+        patterns: the keys that have a reaction of their own, or None where one serves all.
+        presence: by key, or None for all, the outputs that are present for certain and those that can be, a
+            bit each.
+        longest: turns of the longest loop.
+    """
+
+    names: Names
+    real: str
+    header: str
+    source: str
+    patterns: tuple[int, ...] | None
+    presence: Mapping[int | None, tuple[int, int]]
+    longest: int
+
+    def presence_of(self, key: int) -> tuple[int, int]:
+        """The outputs that are present for certain in a tick of this pattern, and those that can be."""
+        return self.presence.get(None if self.patterns is None else key, (0, 0))
+
+
+class File:
+    """One file of C: reactions, and what they need.
+
+    Args:
+        pipeline, real, patterns, tidy, checked: as for `generate`.
+    """
+
+    writer: type[Writer] = Writer
+
+    def __init__(
+        self, pipeline: Pipeline, real: str, patterns: list[int] | None, tidy: Any, checked: bool
+    ) -> None:
+        self.pipeline, self.real, self.patterns, self.tidy = pipeline, real, patterns, tidy
+        self.checked = checked
+        self.names = names_of(pipeline)
+        self.expressions = Expressions(real, self.turn)
+        self.constants: dict[Any, tuple[str, Buffer]] = {}
+        self.pool: dict[str, list[int]] = {}
+        self.presence: dict[int | None, tuple[int, int]] = {}
+        self.longest = 0
+
+    def source(self) -> Source:
+        m = self.names.module
+        reactions = [self.reaction(key) for key in ([None] if self.patterns is None else self.patterns)]
+        reset = self._reset()
+        parts = [
+            f'#include "{m}.h"',
+            "",
+            "#include <math.h>",
+            "#include <stddef.h>",
+            "",
+            REFUSED,
+            MACROS,
+            helper_text(self.expressions.helpers, self.real),
+            *(self._constant(name, b) for name, b in self.constants.values()),
+            *(text for _, text in self.expressions.functions.values()),
+            reset,
+            *reactions,
+            entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
+        ]
+        text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
+        head = partial(header, self.pipeline, self.names, self.real, self.patterns, self.pool)
+        said = hashlib.sha256(f"{head('')}{text}".encode()).hexdigest()[:8]
+        return Source(
+            self.names,
+            self.real,
+            head(said),
+            text,
+            None if self.patterns is None else tuple(self.patterns),
+            self.presence,
+            self.longest,
+        )
+
+    # -- one reaction --------------------------------------------------------------------------------
+
+    def reaction(self, key: int | None) -> str:
+        """The function of one pattern of present inputs."""
+        pipeline, tape = self.pipeline, Tape()
+        program = self.tidy(specialise(pipeline, key))
+        values = self._given(tape, program, key)
+        expander = Expander(tape, values)
+        sites = {site.value: site for site in pipeline.random}
+        places = self._in_place(program)
+        for i in program.instructions:
+            if i.out in sites:
+                values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
+            elif i.out in places:
+                values[i.out] = expander.replayed(i, places[i.out])
+            else:
+                expander.tell(program.elements, i)
+                expander.play(i)
+        roots: list[Any] = []
+        flags: list[tuple[int, Node]] = []
+        for k, ((flag, leaves), port) in enumerate(zip(program.outputs, pipeline.outputs, strict=True)):
+            if flag is None:
+                continue
+            for name, leaf, n in zip(self.names.output_leaves[k], port.leaves, leaves, strict=True):
+                buffer = self._place(f"{made(self.names)[k]}->{name}", "output", leaf)
+                roots += self._write(expander, buffer, values[n])
+            present = expander.form.elements(values[flag]).item()
+            flags.append((k, present))
+            roots.append(present)
+        cells = [c for r in pipeline.registers for c in r.cells]
+        for cell, n, name in zip(cells, program.writes, self._cell_names(), strict=True):
+            if n in places and places[n].name == f"s->{name}":
+                roots += places[n].writers
+            elif n != cell.read:
+                roots += self._write(expander, self.state[name], values[n])
+        plan = schedule(tape, roots)
+        work, local = self._memory(plan.span)
+        writer = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
+        body = writer.body()
+        self.longest = max(self.longest, *(math.prod(space) for _, space in writer.groups), 0)
+        must = may = 0
+        for k, present in flags:
+            must, may = must | (writer.ref(present) == "true") << k, may | 1 << k
+        self.presence[key] = must, may
+        body += self.told(writer, flags)
+        all_text = re.sub(r"/\*.*?\*/", "", "\n".join(body))
+        unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
+        head = [f"    (void){n};" for n in unused]
+        return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
+
+    def told(self, writer: Writer, flags: list[tuple[int, Node]]) -> list[str]:
+        """The end of a reaction: which outputs are there."""
+        lines = ["    uint64_t made = 0;"]
+        for k, present in flags:
+            bit = f"made |= UINT64_C({1 << k}); /* {comment(self.pipeline.outputs[k].name)} */"
+            text = writer.ref(present)
+            lines.append(f"    {bit}" if text == "true" else f"    if ({text}) {bit}")
+        return [*lines, "    return made;"]
+
+    def _in_place(self, program: Program) -> dict[int, Buffer]:
+        """The replays that can make a register anew where it lies, with its memory: nobody else reads it."""
+        readers = Counter(a for i in program.instructions for a in i.args)
+        readers.update(n for _, leaves in program.outputs for n in leaves)
+        readers.update(program.writes)
+        cells = (c for r in self.pipeline.registers for c in r.cells)
+        made = {i.out: i.args[0] for i in program.instructions if i.op == "replay"}
+        return {
+            n: replace(self._place(f"s->{name}", "work", cell), writers=[])
+            for cell, n, name in zip(cells, program.writes, self._cell_names(), strict=True)
+            if made.get(n) == cell.read and readers[cell.read] == 1 and program.writes.count(n) == 1
+        }
+
+    def turn(self, name: str, case: Case, sizes: tuple[int, int]) -> str:
+        """The function of one case of a replay: what comes of the history before and of a row."""
+        before, row = (Spec((n,), "real") for n in sizes)
+        specs = {0: before, 1: row, **{n: Spec(a.shape, kind_of(a)) for n, a in case.constants.items()}}
+        specs |= {t.out: t.spec for t in case.turns}
+        steps = tuple(Instruction(t.op, t.args, t.attrs, t.out, t.spec, t.line) for t in case.turns)
+        program = self.tidy(Program(case.constants, steps, ((None, ()),), (case.result,), specs, (0,)))
+        tape, values = Tape(), {}
+        for n, text, spec in ((0, "before", before), (1, "row", row)):
+            values[n] = _whole(Buffer(text, "real", spec.shape[0], "input"), spec.shape)
+        for n, array in program.constants.items():
+            values[n] = self._known(np.asarray(array), program.specs[n].dtype)
+        expander = Expander(tape, values)
+        for i in program.instructions:
+            expander.tell(program.elements, i)
+            expander.play(i)
+        after = Buffer("after", "real", sizes[0], "output")
+        plan = schedule(tape, self._write(expander, after, values[program.writes[0]]))
+        work, local = self._memory(plan.span, "turn_")
+        body = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
+        unused = [n for n in ("s", "before", "row") if not _names_it("\n".join(body), n)]
+        real, state = self.real, f"{self.names.module}_state"
+        head = (
+            f"static FG_APART void {name}({state} *s, const {real} *before, const {real} *row, {real} *after)"
+        )
+        return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
+
+    def signature(self, key: int | None) -> str:
+        return f"static uint64_t {reaction_name(key)}({self._typed(key)})"
+
+    def _parameters(self, key: int | None) -> list[str]:
+        inputs = [n for k, n in enumerate(given(self.names)) if key is None or key >> k & 1]
+        return ["s", "time", *(["present"] if key is None else []), *inputs, *made(self.names)]
+
+    def _typed(self, key: int | None) -> str:
+        m = self.names.module
+        parts = [f"{m}_state *restrict s", "int64_t time"] + (["uint64_t present"] if key is None else [])
+        parts += [
+            f"const {m}_{n} *restrict in_{n}"
+            for k, n in enumerate(self.names.inputs)
+            if key is None or key >> k & 1
+        ]
+        return ", ".join(parts + [f"{m}_{n} *restrict out_{n}" for n in self.names.outputs])
+
+    def _cell_names(self) -> list[str]:
+        return [n for names in self.names.registers for n in names]
+
+    def _place(self, name: str, kind: str, leaf: Leaf | Cell) -> Buffer:
+        return Buffer(name, leaf.dtype, math.prod(leaf.shape), kind, bare=leaf.shape == ())
+
+    def _given(self, tape: Tape, program: Program, key: int | None) -> dict[int, Value]:
+        """The values that no instruction makes."""
+        pipeline = self.pipeline
+        values: dict[int, Value] = {}
+
+        def scalar(n: int, node: Node) -> None:
+            values[n] = Value(Spec((), node.dtype), np.array(node, object).reshape(()))
+
+        scalar(pipeline.time, tape.given("time", "int64"))
+        seed = Buffer("s->seed", "uint32", 2, "state")
+        values[pipeline.seed] = Value(Spec((2,), "uint32"), view=View(seed, (2,), 0, (1,)))
+        self.state: dict[str, Buffer] = {}
+        for cell, name in zip(
+            (c for r in pipeline.registers for c in r.cells), self._cell_names(), strict=True
+        ):
+            self.state[name] = self._place(f"s->{name}", "state", cell)
+            values[cell.read] = _whole(self.state[name], cell.shape)
+        for k, port in enumerate(pipeline.inputs):
+            here = key is None or key >> k & 1
+            if key is None:
+                scalar(port.present, tape.given(f"((present >> {k}) & 1u)", "bool"))
+            for name, leaf in zip(self.names.input_leaves[k], port.leaves, strict=True):
+                if here:
+                    values[leaf.value] = _whole(
+                        self._place(f"{given(self.names)[k]}->{name}", "input", leaf), leaf.shape
+                    )
+                else:
+                    zeros = np.zeros(leaf.shape, _HOST.get(leaf.dtype, leaf.dtype))
+                    values[leaf.value] = self._known(zeros, leaf.dtype)
+        for n, array in program.constants.items():
+            if n not in values:
+                values[n] = self._known(np.asarray(array), program.specs[n].dtype)
+        return values
+
+    def _known(self, array: np.ndarray, dtype: str) -> Value:
+        key = (array.tobytes(), array.shape, dtype)
+        if key not in self.constants:
+            name = f"k{len(self.constants)}"
+            self.constants[key] = name, Buffer(name, dtype, array.size, "const", data=array)
+        return _whole(self.constants[key][1], array.shape)
+
+    def _drawn(self, tape: Tape, site: Any, seed: Value) -> Value:
+        blocks = -(-math.prod(site.shape) // 4)
+        assert seed.view is not None
+        view = View(tape.work("real", 4 * blocks), site.shape, 0, row_major(site.shape))
+        if blocks:
+            tape.origin = f"random numbers {site.name}"
+            tape.macro("random", [seed.view], view, draws=site.kind, hash=site.hash)
+        return Value(Spec(site.shape, "real"), view=view)
+
+    def _write(self, expander: Expander, buffer: Buffer, value: Value) -> list[Store]:
+        before = len(buffer.writers)
+        view = View(buffer, value.shape, 0, row_major(value.shape))
+        expander.form.write(view, expander.form.elements(value))
+        return [
+            w
+            for w in buffer.writers[before:]
+            if isinstance(w, Store)
+            and not (w.node.op == "load" and w.node.extra == (buffer, w.offset, w.strides))
+        ]
+
+    # -- memory --------------------------------------------------------------------------------------
+
+    def _name(self, buffer: Buffer) -> str:
+        if buffer.kind == "const" and not buffer.name:
+            assert buffer.data is not None
+            value = self._known(buffer.data, buffer.dtype)
+            assert value.view is not None
+            buffer.name = value.view.buffer.name
+        if buffer.kind == "const":
+            self.used_constants.add(buffer.name)
+        return buffer.name
+
+    @property
+    def used_constants(self) -> set[str]:
+        used: set[str] = self.__dict__.setdefault("_used", set())
+        return used
+
+    def _memory(
+        self, spans: dict[Buffer, tuple[int, int]], whose: str = ""
+    ) -> tuple[dict[Buffer, str], list[str]]:
+        """Names of the work buffers: small ones on the stack, large ones in the state, which are reused by
+        all reactions, or by all that `whose` says."""
+        names: dict[Buffer, str] = {}
+        local: list[str] = []
+        ends: dict[str, list[int]] = {}
+        pool: dict[str, list[int]] = {}
+        for buffer, (first, last) in sorted(spans.items(), key=lambda item: item[1][0]):
+            if buffer.name:
+                names[buffer] = buffer.name
+                continue
+            size = _BYTES.get(buffer.dtype, 8 if self.real == "double" else 4) * buffer.size
+            if size <= _LOCAL_BYTES:
+                names[buffer] = f"w{len(local)}"
+                kept = self.expressions.ctype(buffer.dtype)
+                local.append(f"    {kept} w{len(local)}[{max(buffer.size, 1)}];")
+                continue
+            kind = whose + buffer.dtype
+            slots, busy = pool.setdefault(kind, []), ends.setdefault(kind, [])
+            free = [k for k in range(len(slots)) if busy[k] < first]
+            fits = [k for k in free if slots[k] >= buffer.size] or free
+            k = min(fits, key=lambda j: abs(slots[j] - buffer.size), default=len(slots))
+            if k == len(slots):
+                slots.append(0)
+                busy.append(0)
+            slots[k], busy[k] = max(slots[k], buffer.size), last
+            names[buffer] = f"s->fg_work_{kind}_{k}"
+        for kind, slots in pool.items():
+            mine = self.pool.setdefault(kind, [])
+            mine += [0] * (len(slots) - len(mine))
+            for k, size in enumerate(slots):
+                mine[k] = max(mine[k], size)
+        return names, local
+
+    # -- the rest of the file ------------------------------------------------------------------------
+
+    def _constant(self, name: str, buffer: Buffer) -> str | None:
+        if name not in self.used_constants or buffer.data is None:
+            return None
+        numbers = [number(v, buffer.dtype, self.real) for v in buffer.data.ravel().tolist()] or ["0"]
+        rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
+        type_ = ctype(buffer.dtype, self.real)
+        return (
+            f"static const {type_} {name}[{max(buffer.size, 1)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
+        )
+
+    def _reset(self) -> str:
+        m = self.names.module
+        lines = [f"void {m}_reset({m}_state *s, uint64_t seed)", "{"]
+        for name, cell in zip(
+            self._cell_names(), (c for r in self.pipeline.registers for c in r.cells), strict=True
+        ):
+            reset = np.asarray(cell.reset)
+            flat = [number(v, cell.dtype, self.real) for v in reset.ravel().tolist()]
+            if cell.shape == ():
+                lines.append(f"    s->{name} = {flat[0]};")
+            elif flat and len(set(flat)) == 1:
+                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {flat[0]};")
+            elif len(flat) <= 16:
+                lines += [f"    s->{name}[{i}] = {v};" for i, v in enumerate(flat)]
+            elif flat:
+                buffer = self._known(reset, cell.dtype).view
+                assert buffer is not None
+                start = self._name(buffer.buffer)
+                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {start}[i];")
+        lines += ["    s->seed[0] = (uint32_t)seed;", "    s->seed[1] = (uint32_t)(seed >> 32);", "}", ""]
+        return "\n".join(lines)
+
+
+def _names_it(text: str, name: str) -> bool:
+    return re.search(rf"(?<![A-Za-z0-9_>.]){re.escape(name)}\b", text) is not None
+
+
+def _whole(buffer: Buffer, shape: tuple[int, ...]) -> Value:
+    return Value(Spec(shape, buffer.dtype), view=View(buffer, shape, 0, row_major(shape)))
+
+
+_HOST = {"real": np.float64, "bool": np.bool_}

@@ -1,0 +1,254 @@
+"""How large numbers get: the sizes of all values of a pipeline, over recorded flights in floating point.
+
+What is rounding alone has no size of its own in floating point, such as an element of a product that is zero
+by symmetry. In words it takes the rounding of what is around it, which is larger; so the error of each value
+is bounded to the first order from the formats of its arguments, and a format fits that too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.tape import Tape
+from flowgraph.engines.fixed.shifts import MOVES, Site, moved
+from flowgraph.engines.reference import Interpreter
+from flowgraph.pipeline.format_files import structure_of
+from flowgraph.pipeline.formats import FREE, Formats, fraction_for, fraction_of_constant
+from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.program import needed
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.trace import Instruction
+
+_TOGETHER = 128
+"""Ticks whose values are looked at in one go."""
+
+_HELD = 16.0
+"""Errors of a register, in units of its last place: it gathers those of many ticks."""
+
+_MOST = 256.0
+"""Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
+
+
+_CORRELATION = 2.0**-7
+"""The smallest that an element of a matrix is taken for, beside its diagonal."""
+
+
+class Sizes:
+    """The largest size of each element of each real value, so far.
+
+    Args:
+        pipeline: in plain instructions; it is played in float64.
+
+    Attributes:
+        largest: by value number, an array that broadcasts to the value's shape.
+        untaken: the same of elements that no selection took, whatever they were.
+        absent: the inputs and registers that were NaN at some time.
+        ticks: how many were played.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.pipeline = pipeline
+        self.largest: dict[int, np.ndarray] = {}
+        self.untaken: dict[int, np.ndarray] = {}
+        self.absent: set[int] = set()
+        self.ticks = 0
+        self._cells = [c for r in pipeline.registers for c in r.cells]
+        self._real = {n for n, s in pipeline.specs.items() if s.dtype == "real"} - set(pipeline.constants)
+        self._shared = {
+            n for part in _parts(pipeline) for n, axis in zip(part.shape, part.axes, strict=False) if axis
+        }
+        self._waiting: dict[int, list[Any]] = {}
+        self._idle: dict[int, list[Any]] = {}
+        self._fits: dict[int, np.ndarray] = {}
+
+    def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
+        """Play one flight, and widen the sizes by what occurs in it.
+
+        Args:
+            pipeline: of the same structure, with the numbers of this flight.
+            tape: its ticks.
+            cells: register cells at the start.
+            seed: (2,) uint32.
+        """
+        player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
+        rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
+        for cell, value in zip(self._cells, cells, strict=True):
+            self._see(cell.read, cell.dtype, value)
+        with np.errstate(all="ignore"):
+            for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
+                values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
+                program, env = player.values(time, key, values)
+                player.cells = [env[n] for n in program.writes]
+                given = [
+                    leaf.value
+                    for k, port in enumerate(pipeline.inputs)
+                    if key >> k & 1
+                    for leaf in port.leaves
+                    if leaf.dtype == "real"
+                ]
+                taken = needed(program, env)
+                for n in (*given, *(i.out for i in program.instructions if i.spec.dtype == "real")):
+                    mask = taken.get(n, False)
+                    if mask is not True:
+                        self._idle.setdefault(n, []).append(env[n])
+                    self._see(n, "real", env[n] if mask is True else np.where(mask, env[n], 0.0))
+                self.absent |= {n for n in given if np.isnan(env[n]).any()}
+                for cell, n in zip(self._cells, program.writes, strict=True):
+                    self._see(cell.read, cell.dtype, env[n])
+                self.ticks += 1
+                if self.ticks % _TOGETHER == 0:
+                    self._look()
+        self._look()
+
+    def _see(self, value: int, dtype: str, x: Any) -> None:
+        if dtype == "real":
+            self._waiting.setdefault(value, []).append(x)
+
+    def _look(self) -> None:
+        """Widen the sizes by the values that wait."""
+        held = {c.read for c in self._cells}
+        for waiting, sizes in ((self._waiting, self.largest), (self._idle, self.untaken)):
+            for value, rows in waiting.items():
+                size = np.abs(np.asarray(rows, dtype=np.float64))
+                axes = tuple(a for a, n in enumerate(size.shape[1:]) if n in self._shared)
+                finite = np.isfinite(size)
+                if not finite.all():
+                    if value in held and np.isnan(size).any():
+                        self.absent.add(value)
+                    size = np.where(finite, size, 0.0)
+                size = size.max(axis=0).max(axis=axes, keepdims=True, initial=0.0)
+                sizes[value] = np.maximum(sizes.get(value, 0.0), size)
+            waiting.clear()
+
+    def _size(self, value: int) -> np.ndarray | None:
+        """Of what was taken; where an element never was, of what it would have been."""
+        found = self.largest.get(value)
+        if found is None or value not in self.untaken:
+            return found
+        return np.asarray(np.where(found > 0.0, found, self.untaken[value]))
+
+    def widen(self, value: int, marks: np.ndarray, factor: float) -> None:
+        """Make the elements that are marked larger than what the last formats were made for, by so much."""
+        axes = tuple(a for a, n in enumerate(marks.shape) if n in self._shared)
+        wider = marks.any(axis=axes, keepdims=True)
+        size = np.maximum(self.largest[value], np.where(wider, self._fits[value] * factor, 0.0))
+        self.largest[value] = size
+
+    def formats(self, width: int, margin: float = 2.0) -> Formats:
+        """Formats in which numbers fit that are `margin` times as large as any that was seen."""
+        fractions: dict[int, np.ndarray] = {}
+        errors = _Errors(self.pipeline, width)
+        for n, size in self.largest.items():
+            if n in errors.given:
+                wide = margin * _beside_its_diagonal(size)
+                fractions[n] = fraction_for(wide, width)
+                errors.start(n, fractions[n], wide)
+        for i in self.pipeline.instructions:
+            found = self._size(i.out)
+            if found is None:
+                continue
+            rounding = errors.of(i)
+            axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
+            rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
+            size = margin * _beside_its_diagonal(np.maximum(found, rounding))
+            fractions[i.out] = fraction_for(size, width)
+            errors.add(i, fractions[i.out], size, rounding)
+        self._fits = {n: np.ldexp(0.5, width - 1 - f.astype(int)) / margin for n, f in fractions.items()}
+        return Formats(width, fractions, margin, frozenset(self.absent), structure_of(self.pipeline))
+
+
+def _beside_its_diagonal(size: np.ndarray) -> np.ndarray:
+    """The elements of a square matrix, no smaller than a small part of what its diagonal would let them be.
+
+    In a covariance P_ij^2 <= P_ii P_jj, and where it is near zero it is what is left of larger numbers. Finer
+    formats than this only tell the rounding of the diagonal.
+    """
+    if size.ndim < 2 or size.shape[-1] != size.shape[-2] or size.shape[-1] < 2:
+        return size
+    root = np.sqrt(np.diagonal(size, axis1=-2, axis2=-1))
+    return np.asarray(np.maximum(size, _CORRELATION * root[..., :, None] * root[..., None, :]))
+
+
+class _Errors:
+    """Sizes and rounding errors of values, in the order in which they are computed.
+
+    Attributes:
+        given: the inputs and registers.
+    """
+
+    def __init__(self, pipeline: Pipeline, width: int) -> None:
+        self._specs: Mapping[int, Spec] = pipeline.specs
+        self._width = width
+        self._size: dict[int, np.ndarray] = {}
+        self._error: dict[int, np.ndarray] = {}
+        self._fraction: dict[int, np.ndarray] = {}
+        self._registers = {c.read for r in pipeline.registers for c in r.cells}
+        self.given = self._registers | {x.value for port in pipeline.inputs for x in port.leaves}
+        for n, array in pipeline.constants.items():
+            if array.dtype.kind == "f":
+                fraction = fraction_of_constant(array, width)
+                self._keep(n, fraction, np.abs(array), 0.0)
+
+    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any) -> None:
+        shape = self._specs[n].shape
+        last = np.where(fraction == FREE, 0.0, np.ldexp(1.0, -np.minimum(fraction, 1000).astype(int)))
+        self._fraction[n] = np.broadcast_to(fraction, shape)
+        self._size[n] = np.broadcast_to(size, shape)
+        self._error[n] = np.broadcast_to(np.minimum(error + last, _MOST * last), shape)
+
+    def start(self, n: int, fraction: np.ndarray, size: np.ndarray) -> None:
+        """A value that is given."""
+        last = np.ldexp(1.0, -fraction.astype(int))
+        self._keep(n, fraction, size, (_HELD - 1.0) * last if n in self._registers else 0.0)
+
+    def add(self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray) -> None:
+        """A value that was computed; one that is only moved keeps its formats."""
+        if i.op in MOVES and all(a in self._fraction for a in i.args[:1]):
+            given = [self._fraction.get(a) for a in i.args]
+            if all(f is not None for f in given) or i.op == "take":
+                fraction = moved(i, given)
+                self._keep(i.out, fraction, size, error - np.ldexp(1.0, -np.minimum(fraction, 1000)))
+                return
+        self._keep(i.out, fraction, size, error)
+
+    def of(self, i: Instruction) -> np.ndarray:
+        """The error of a result from those of its arguments, of its shape; zero where none is known."""
+        rule = _GROWTH.get(i.op)
+        if i.op in MOVES and i.op != "take":
+            rule = _moved
+        if rule is None or any(a not in self._size for a in i.args):
+            return np.zeros(i.spec.shape)
+        site = Site(i, [], None, self._specs, self._width)
+        sizes, errors = [self._size[a] for a in i.args], [self._error[a] for a in i.args]
+        return np.asarray(np.broadcast_to(rule(site, sizes, errors), i.spec.shape))
+
+
+def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
+    op = s.i.op
+    return errors[0] if op in ("negative", "abs", "positive", "materialise") else moved(s.i, list(errors))
+
+
+def _product(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
+    return np.asarray(sizes[0] * errors[1] + errors[0] * sizes[1])
+
+
+_GROWTH: dict[str, Callable[[Site, list[np.ndarray], list[np.ndarray]], Any]] = {
+    "add": lambda s, x, e: e[0] + e[1],
+    "subtract": lambda s, x, e: e[0] + e[1],
+    "multiply": _product,
+    "matmul": lambda s, x, e: x[0] @ e[1] + e[0] @ x[1],
+    "vecdot": lambda s, x, e: (x[0] * e[1] + e[0] * x[1]).sum(axis=-1),
+    "sum": lambda s, x, e: np.sum(
+        e[0],
+        axis=tuple(s.i.attrs["axis"]) if isinstance(s.i.attrs.get("axis"), list) else s.i.attrs.get("axis"),
+        keepdims=bool(s.i.attrs.get("keepdims", False)),
+    ),
+}
+
+
+def _parts(pipeline: Pipeline) -> Iterable[Any]:
+    yield from (c for r in pipeline.registers for c in r.cells)
+    yield from (x for port in (*pipeline.inputs, *pipeline.outputs) for x in port.leaves)

@@ -1,0 +1,106 @@
+"""C text in the making: lines, loops over shapes, small tables of shifts, and where each value lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from flowgraph.engines.fixed.engine import Bound, Integers
+from flowgraph.engines.fixed.shifts import slim
+from flowgraph.recorder.ops import Spec
+
+_WRAP = {"uint32": "(int64_t)(uint32_t)({})", "int32": "(int64_t)(int32_t)({})", "bool": "(({}) != 0)"}
+
+
+class Text:
+    """C text of the ticks of a pipeline in its formats."""
+
+    def __init__(self, player: Integers) -> None:
+        self.player, self.pipeline = player, player.pipeline
+        self.place: dict[int, int] = {}
+        self.size = 0
+        self.tables: dict[bytes, str] = {}
+        self.lines: list[str] = []
+        self.indent = 1
+        self.lost: dict[int, int] = {}
+        self.bound: Bound
+
+    # -- text ----------------------------------------------------------------------------------------
+
+    def put(self, line: str) -> None:
+        self.lines.append("  " * self.indent + line)
+
+    def at(self, value: int, shape: Sequence[int]) -> int:
+        """Where a value lies in `w`."""
+        if value not in self.place:
+            self.place[value] = self.size
+            self.size += max(math.prod(shape), 1)
+        return self.place[value]
+
+    def table(self, numbers: np.ndarray, name: str = "s", kind: str = "int16_t") -> str:
+        row = np.ascontiguousarray(numbers, dtype=np.int64).ravel()
+        key = kind.encode() + row.tobytes()
+        if key not in self.tables:
+            self.tables[key] = (
+                f"static const {kind} {name}{len(self.tables)}[] = {{{', '.join(map(str, row))}}};"
+            )
+        return self.tables[key].split()[3].split("[")[0]
+
+    def shift(self, by: np.ndarray, index: Sequence[str]) -> str:
+        """A shift at an index of the loops around: a number, or an element of a table."""
+        by = slim(np.asarray(by))
+        if by.size == 1:
+            return str(int(by.ravel()[0]))
+        return f"{self.table(by)}[{flat(by.shape, index)}]"
+
+    @contextmanager
+    def loops(self, shape: Sequence[int]) -> Iterator[list[str]]:
+        """Nested loops over a shape; gives the names of their indices."""
+        names = [f"i{self.indent}_{n}" for n in range(len(shape))]
+        opened = 0
+        for name, size in zip(names, shape, strict=True):
+            if size != 1:
+                self.put(f"for (int {name} = 0; {name} < {size}; ++{name}) {{")
+                self.indent += 1
+                opened += 1
+        yield [n if size != 1 else "0" for n, size in zip(names, shape, strict=True)]
+        for _ in range(opened):
+            self.indent -= 1
+            self.put("}")
+
+    def word(self, value: int, index: Sequence[str]) -> str:
+        """The element of a value at an index of a shape that it broadcasts to."""
+        shape = self.shape(value)
+        return f"w[{plus(self.at(value, shape), flat(shape, index[len(index) - len(shape) :]))}]"
+
+    def shape(self, value: int) -> tuple[int, ...]:
+        return self.bound.program.specs[value].shape
+
+    def fitted(self, place: str, text: str) -> str:
+        """The statement that puts a result into its place, cut to a word where it does not fit."""
+        return f"{place} = FX_FIT({text}, {place[2:-1]});"
+
+    def counter(self, value: int) -> int:
+        """The number of a value's counter of lost words."""
+        return self.lost.setdefault(value, len(self.lost))
+
+    def wrapped(self, text: str, spec: Spec) -> str:
+        return _WRAP.get(spec.dtype, "(int64_t)({})").format(text)
+
+
+def plus(base: int, rest: str) -> str:
+    return str(base) if rest == "0" else rest if base == 0 else f"{base} + {rest}"
+
+
+def flat(shape: Sequence[int], index: Sequence[str]) -> str:
+    """The place of an element in an array laid out row by row; axes of one stay at 0."""
+    parts = []
+    stride = 1
+    for size, x in zip(reversed(shape), reversed(index), strict=True):
+        if size != 1 and x != "0":
+            parts.append(x if stride == 1 else f"{stride} * ({x})" if "+" in x else f"{stride} * {x}")
+        stride *= size
+    return " + ".join(reversed(parts)) or "0"

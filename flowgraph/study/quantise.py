@@ -1,0 +1,344 @@
+"""Number formats for a graph: found on some flights, widened until nothing saturates, judged on others.
+
+The sizes of all values are taken from flights in floating point and widened by a margin. Each width of words
+is then tried in integers, on the flights of the sizes first: what saturates there is rounding that floating
+point does not have, and its format is widened. The flights that were held out judge: against the same filter
+in float64, in the terms of the filter. The search goes down from the width that was given while the bounds
+hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.result import Result
+from flowgraph.data.series import Series
+from flowgraph.engines.c.fixed import CompiledIntegers
+from flowgraph.engines.contract import Outcome
+from flowgraph.engines.fixed.counts import KINDS, Counts, names_of
+from flowgraph.engines.fixed.ranges import Sizes
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.simulate import simulate
+from flowgraph.engines.subject import LoweredGraph
+from flowgraph.errors import DeclarationError, LoweringError, UnknownNameError
+from flowgraph.language.graph import Graph
+from flowgraph.pipeline.format_files import structure_of
+from flowgraph.pipeline.formats import NARROWEST, Formats
+from flowgraph.pipeline.lowering import lower
+from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.plain import plain
+from flowgraph.recorder.random import seed_words
+from flowgraph.types import unflatten
+
+POSITION, ATTITUDE = "position_difference_rms_m", "attitude_difference_rms_deg"
+RELATIVE, DECISIONS = "estimate_difference_relative", "decisions_differing"
+FIGURES = (POSITION, ATTITUDE, RELATIVE, DECISIONS)
+"""What a bound may be of."""
+
+MARGIN = 2.0
+"""The sizes that occurred times this fit their formats, if nobody says otherwise."""
+
+_ROUNDS = 10
+_WIDER = 4.0
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A graph made ready for a flight, and what it is fed; `estimate` names its output that is judged."""
+
+    graph: Graph
+    inputs: Inputs
+    estimate: str
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Quantised:
+    """Formats, and what they are worth.
+
+    Args:
+        formats: of the narrowest words that keep the bounds.
+        figures: of the flights that were held out, the worst of each, with saturations and the other counts.
+        tried: the figures of each width, widest first.
+        notes: what was widened, a sentence each.
+    """
+
+    formats: Formats
+    figures: Mapping[str, Any]
+    tried: tuple[Mapping[str, Any], ...]
+    notes: tuple[str, ...]
+    pipeline: Pipeline
+
+    def values(self) -> list[dict[str, Any]]:
+        """For a person: each value with its line, bits, and the fractions of its elements."""
+        names = names_of(self.pipeline)
+        return [
+            {
+                "value": n,
+                "name": names.get(n, f"v{n}"),
+                "bits": self.formats.width,
+                "fraction": [int(np.min(f)), int(np.max(f))],
+            }
+            for n, f in sorted(self.formats.fractions.items())
+        ]
+
+
+def quantise(
+    flights: Sequence[Flown],
+    held_out: Sequence[Flown],
+    *,
+    width: int = 32,
+    bounds: Mapping[str, float],
+    margin: float = MARGIN,
+    least: int = NARROWEST,
+    say: Say = lambda words: None,
+) -> Quantised:
+    """The narrowest words, of `width` bits at most, in which a graph keeps the bounds.
+
+    Args:
+        flights: on which formats are found; one is a trap, for another flies elsewhere.
+        held_out: on which they are judged.
+        width: bits of a word at most.
+        bounds: figures of `FIGURES`, and the most that each may be.
+        margin: the sizes that occurred times this fit.
+        least: bits below which nothing is tried.
+        say: told what is going on.
+
+    Raises:
+        LoweringError: where the graph does not keep the bounds even at `width`, naming the place; or has no
+            form in fixed point.
+        DeclarationError, UnknownNameError: for flights or bounds that do not fit.
+    """
+    for name in bounds:
+        if name not in FIGURES:
+            raise UnknownNameError("bound", name, FIGURES, path="--bound")
+    if not flights or not held_out:
+        raise DeclarationError(
+            "formats are found on some flights and judged on others",
+            path="quantise",
+            expected="one flight at least of each",
+            got=f"{len(flights)} and {len(held_out)} held out",
+            fix="write --seeds 4 --held-out-seeds 3",
+        )
+    search = _Search(flights, held_out, margin, say)
+    tried: list[Mapping[str, Any]] = []
+    best: tuple[Formats, Mapping[str, Any]] | None = None
+    bits, step = width, 2
+    while bits >= least:
+        formats, figures = search.at(bits)
+        holds = not figures["saturations"] and all(figures[k] <= v for k, v in bounds.items())
+        tried.append({**figures, "holds": holds})
+        say(f"{bits} bits: {'holds' if holds else 'does not hold'}, " + _said(figures))
+        if holds:
+            best = formats, figures
+            bits -= step
+        elif best is None:
+            raise search.refusal(bits, figures, bounds)
+        elif step == 2:
+            bits, step = bits + 1, least + width  # the one between, and then no more
+            if bits >= best[0].width:
+                break
+        else:
+            break
+    assert best is not None
+    return Quantised(best[0], best[1], tuple(tried), tuple(search.notes), search.pipeline)
+
+
+def _said(figures: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v:.3g}" for k, v in figures.items() if k != "bits")
+
+
+class _Search:
+    def __init__(self, flights: Sequence[Flown], held_out: Sequence[Flown], margin: float, say: Say) -> None:
+        self._flights = [_Ready(f) for f in flights]
+        self._held = [_Ready(f) for f in held_out]
+        self._margin, self._say = margin, say
+        self.pipeline = self._flights[0].pipeline
+        self.notes: list[str] = []
+        self._worst = Counts()
+        first = structure_of(self.pipeline)
+        for one in (*self._flights, *self._held):
+            if structure_of(one.pipeline) != first:
+                raise DeclarationError(
+                    "these flights make different filters of the graph",
+                    path=one.flown.graph.name,
+                    expected="one structure, with the same settings and streams",
+                    got="another",
+                    fix="quantise them one by one",
+                )
+        self.sizes = Sizes(self.pipeline)
+        for n, one in enumerate(self._flights):
+            say(f"sizes of flight {n + 1} of {len(self._flights)}: {len(one.tape.time)} ticks")
+            self.sizes.play(one.pipeline, one.tape, one.start.cells, one.seed)
+
+    def at(self, bits: int) -> tuple[Formats, dict[str, Any]]:
+        """Formats of so many bits, and their figures on the flights that were held out."""
+        for _ in range(_ROUNDS):
+            formats = self.sizes.formats(bits, self._margin)
+            player = self._player(formats, self._flights)
+            if not self._widened(player, self._flights, "the flights of the sizes", bits):
+                break
+        for _ in range(_ROUNDS):
+            formats = self.sizes.formats(bits, self._margin)
+            player = self._player(formats, self._held)
+            figures = self._judge(formats, player)
+            if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
+                break
+        return formats, figures
+
+    def _player(self, formats: Formats, flights: Sequence[_Ready]) -> CompiledIntegers:
+        patterns = sorted({key for one in (*self._flights, *self._held) for key in one.tape.patterns})
+        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns)
+
+    def _widened(self, player: CompiledIntegers, flights: Sequence[_Ready], where: str, bits: int) -> bool:
+        counts = Counts()
+        for one in flights:
+            counts.join(one.play(player))
+        return self._widen(counts, where, bits)
+
+    def _widen(self, counts: Counts, where: str, bits: int) -> bool:
+        """Widen the formats of what saturated; tells whether anything did."""
+        for value, marks in counts.cut.items():
+            self.sizes.widen(value, marks, _WIDER)
+        if counts.cut:
+            names = names_of(self.pipeline)
+            some = ", ".join(names[v] for v in list(counts.cut)[:3])
+            self.notes.append(f"{len(counts.cut)} values widened at {bits} bits, after {where}: {some}")
+            self._say(self.notes[-1])
+        return bool(counts.cut)
+
+    def _judge(self, formats: Formats, player: CompiledIntegers) -> dict[str, Any]:
+        self._worst = Counts()
+        found: dict[str, Any] = {"bits": formats.width, **dict.fromkeys(KINDS, 0)}
+        for one in self._held:
+            counts = one.play(player)
+            self._worst.join(counts)
+            for name, figure in differences(one.reference, one.result(player), one.flown.estimate).items():
+                found[name] = max(found.get(name, 0), figure)
+        found |= {kind: self._worst.total(kind) for kind in KINDS}
+        return found
+
+    def refusal(self, bits: int, figures: Mapping[str, Any], bounds: Mapping[str, float]) -> LoweringError:
+        """Why the graph is not trusted at so many bits, with the place."""
+        broken = {k: v for k, v in bounds.items() if not figures[k] <= v}
+        kind = next((k for k in ("saturations", "divisions_by_zero") if self._worst.total(k)), None)
+        named = self._worst.first(self.pipeline, kind) if kind else self._coarsest(bits)
+        place = f"; most {kind} in {named}" if kind else f"; coarsest beside its size: {named}"
+        return LoweringError(
+            f"this graph cannot be trusted at {bits} bits",
+            path=named,
+            expected=", ".join(f"{k} <= {v:g}" for k, v in broken.items()) or "no saturation",
+            got=_said(figures) + place,
+            fix="allow more bits (--width), a larger bound, or write the place so that its numbers are nearer"
+            " to one another",
+        )
+
+    def _coarsest(self, bits: int) -> str:
+        """The register whose elements differ most in size: its words are the first to be too short."""
+        names = names_of(self.pipeline)
+        spread: dict[int, float] = {}
+        for register in self.pipeline.registers:
+            for c in register.cells:
+                size = self.sizes.largest.get(c.read)
+                if size is not None and (size > 0.0).any():
+                    spread[c.read] = float(size.max() / size[size > 0.0].min())
+        return names[max(spread, key=lambda n: spread[n])] if spread else self.pipeline.name
+
+
+class _Ready:
+    """A flight as ticks, with what the filter makes of it in float64."""
+
+    def __init__(self, flown: Flown) -> None:
+        self.flown = flown
+        subject = LoweredGraph(flown.graph, dtype="fixed")
+        if lower(flown.graph).host:
+            raise LoweringError(
+                "a graph with blocks on the host has no formats",
+                path=flown.graph.name,
+                expected="a graph that lowers whole",
+                got=", ".join(stage.path for stage in lower(flown.graph).host),
+                fix="quantise the graph without them",
+            )
+        self.pipeline = plain(subject.pipeline)
+        self.start = subject.start(RunOptions(seed=flown.seed))
+        self.tape = subject.tape(flown.inputs, self.start.last)
+        self.seed = seed_words(flown.seed)
+        self._subject = subject
+        self._reference: Result | None = None
+        self._outcome: Outcome | None = None
+
+    @property
+    def reference(self) -> Result:
+        """In float64."""
+        if self._reference is None:
+            self._reference = simulate(
+                self.flown.graph, self.flown.inputs, engine="reference", seed=self.flown.seed
+            )
+        return self._reference
+
+    def play(self, player: CompiledIntegers) -> Counts:
+        """Fly in integers; gives what was counted."""
+        self._outcome = player.play(self.tape, self.start.cells, self.seed, None)
+        return player.counts
+
+    def result(self, player: CompiledIntegers) -> dict[str, Series]:
+        """The outputs of the last flight."""
+        assert self._outcome is not None
+        return {
+            port.name: Series(times, unflatten(type_, iter(leaves)), type=type_, name=port.name)
+            for port, type_, (times, leaves) in zip(
+                self.pipeline.outputs, self._subject.types, self._outcome.outputs, strict=True
+            )
+        }
+
+
+def differences(reference: Result, found: Mapping[str, Series], estimate: str) -> dict[str, float]:
+    """How two runs of one filter differ, by the figures of `FIGURES` that it has.
+
+    A decision is an event of an output in which a truth value or an integer differs, or that only one has.
+    The relative difference is the root mean square of a leaf's, divided by that of the leaf: the worst.
+    """
+    differing = 0
+    for name, ours in found.items():
+        theirs = reference.series[name]
+        common, a, b = np.intersect1d(ours.time, theirs.time, return_indices=True)
+        differing += len(ours.time) + len(theirs.time) - 2 * len(common)
+        differs = np.zeros(len(common), bool)
+        for leaf, x in ours.leaves.items():
+            if x.dtype.kind != "f":
+                unequal = x[a] != theirs.leaves[leaf][b]
+                differs |= unequal.reshape(len(common), -1).any(axis=1)
+        differing += int(differs.sum())
+    figures: dict[str, float] = {DECISIONS: differing}
+    ours, theirs = found[estimate], reference.series[estimate]
+    _, a, b = np.intersect1d(ours.time, theirs.time, return_indices=True)
+    worst = 0.0
+    for leaf, x in ours.leaves.items():
+        if x.dtype.kind != "f" or leaf.endswith("covariance"):
+            continue
+        p, q = x[a].reshape(len(a), -1), theirs.leaves[leaf][b].reshape(len(a), -1)
+        if leaf == "position":
+            figures[POSITION] = _rms(p - q)
+        if leaf == "attitude" and p.shape[-1] == 4:
+            figures[ATTITUDE] = float(np.degrees(np.sqrt(np.mean(_turned(p, q) ** 2))))
+        size = _rms(q)
+        worst = max(worst, _rms(p - q) / size if size else float(_rms(p - q) > 0.0))
+    return figures | {RELATIVE: worst}
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(x * x, axis=-1)))) if x.size else 0.0
+
+
+def _turned(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """The angles between quaternions, in rad; those of the words need not be of unit length."""
+    p, q = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (p, q))
+    p = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0.0, -p, p)
+    return np.asarray(4.0 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=-1) / 2.0, 0.0, 1.0)))

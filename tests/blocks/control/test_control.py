@@ -1,0 +1,183 @@
+"""Plants, controllers and loops, against what they come to when they are worked out elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+from flowgraph import DeclarationError, Scalar, Stream, Tick, graph, simulate, ticks
+from flowgraph.blocks.control import (
+    late,
+    limited,
+    pid,
+    pid_action,
+    plant,
+    quadrotor,
+    quadrotor_motion,
+    regulator,
+    state_feedback,
+    transfer,
+)
+from flowgraph.blocks.geometry.rotations import geodesic_angle
+from flowgraph.blocks.kalman import LinearModel
+from flowgraph.blocks.signals import FlightCommand
+from tests.support import MS, all_engines, both_quick, scalars
+
+GAIN, INTEGRAL, DERIVATIVE, FILTER = 10.0, 6.0, 2.0, 0.05
+
+
+@graph
+def continuous(clock: Stream[Tick], step: Stream[Scalar]):
+    """A PID loop round 1 / ((s + 0.5) (2 s + 1)), in continuous time."""
+    loop = pid_action(GAIN, INTEGRAL, DERIVATIVE, filter=FILTER).then(transfer([1.0], [2.0, 2.0, 0.5]))
+    closed = loop.fed_back()
+    body = plant(closed.model, start=np.zeros(len(closed.A)), command=0.0, at=clock)
+    body.feed(step)
+    return body.output.map(lambda x: (closed.C @ x)[0])
+
+
+@pytest.mark.parametrize("period", ["10ms", "130ms"])
+def test_a_pid_loop_in_continuous_time_is_exact_however_seldom_it_is_looked_at(period: str) -> None:
+    clock = ticks(period, until="5s")
+    given = {"clock": clock, "step": scalars([0], [1.0])}
+    found = both_quick(continuous.build(), given).output.value
+    # the closed loop as one transfer function, and its response by the roots of that
+    numerator = np.polyadd(np.polymul([GAIN, INTEGRAL], [FILTER, 1.0]), [DERIVATIVE, 0.0, 0.0])
+    open_loop = np.polymul([FILTER, 1.0, 0.0], [2.0, 2.0, 0.5])
+    r, p, k = scipy.signal.residue(numerator, np.polymul(np.polyadd(open_loop, numerator), [1.0, 0.0]))
+    assert not len(k)
+    want = (r[:, None] * np.exp(p[:, None] * clock.time * 1e-9)).sum(0).real
+    np.testing.assert_allclose(found, want, atol=1e-9)
+    assert np.ptp(found) > 0.9
+
+
+@graph
+def sampled(clock: Stream[Tick], *, lag: int, low: float, high: float):
+    """A sampled PID in front of 1 / (s (s + 1)), whose output comes late."""
+    system = transfer([1.0], [1.0, 1.0, 0.0])
+    body = plant(system.model, start=np.zeros(2), command=0.0, at=clock)
+    y = body.output.map(lambda x: (system.C @ x)[0])
+    told = pid(
+        1.0 - late(y, lag, 0.0), gain=8.0, integral=2.0, derivative=3.0, filter=0.02, low=low, high=high
+    )
+    body.feed(told)
+    return {"y": y, "u": told}
+
+
+@pytest.mark.parametrize(("lag", "low", "high"), [(0, -np.inf, np.inf), (3, -np.inf, np.inf), (0, -1.5, 1.5)])
+def test_a_sampled_pid_does_in_every_engine_what_its_equations_say(lag: int, low: float, high: float) -> None:
+    h, n = 0.01, 150
+    result = all_engines(sampled.build(lag=lag, low=low, high=high), {"clock": ticks("10ms", until="1.5s")})
+    A, B = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0])
+    both = scipy.linalg.expm(h * np.block([[A, B[:, None]], [np.zeros((1, 3))]]))
+    x, u, i, before, slope, ys, us = np.zeros(2), 0.0, 0.0, 0.0, 0.0, [], []
+    for k in range(n):
+        if k:
+            x = both[:2, :2] @ x + both[:2, 2] * u
+        ys.append(x[1])
+        e = 1.0 - (ys[k - lag] if k >= lag else 0.0)
+        if k:
+            slope = (0.02 * slope + e - before) / (0.02 + h)
+        grown = i + (2.0 * before * h if k else 0.0)
+        free = 8.0 * e + grown + 3.0 * slope
+        u = min(max(free, low), high)
+        if (free - u) * (grown - i) <= 0.0:
+            i = grown
+        before = e
+        us.append(u)
+    np.testing.assert_allclose(result["y"].value, ys, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result["u"].value, us, rtol=1e-9, atol=1e-9)
+    if high < 10.0:
+        assert max(us) == high
+
+
+CART = np.array([[0.0, 1.0], [0.0, -0.1]]), np.array([[0.0], [2.0]])
+
+
+def test_a_regulator_makes_its_cost_least() -> None:
+    A, B = CART
+    Q, R = np.diag([3.0, 0.5]), np.array([[0.2]])
+    K = regulator(A, B, Q, R)
+
+    def cost(K: np.ndarray) -> float:
+        closed = A - B @ K
+        P = scipy.linalg.solve_continuous_lyapunov(closed.T, -(Q + K.T @ R @ K))
+        return float(np.trace(P))
+
+    least = cost(K)
+    for d in ([0.02, 0.0], [-0.02, 0.0], [0.0, 0.02], [0.0, -0.02]):
+        assert cost(K + np.array([d])) > least
+    fine = regulator(A, B, Q * 1e-4, R * 1e-4, period=1e-4)
+    np.testing.assert_allclose(fine, K, rtol=1e-3)
+
+
+@graph
+def regulated(clock: Stream[Tick], *, gains):
+    body = plant(LinearModel(*CART, np.zeros(2)), start=[1.0, 0.0], command=np.zeros(1), at=clock)
+    target = body.output.map(lambda x: 0.0 * x)
+    body.feed(limited(state_feedback(body.output, target, gains=gains), low=-1.0, high=1.0))
+    return body.output
+
+
+def test_state_feedback_within_limits_brings_a_cart_home_in_every_engine() -> None:
+    A, B = CART
+    K = regulator(A, B, np.eye(2), np.eye(1) * 0.1, period=0.05)
+    found = all_engines(regulated.build(gains=K), {"clock": ticks("50ms", until="6s")}).output.value
+    both = scipy.linalg.expm(0.05 * np.block([[A, B], [np.zeros((1, 3))]]))
+    x, limit = np.array([1.0, 0.0]), 0
+    for k in range(len(found)):
+        np.testing.assert_allclose(found[k], x, atol=1e-9)
+        u = np.clip(-K @ x, -1.0, 1.0)
+        limit += abs(u[0]) == 1.0
+        x = both[:2, :2] @ x + both[:2, 2:] @ u
+    assert limit > 0, "or the limit was not tried"
+    assert np.abs(found[-1]).max() < 0.01
+
+
+@graph
+def turning(clock: Stream[Tick], command: Stream[FlightCommand]):
+    body = quadrotor(at=clock, position=(0.0, 0.0, 2.0), lag=0.05)
+    body.feed(command)
+    return quadrotor_motion(body.output)
+
+
+def test_a_quadrotor_moves_as_its_equations_say() -> None:
+    """Against an integration of the same equations with rotation matrices, by another rule."""
+    time = np.array([0, 400]) * MS
+    told = FlightCommand(thrust=np.array([11.0, 8.0]), rate=np.array([[0.5, -0.3, 0.2], [-0.4, 0.6, 0.1]]))
+    given = {"clock": ticks("5ms", until="1s"), "command": (time, told)}
+    found = simulate(turning.build(), given, engine="reference").output
+    from scipy.integrate import solve_ivp  # the judge
+
+    def slope(t: float, x: np.ndarray, u: int) -> np.ndarray:
+        v, R, w, f = x[3:6], x[6:15].reshape(3, 3), x[15:18], x[18]
+        skew = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+        rates = (told.rate[u] - w) / 0.05, [(told.thrust[u] - f) / 0.05]
+        return np.concatenate([v, R @ [0.0, 0.0, f] - [0.0, 0.0, 9.81], (R @ skew).ravel(), *rates])
+
+    x = np.concatenate([[0.0, 0.0, 2.0], np.zeros(3), np.eye(3).ravel(), np.zeros(3), [9.81]])
+    for u, (begin, end) in enumerate(((0.0, 0.4), (0.4, 0.995))):
+        x = solve_ivp(slope, (begin, end), x, args=(u,), rtol=1e-11, atol=1e-11).y[:, -1]
+    np.testing.assert_allclose(found["position"][-1], x[:3], atol=1e-6)
+    np.testing.assert_allclose(found["velocity"][-1], x[3:6], atol=1e-5)
+    np.testing.assert_allclose(found["rate"][-1], x[15:18], atol=1e-7)
+    q = scipy.spatial.transform.Rotation.from_matrix(x[6:15].reshape(3, 3)).as_quat()[[3, 0, 1, 2]]
+    assert geodesic_angle(found["attitude"][-1], q) < 1e-4
+
+
+def test_systems_that_are_none_are_refused() -> None:
+    with pytest.raises(DeclarationError, match="no system"):
+        transfer([1.0, 0.0], [1.0])
+    with pytest.raises(DeclarationError, match="no state in it"):
+        transfer([1.0, 0.0], [1.0, 1.0]).fed_back()
+    with pytest.raises(DeclarationError, match="no linear quadratic regulator"):
+        regulator(np.eye(2), [[1.0], [0.0]], np.eye(2), np.eye(1))
+
+    @graph
+    def wrong(x: Stream[Scalar]):
+        return late(x, -1, 0.0)
+
+    with pytest.raises(DeclarationError, match="no number of ticks"):
+        wrong.build()

@@ -1,0 +1,147 @@
+"""Number formats that are found: the narrowest words that keep the bounds on other flights, or a refusal."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowgraph import (
+    DeclarationError,
+    LoweringError,
+    Scalar,
+    Stream,
+    UnknownNameError,
+    block,
+    boolean,
+    graph,
+    simulate,
+)
+from flowgraph.cli import app
+from flowgraph.pipeline.format_files import load_formats
+from flowgraph.study.quantise import DECISIONS, RELATIVE, Flown, differences, quantise
+
+MS = 1_000_000
+
+
+Flag = Annotated[Any, boolean()]
+
+
+@block
+def above(y: Scalar) -> Flag:
+    """A decision."""
+    return y > 0.3
+
+
+@block
+def curve(x: Scalar, *, xp) -> Scalar:
+    """A smooth function."""
+    return xp.sin(x) / (1.5 + xp.cos(3.0 * x)) + 0.1 * x * x
+
+
+@graph
+def curved(x: Stream[Scalar]):
+    """A function, and whether it is large."""
+    y = curve(x)
+    return {"y": y, "above": above(y)}
+
+
+def flown(seed, scale=1.0):
+    x = scale * np.random.default_rng(seed).uniform(-2.0, 2.0, 200)
+    return Flown(curved.build(), {"x": (np.arange(200, dtype=np.int64) * MS, x)}, "y")
+
+
+def test_the_narrowest_words_that_keep_the_bound():
+    found = quantise([flown(0), flown(1)], [flown(2)], width=28, bounds={RELATIVE: 1e-4})
+    assert found.figures["saturations"] == 0
+    assert found.figures[RELATIVE] <= 1e-4
+    bits = found.formats.width
+    assert 10 < bits < 24
+    tried = {row["bits"]: row for row in found.tried}
+    assert tried[bits]["holds"]
+    assert not tried[bits - 1]["holds"]
+    assert tried[28][RELATIVE] < 1e-2 * tried[bits][RELATIVE]  # each bit halves it
+    flight = flown(2)
+    ours = simulate(flight.graph, flight.inputs, engine="fixed", formats=found.formats)
+    real = simulate(flight.graph, flight.inputs, engine="reference")
+    assert differences(real, ours.series, "y")[RELATIVE] == found.figures[RELATIVE]
+    named = {row["value"]: row["name"] for row in found.values()}
+    assert any("test_quantise" in name for name in named.values())
+
+
+def test_decisions_that_differ_are_counted():
+    found = quantise([flown(0)], [flown(3)], width=8, least=8, bounds={DECISIONS: 200})
+    assert 0 < found.figures[DECISIONS] < 60
+    with pytest.raises(LoweringError, match="(?s)cannot be trusted at 8 bits.*decisions_differing <= 0"):
+        quantise([flown(0)], [flown(3)], width=8, bounds={DECISIONS: 0})
+
+
+def test_a_flight_elsewhere_widens_what_saturates_and_says_so():
+    found = quantise([flown(0)], [flown(1, scale=3.0)], width=24, least=24, bounds={RELATIVE: 1e-2})
+    assert found.figures["saturations"] == 0
+    assert any("flights held out" in note and "input x" in note for note in found.notes)
+
+
+def test_a_bound_that_nobody_keeps_is_refused_with_a_place():
+    with pytest.raises(
+        LoweringError, match=r"(?s)cannot be trusted at 16 bits.*expected: .*<= 1e-12.*--width"
+    ):
+        quantise([flown(0)], [flown(1)], width=16, bounds={RELATIVE: 1e-12})
+
+
+def test_what_is_asked_wrongly():
+    with pytest.raises(UnknownNameError, match="position_difference_rms_m"):
+        quantise([flown(0)], [flown(1)], bounds={"error": 1.0})
+    with pytest.raises(DeclarationError, match="found on some flights and judged on others"):
+        quantise([flown(0)], [], bounds={RELATIVE: 1.0})
+
+
+def test_the_command_writes_what_run_and_lower_read(tmp_path):
+    run = CliRunner().invoke
+    flight = ["--data", "sim", "--set", "duration=1"]
+    asked = ["--seeds", "1", "--held-out-seeds", "1", "--width", "26", "--least", "26"]
+    bound = ["--bound", "position_difference_rms_m=0.001"]
+    made = run(app, ["quantise", "kalman", *flight, *asked, *bound, "-o", str(tmp_path / "f"), "--json"])
+    assert made.exit_code == 0, made.output
+    report = json.loads(made.stdout)
+    assert report["bits"] == 26
+    assert report["position_difference_rms_m"] <= 0.001
+    assert report["saturations"] == report["decisions_differing"] == 0
+    assert load_formats(tmp_path / "f").width == 26
+    rows = [
+        json.loads(run(app, ["run", "kalman", *flight, *how, "--json"]).stdout)
+        for how in (
+            ["--engine", "fixed", "--formats", str(tmp_path / "f")],
+            ["--engine", "c", "--dtype", "fixed", "--formats", str(tmp_path / "f")],
+            ["--engine", "reference"],
+        )
+    ]
+    assert rows[0]["position_rmse_m"] == rows[1]["position_rmse_m"]
+    assert abs(rows[0]["position_rmse_m"] - rows[2]["position_rmse_m"]) < 1e-3
+    assert rows[0]["saturations"] == 0
+    wrote = run(
+        app, ["lower", "kalman", *flight, "--formats", str(tmp_path / "f"), "--target", "c",
+              "--dtype", "fixed", "-o", str(tmp_path / "c")],
+    )  # fmt: skip
+    assert wrote.exit_code == 0, wrote.output
+    assert {"pipeline.json", "kalman_fixed.c", "kalman_fixed.h"} <= {
+        f.name for f in (tmp_path / "c").iterdir()
+    }
+    assert json.loads((tmp_path / "c" / "pipeline.json").read_text())["formats"]["width"] == 26
+
+
+def test_lowering_to_fixed_point_needs_formats():
+    made = CliRunner().invoke(app, ["lower", "kalman", "--dtype", "fixed", "-o", "nowhere"])
+    assert made.exit_code != 0
+    assert "flowgraph quantise kalman" in made.output
+
+
+def test_a_bound_is_a_figure_and_a_number():
+    made = CliRunner().invoke(
+        app, ["quantise", "kalman", "--data", "sim", "--bound", "tight", "-o", "nowhere"]
+    )
+    assert made.exit_code != 0
+    assert "FIGURE=MOST" in made.output

@@ -1,0 +1,103 @@
+"""Whole experiments: the figures of a study are those of the recorded way, whose flights are written down."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowgraph import find_graph, load_flight, simulate
+from flowgraph.study import Study, run_study, tasks
+from flowgraph.study.whole import whole_case
+
+pytest.importorskip("pyarrow")
+SHORT: dict[str, Any] = {"duration": 2.0, "imu.rate": 50, "start": "truth"}
+
+
+def study(**more: Any) -> Study:
+    parameters = {**SHORT, **more.pop("parameters", {})}
+    return Study(
+        **{
+            "graphs": ["ekf"],
+            "data": ["sim:figure"],
+            "seeds": 4,
+            "engine": "c",
+            "parameters": parameters,
+            **more,
+        }
+    )
+
+
+def figures(row: dict[str, Any]) -> dict[str, float]:
+    return {n: v for n, v in row.items() if isinstance(v, float) and not n.endswith("_s")}
+
+
+@pytest.mark.slow
+def test_a_study_of_whole_experiments_has_the_figures_of_the_recorded_way(tmp_path, monkeypatch) -> None:
+    found = run_study(study(), tmp_path / "whole").rows
+    assert [row["load_s"] for row in found] == [0.0] * 4, "no flight was written down"
+    monkeypatch.setattr(tasks, "_whole", lambda run: None)
+    recorded = run_study(study(), tmp_path / "recorded").rows
+    assert all(row["load_s"] > 0.0 for row in recorded)
+    for one, other in zip(found, recorded, strict=True):
+        want = figures(other)
+        assert figures(one).keys() == want.keys()
+        for name, value in want.items():
+            assert figures(one)[name] == pytest.approx(value, rel=1e-9, abs=1e-9), name
+    assert len({row["position_rmse_m"] for row in found}) == 4, "seeds choose the flight"
+
+
+@pytest.mark.slow
+def test_a_study_of_whole_experiments_goes_on_where_it_was_left(tmp_path) -> None:
+    first = run_study(study(seeds=3), tmp_path)
+    again = run_study(study(seeds=6), tmp_path)
+    assert (first.done, again.done, again.kept) == (3, 3, 3)
+    alone = run_study(study(seeds=6), tmp_path / "alone")
+    assert [figures(row) for row in again.rows] == [figures(row) for row in alone.rows]
+
+
+@pytest.mark.slow
+def test_a_setting_that_a_program_cannot_take_is_an_error_of_its_rows_alone(tmp_path) -> None:
+    rows = run_study(study(seeds=2, parameters={"position_noise": [0.01, -1.0]}), tmp_path).rows
+    assert [row["error"] is None for row in rows] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("settings", "more"),
+    [({}, {"start": "file"}), ({"vicon.latency": "0.02"}, {"start": "truth"})],
+    ids=["a start by the first pose", "a reading that comes late"],
+)
+def test_what_hangs_on_the_recording_has_no_whole_case(
+    settings: dict[str, str], more: dict[str, str]
+) -> None:
+    found = []
+    for seed in (0, 1):
+        flight = load_flight(
+            "sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings}
+        )
+        found.append((find_graph("ekf").case(flight, **more), flight))
+    made_by = found[0][1].experiment
+    if settings:
+        assert made_by is None
+    else:
+        assert made_by is not None
+        assert whole_case(made_by, *found) is None
+
+
+@pytest.mark.slow
+def test_a_whole_experiment_is_the_same_in_every_engine() -> None:
+    found = []
+    for seed in (0, 1):
+        flight = load_flight("sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50"})
+        found.append((find_graph("ekf").case(flight, start="truth"), flight))
+    experiment = found[0][1].experiment
+    assert experiment is not None
+    case = whole_case(experiment, *found)
+    assert case is not None
+    want = case.score(simulate(case.graph, case.inputs, engine="python", seed=3))
+    assert all(map(math.isfinite, want.values()))
+    for engine in ("reference", "xla", "c"):
+        got = case.score(simulate(case.graph, case.inputs, engine=engine, seed=3))
+        np.testing.assert_allclose(list(got.values()), list(want.values()), rtol=1e-9, atol=1e-9)
