@@ -39,14 +39,9 @@ from flowgraph.blocks.outdoor.belief import (
     predict_clone,
     start_outdoor,
 )
-<<<<<<< HEAD
 from flowgraph.blocks.outdoor.flight import OutdoorSensors
-from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Smoothed, on_flight
-from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
-=======
-from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
 from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
->>>>>>> main
+from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -138,15 +133,10 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-<<<<<<< HEAD
 def for_flight(
-    on: OnFlight, *, gated: Gated, control: HeldControl, started: StartedOutdoor, scored: Smoothed
+    on: OnFlight, *, gated: Adapted, control: HeldControl, started: StartedOutdoor, scored: Smoothed
 ) -> Case:
     """Start the filter on an outdoor flight, at rest, and at its first readings if nothing else is set.
-=======
-def for_flight(on: OnFlight, *, gated: Adapted, control: HeldControl, scored: Smoothed) -> Case:
-    """Start the filter on an outdoor flight, at its first readings and at rest.
->>>>>>> main
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
