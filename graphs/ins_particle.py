@@ -127,7 +127,7 @@ def for_flight(
     filter: EulerPose,
     control: HeldControl,
     gated: Gated,
-    inflate: Positive = 1.2,
+    inflate: Positive = 1.25,
     spread: NotNegative = 0.0,
     bandwidth: Share | None = None,
 ) -> Case:

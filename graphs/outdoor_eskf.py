@@ -41,9 +41,10 @@ from flowgraph.blocks.outdoor.belief import (
     predict_clone,
     start_outdoor,
 )
-from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor.flight import OutdoorSensors
 from flowgraph.blocks.outdoor.recording import outdoor_recording
 from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
+from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Gaussian, Imu, MagneticField, OpticalFlow, Position, Range
 
@@ -136,14 +137,15 @@ def outdoor_eskf(
 
 
 @on_flight(outdoor_eskf)
-def for_flight(on: OnFlight, *, gated: Adapted, control: HeldControl, scored: Smoothed) -> Case:
-    """Start the filter on an outdoor flight, at its first readings and at rest.
+def for_flight(
+    on: OnFlight, *, gated: Adapted, control: HeldControl, started: StartedOutdoor, scored: Smoothed
+) -> Case:
+    """Start the filter on an outdoor flight, at rest, and at its first readings if nothing else is set.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for.
     """
-    inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
-    on.notes.extend(notes)
+    inputs, sensors, first = started.begin(on)
     known: dict[str, Any] = {
         "start": start_outdoor(first),
         "sensors": sensors,

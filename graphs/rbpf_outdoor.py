@@ -37,11 +37,12 @@ from flowgraph.blocks.outdoor.corrections import (
     correct_flow,
     correct_position,
 )
-from flowgraph.blocks.outdoor.flight import OutdoorSensors, outdoor_flight
+from flowgraph.blocks.outdoor.flight import OutdoorSensors
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.particles.resampling import draw_ancestors
 from flowgraph.blocks.scoring.cases import Gated, HeldControl, OnFlight, Particles, Scored, on_flight
+from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
 from flowgraph.blocks.scoring.tuning import reading_of
 from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
 
@@ -138,8 +139,16 @@ _UNSMOOTHED = (
 
 
 @on_flight(rbpf_outdoor, unsmoothed=_UNSMOOTHED)
-def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldControl, scored: Scored) -> Case:
-    """Start the filter on an outdoor flight, at its first readings and at rest.
+def for_flight(
+    on: OnFlight,
+    *,
+    cloud: Particles,
+    gated: Gated,
+    control: HeldControl,
+    started: StartedOutdoor,
+    scored: Scored,
+) -> Case:
+    """Start the filter on an outdoor flight, at rest, and at its first readings if nothing else is set.
 
     Args:
         flight: with the streams and the knowledge that `outdoor_flight` asks for, such as that of
@@ -150,8 +159,7 @@ def for_flight(on: OnFlight, *, cloud: Particles, gated: Gated, control: HeldCon
         DeclarationError: for a setting that is out of range.
         UnknownNameError: for a scheme that is not there.
     """
-    inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
-    on.notes.extend(notes)
+    inputs, sensors, first = started.begin(on)
     return on.case(
         scored.score(on, pose_errors, estimate="belief"),
         inputs=inputs,

@@ -50,6 +50,7 @@ from flowgraph.blocks.outdoor.flight import (
     OutdoorStart,
     attitude_of_two,
     outdoor_flight,
+    without_gaps,
 )
 
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "OutdoorStart",
     "attitude_of_two",
     "outdoor_flight",
+    "without_gaps",
     "FLOW",
     "FieldObserver",
     "OUTDOOR",

@@ -15,12 +15,20 @@ import numpy.typing as npt
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import level
-from flowgraph.blocks.inertial.alignment import StartSpread
+from flowgraph.blocks.inertial.alignment import StartSpread, need_usable, usable
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
-__all__ = ["AIDS", "STREAMS", "OutdoorSensors", "OutdoorStart", "attitude_of_two", "outdoor_flight"]
+__all__ = [
+    "AIDS",
+    "STREAMS",
+    "OutdoorSensors",
+    "OutdoorStart",
+    "attitude_of_two",
+    "outdoor_flight",
+    "without_gaps",
+]
 
 AIDS = ("gps", "gps2", "altimeter", "magnetometer", "optical_flow")
 """What an outdoor flight has any of, by name."""
@@ -131,9 +139,10 @@ def outdoor_flight(
 ) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart, tuple[str, ...]]:
     """The streams of a flight by name, what is known of its sensors, where to start, and notes on that.
 
-    The position is that of the first reading of a receiver, the attitude that of the first force and field.
-    What no sensor tells of these is the truth's, where there is one, and else taken for the origin and north,
-    with a deviation that says so.
+    The position is that of the first reading of a receiver, the attitude that of the first force and field;
+    readings that are not finite, and a force or field of nearly no length, are passed over. What no sensor
+    tells of these is the truth's, where there is one, and else taken for the origin and north, with a
+    deviation that says so.
 
     Args:
         flight: with `imu` and any of `AIDS`; a reading of optical flow covers the time since the one before
@@ -142,7 +151,8 @@ def outdoor_flight(
         graph: who asks, for messages.
 
     Raises:
-        DataError: where a stream or what should be known of it is missing, or optical flow has a gap.
+        DataError: where a stream or what should be known of it is missing, optical flow has a gap, or no
+            reading of a sensor can start a filter.
     """
     streams = flight.need(graph, "imu")
     streams |= {name: flight.streams[name] for name in AIDS if len(flight.streams.get(name, ()))}
@@ -165,7 +175,7 @@ def outdoor_flight(
             got=f"no {', '.join(missing)}",
             fix="add them to the flight's info, or build the graph with sensors=OutdoorSensors(...)",
         )
-    _without_gaps(flight.name, streams)
+    without_gaps(flight.name, streams)
     noise = info["noise"]
     known = {name: noise[name]["noise"] for name in AIDS[:-1] if name in streams}
     if "optical_flow" in streams:
@@ -191,16 +201,17 @@ def _start(
     receiver = next((name for name in ("gps", "gps2") if name in streams), None)
     place = np.zeros(3)
     if receiver is not None:
-        place = streams[receiver]["position"][0]
+        place = _first(flight, receiver, "position", -1.0)
     elif truth is not None and "position" in truth.leaves:
         place = truth["position"][0]
         notes.append(note("assumed", "the position at the start is the truth's: no receiver tells it"))
     else:
         spread = replace(spread, position=LOST)
         notes.append(note("assumed", "the start is the origin, for all that is known: no receiver is there"))
-    force = streams["imu"]["specific_force"][0]
+    forces = streams["imu"]["specific_force"]
+    force = forces[np.argmax(need_usable(forces, f"{flight.name}: imu"))]
     if "magnetometer" in streams:
-        turn = attitude_of_two(force, streams["magnetometer"]["field"][0], earth=sensors.field)
+        turn = attitude_of_two(force, _first(flight, "magnetometer", "field", 0.0), earth=sensors.field)
     elif truth is not None and "attitude" in truth.leaves:
         turn = np.asarray(level(truth["attitude"][0], force, xp=np))
         spread = replace(spread, heading=StartSpread().heading)
@@ -210,6 +221,21 @@ def _start(
         spread = replace(spread, heading=math.pi)
         notes.append(note("assumed", "the heading at the start is 0, for all that is known"))
     return OutdoorStart(place, turn, spread), tuple(notes)
+
+
+def _first(flight: Flight, name: str, field: str, least: float) -> np.ndarray:
+    """The first reading (3) of a stream that is finite and longer than that."""
+    readings = flight.streams[name][field]
+    shown = usable(readings, least)
+    if not shown.any():
+        raise DataError(
+            f"no reading of {name} can start a filter",
+            path=f"{flight.name}: {name}",
+            expected="one that is finite" + (", and no field of zero" if least == 0.0 else ""),
+            got=f"none in {len(readings)} readings",
+            fix=f"check the columns of {name} and their unit",
+        )
+    return np.asarray(readings[np.argmax(shown)])
 
 
 def _spread(sensors: OutdoorSensors, imu: Series) -> StartSpread:
@@ -229,7 +255,7 @@ def _three(values: npt.ArrayLike) -> Vector:
     return x, y, z
 
 
-def _without_gaps(name: str, streams: dict[str, Series]) -> None:
+def without_gaps(name: str, streams: dict[str, Series]) -> None:
     """Refuse optical flow of which a reading does not begin where the one before it ended."""
     flow = streams.get("optical_flow")
     if flow is None:

@@ -6,7 +6,8 @@ noise that a filter is told, in its settings or in the flight, and `covariances`
 makes the streams that it asks for out of those that a flight has. `scorer` compares a run with the truth:
 errors, consistency, and the same for the smoothed run; `orientation` counts only the times that a recording
 says count, and `calibration` how well one explains its windows. `own` makes a case where nobody says how, and
-`outdoors` has the streams and the start of a flight with satellites. `settings`, `point`, `euler`, `own` and
+`outdoors` has the streams and the start of a flight with satellites, `outdoor_start` that of one with six
+sensors. `settings`, `point`, `euler`, `own` and
 `calibration` are imported by their own names.
 """
 
@@ -32,6 +33,7 @@ from flowgraph.blocks.scoring.cases import (
 from flowgraph.blocks.scoring.covariances import Covariance, six_by_six
 from flowgraph.blocks.scoring.late import Late, built_for, late_streams, places, rewound_graph
 from flowgraph.blocks.scoring.orientation import Share, counted, counted_errors, scored_errors
+from flowgraph.blocks.scoring.outdoor_start import StartedOutdoor
 from flowgraph.blocks.scoring.outdoors import (
     POSITIONS,
     Outdoors,
@@ -97,6 +99,7 @@ __all__ = [
     "MAGNETIC_HEADING",
     "UNKNOWN_HEADING",
     "Started",
+    "StartedOutdoor",
     "StartPose",
     "Scorer",
     "WEIGHTLESS",

@@ -98,6 +98,7 @@ class Started(Settings):
         *,
         position: Series | None = None,
         attitude: Series | None = None,
+        shown: np.ndarray | None = None,
         usual: str = "truth",
         rests: float = 0.0,
         deviates: bool = True,
@@ -110,6 +111,8 @@ class Started(Settings):
             inputs: of the graph. What comes before the start is left out of them, with a note.
             position, attitude: the series that measure them, None where the file has none. Where there is no
                 `attitude`, the file may still show one, by another stream or by a magnetometer.
+            shown: (4,), the attitude that the file shows at its first reading, where the caller has found it;
+                then a heading of which nothing is known is about that one, for a filter that measures it.
             usual: what is taken first if `start` is left out.
             rests: for so many seconds from the first input on the body rests, so that a pose of that time is
                 that of the first input, and nothing need be left out.
@@ -122,12 +125,19 @@ class Started(Settings):
         told = self._truth(on, first)
         place = _first(position, "position")
         measured = _first(attitude, "attitude")
-        seen = _compass(on) if measured is None else _Shown(*measured, None, "the first attitude that was")
-        shown = {"truth": told is not None, "file": seen is not None, "unknown_yaw": True}
+        if shown is not None:
+            seen: _Shown | None = _Shown(
+                first, shown, None, "the attitude of the first force and field that were"
+            )
+        elif measured is not None:
+            seen = _Shown(*measured, None, "the first attitude that was")
+        else:
+            seen = _compass(on)
+        there = {"truth": told is not None, "file": seen is not None, "unknown_yaw": True}
         chosen = self.start
         if chosen is None:
-            chosen = next(name for name in (usual, "truth", "file", "unknown_yaw") if shown[name])
-        if not shown[chosen]:
+            chosen = next(name for name in (usual, "truth", "file", "unknown_yaw") if there[name])
+        if not there[chosen]:
             raise DataError(
                 f"there is no start of this kind for {on.name}",
                 path=f"{on.name}.start",
@@ -137,7 +147,8 @@ class Started(Settings):
             )
         starts = [first] if place is None else [place[0]]
         here = np.zeros(3) if place is None else place[1]
-        turn, heading, tilted = _LEVEL, None, chosen != "unknown_yaw" or measured is not None
+        turn, heading = _LEVEL, None
+        tilted = chosen != "unknown_yaw" or measured is not None or shown is not None
         if chosen == "truth" and told is not None:
             starts = [told[0]]
             here = here if told[1] is None else told[1]
@@ -151,15 +162,16 @@ class Started(Settings):
             if measured is not None:
                 starts.append(measured[0])
                 turn = measured[1]
-            turn, heading = turned(turn, 0.0), UNKNOWN_HEADING
+            turn = turned(turn, 0.0) if shown is None else shown
+            heading, whose = UNKNOWN_HEADING, "0 rad" if shown is None else "that of the first field"
             if self.start_heading is None:
                 said = f" with a deviation of {UNKNOWN_HEADING:.3g} rad" if deviates else ""
-                on.note("assumed", f"nothing is known of the heading at the start: 0 rad{said}")
+                on.note("assumed", f"nothing is known of the heading at the start: {whose}{said}")
         if self.start_heading is not None:
             turn, heading = turned(turn, self.start_heading), None
             on.note("assumed", f"the heading at the start is {self.start_heading:g} rad, as it was set")
         time = max(first, *starts)
-        if time - first <= round(rests * 1e9):
+        if time - first <= rests * 1e9:
             time = first
         if chosen != "truth" and position is not None:
             here = _last(position, "position", time, here)

@@ -13,7 +13,13 @@ import pytest
 
 from flowgraph import DataError, DeclarationError, Flight, Series, simulate
 from flowgraph.blocks.flights.worlds import load_world
-from flowgraph.blocks.geometry.rotations import geodesic_angle
+from flowgraph.blocks.geometry.rotations import (
+    from_rotation_vector,
+    geodesic_angle,
+    multiply,
+    rotate,
+    to_matrix,
+)
 from flowgraph.blocks.kalman.filters import observed
 from flowgraph.blocks.outdoor.belief import (
     FLOW,
@@ -139,6 +145,94 @@ def test_the_start_is_read_from_the_first_force_and_field():
     assert off < 3.0 * np.hypot(np.sqrt(2.0) * start.spread.tilt, start.spread.heading)
     exact = attitude_of_two([0.0, 0.0, 9.81], [0.0, 25e-6, -43e-6], earth=[0.0, 25e-6, -43e-6])
     np.testing.assert_allclose(exact, [1.0, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+def turned(base: Flight, degrees: float) -> Flight:
+    """The flight in a world that is turned about the vertical: what the body reads stays."""
+    turn = np.asarray(from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)]), xp=np))
+    about = lambda v: np.asarray(rotate(turn, v, xp=np))
+    streams, truth = dict(base.streams), base.truth
+    assert truth is not None
+    for name in ("gps", "gps2"):
+        series = streams[name]
+        streams[name] = Series(
+            series.time, series.values.replace(position=about(series["position"])), name=name
+        )
+    values = truth.values.replace(
+        position=about(truth["position"]),
+        velocity=about(truth["velocity"]),
+        attitude=np.asarray(multiply(turn, truth["attitude"], xp=np)),
+    )
+    field = tuple(about(np.asarray(base.info["magnetic_field"])).tolist())
+    return dataclasses.replace(
+        base,
+        streams=streams,
+        truth=Series(truth.time, values, name="truth"),
+        info={**base.info, "magnetic_field": field},
+    )
+
+
+def with_first(base: Flight, name: str, field: str, value: float, rows: int) -> Flight:
+    """The flight whose stream reads that in its first rows."""
+    series = base.streams[name]
+    readings = np.array(series[field])
+    readings[:rows] = value
+    made = Series(series.time, series.values.replace(**{field: readings}), name=name, gaps=True)
+    return dataclasses.replace(base, streams={**base.streams, name: made})
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    ({}, "assumed: the start has the attitude of the first force and field that were measured"),
+    ({"start": "truth"}, "assumed: the start is the truth's"),
+    ({"start": "unknown_yaw"}, "assumed: nothing is known of the heading at the start: that of the first"),
+    ({"start_heading": -2.0}, "assumed: the heading at the start is -2 rad, as it was set"),
+])  # fmt: skip
+@pytest.mark.parametrize("graph", [rbpf_outdoor, outdoor_eskf])
+def test_what_an_outdoor_filter_starts_with_is_a_note(graph, settings, said):
+    few: dict[str, Any] = {"particles": 10} if graph is rbpf_outdoor else {}
+    case = graph.case(flight(), **settings, **few)
+    assert any(note.startswith(said) for note in case.notes)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 150.0, -90.0])
+@pytest.mark.parametrize("graph", [pytest.param(rbpf_outdoor, marks=pytest.mark.slow), outdoor_eskf])
+def test_the_field_shows_a_heading_of_which_nothing_is_known(graph, degrees):
+    few: dict[str, Any] = {"particles": 200} if graph is rbpf_outdoor else {}
+    case = graph.case(turned(flight(1), degrees), start="unknown_yaw", settle=2.0, **few)
+    result = simulate(case.graph, case.inputs)
+    assert case.score(result)["heading_rmse_deg"] < 3.0
+
+
+def test_a_heading_that_is_set_is_that_of_an_outdoor_start():
+    for heading in (0.4, -2.0, 3.0):
+        case = outdoor_eskf.case(flight(), start_heading=heading)
+        early = {name: s[s.time < 20_000_000] for name, s in case.inputs.items()}
+        R = to_matrix(simulate(case.graph, early)["belief"]["attitude"][0], xp=np)
+        assert abs(np.angle(np.exp(1j * (np.arctan2(R[1, 0], R[0, 0]) - heading)))) < 0.3
+
+
+@pytest.mark.parametrize(("name", "field", "value"), [
+    ("imu", "specific_force", 0.0), ("imu", "specific_force", np.nan),
+    ("magnetometer", "field", 0.0), ("magnetometer", "field", np.nan), ("gps", "position", np.nan),
+])  # fmt: skip
+def test_what_can_start_no_outdoor_filter_is_passed_over(name, field, value):
+    base = flight(1)
+    case = outdoor_eskf.case(with_first(base, name, field, value, 2), settle=2.0)
+    score = case.score(simulate(case.graph, case.inputs))
+    usual = outdoor_eskf.case(base, settle=2.0)
+    best = usual.score(simulate(usual.graph, usual.inputs))
+    for key in ("position_rmse_m", "attitude_rmse_deg"):
+        assert score[key] < 1.5 * best[key]
+    with pytest.raises(DataError, match=f"{name}[\\s\\S]*no reading of"):
+        outdoor_eskf.case(with_first(base, name, field, value, len(base.streams[name])))
+
+
+def test_a_truth_that_begins_later_starts_no_outdoor_filter():
+    base = flight()
+    assert base.truth is not None
+    late = dataclasses.replace(base, truth=base.truth[base.truth.time >= 1_012_000_000])
+    with pytest.raises(DataError, match="optical flow has a gap"):
+        outdoor_eskf.case(late, start="truth")
 
 
 def test_a_dead_sensor_is_no_hindrance():

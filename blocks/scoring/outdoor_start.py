@@ -1,0 +1,63 @@
+"""Where a filter on outdoor sensors starts.
+
+Its force and its magnetometer show an attitude, which it starts with if nothing is set. Nothing can be left
+out of its readings, since each of optical flow is over the time since the one before, or since the first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from flowgraph import Series
+from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds
+from flowgraph.blocks.outdoor.flight import OutdoorSensors, OutdoorStart, outdoor_flight, without_gaps
+from flowgraph.blocks.scoring.cases import OnFlight
+from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started
+from flowgraph.errors import DataError
+
+__all__ = ["StartedOutdoor"]
+
+
+@dataclass(frozen=True)
+class StartedOutdoor(Started):
+    """Where a filter starts outdoors.
+
+    Args:
+        start: truth, file (the first force and field) or unknown_yaw (nothing is known of the heading); file
+            if left out.
+    """
+
+    def begin(self, on: OnFlight) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart]:
+        """The inputs, what is known of the sensors, and the start, which a note names.
+
+        Raises:
+            DataError: as `outdoor_flight` and `pose`, and where a truth that begins later would leave optical
+                flow a gap.
+        """
+        inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
+        on.first_up("imu", inputs["imu"]["specific_force"])  # says what was passed over
+        shows = "magnetometer" in inputs
+        if not shows and self.start is None and self.start_heading is None:
+            on.notes.extend(notes)
+            return inputs, sensors, first
+        if not shows and self.start == "file":
+            raise DataError(
+                f"this flight shows {on.name} no heading",
+                path=f"{on.name}.start",
+                expected="a magnetometer",
+                got=", ".join(inputs),
+                fix="write --set start=unknown_yaw, or --set start.heading=RADIANS",
+            )
+        rests = math.inf
+        if self.start == "truth":
+            rests = float(on.flight.info.get("still", rest_seconds(inputs["imu"])))
+        place = inputs.get("gps", inputs.get("gps2"))
+        usual = "file" if shows else "unknown_yaw"
+        pose = self.pose(on, inputs, position=place, shown=first.attitude, usual=usual, rests=rests)
+        if pose.time > min(int(series.time[0]) for series in inputs.values()):
+            without_gaps(on.flight.name, pose.inputs)
+        known = StartSpread().heading if pose.told or self.start_heading is not None else first.spread.heading
+        heading = UNKNOWN_HEADING if pose.unknown else known
+        spread = replace(first.spread, heading=heading)
+        return pose.inputs, sensors, OutdoorStart(pose.position, pose.attitude, spread)
