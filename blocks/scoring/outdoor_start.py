@@ -53,11 +53,14 @@ class StartedOutdoor(Started):
         if self.start == "truth":
             rests = float(on.flight.info.get("still", rest_seconds(inputs["imu"])))
         place = inputs.get("gps", inputs.get("gps2"))
+        if place is None and self.start != "truth":
+            on.notes.append(notes[0])  # on the position, which comes first
         usual = "file" if shows else "unknown_yaw"
         pose = self.pose(on, inputs, position=place, shown=first.attitude, usual=usual, rests=rests)
+        here = first.position if place is None and self.start != "truth" else pose.position
         if pose.time > min(int(series.time[0]) for series in inputs.values()):
             without_gaps(on.flight.name, pose.inputs)
         known = StartSpread().heading if pose.told or self.start_heading is not None else first.spread.heading
         heading = UNKNOWN_HEADING if pose.unknown else known
         spread = replace(first.spread, heading=heading)
-        return pose.inputs, sensors, OutdoorStart(pose.position, pose.attitude, spread)
+        return pose.inputs, sensors, OutdoorStart(here, pose.attitude, spread)

@@ -278,7 +278,7 @@ SUBSETS = [
 def test_any_subset_of_the_sensors_will_do(graph, subsets):
     """It builds and runs, finite and, where a receiver is there, near where it should be; slowly, all 31."""
     f = flight(1, 0.7)
-    few = {"particles": 40} if graph is rbpf_outdoor else {}
+    few = {"settle": 0.2} | ({"particles": 40} if graph is rbpf_outdoor else {})
     for subset in subsets:
         case = graph.case(dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", *subset)}), **few)
         result = simulate(case.graph, case.inputs)
