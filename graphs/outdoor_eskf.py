@@ -118,7 +118,7 @@ def outdoor_eskf(
         sees = FieldObserver(s.field, tesla)
         now = fused(now, seen, "magnetometer", "fuse_magnetometer", observe=sees, R=np.eye(3))
     if altimeter is not None:
-        seen, R = altimeter.map(lambda z: z.distance[..., None]), [[s.noise("altimeter") ** 2]]
+        seen, R = altimeter.map(lambda z: z.distance[..., None]), np.eye(1) * s.noise("altimeter") ** 2
         now = fused(now, seen, "altimeter", "fuse_altimeter", observe=observe_distance, R=R)
     if optical_flow is not None:
         R = np.diag(np.repeat(np.square([s.noise("displacement"), s.noise("turn")]), 3))

@@ -7,6 +7,7 @@ import io
 import json
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def walk(begin: int = START) -> Series:
     return Series(begin + t * 50_000_000, Position(position=place), name="belief")
 
 
-def enu(places: list[tuple[float, float, float]]) -> np.ndarray:
+def enu(places: list[Any]) -> np.ndarray:
     """Of longitude, latitude in degrees and height."""
     table = np.array(places)
     return to_enu(np.stack([np.radians(table[:, 1]), np.radians(table[:, 0]), table[:, 2]], axis=-1), ORIGIN)
@@ -51,7 +52,9 @@ def test_geojson_and_kml_are_where_the_run_was():
 def test_gpx_has_times_where_there_is_a_calendar(begin, first):
     space = "{http://www.topografix.com/GPX/1/1}"
     points = list(ElementTree.fromstring(as_gpx(walk(begin), ORIGIN, "a")).iter(f"{space}trkpt"))
-    rows = [(float(p.get("lon")), float(p.get("lat")), float(p.findtext(f"{space}ele"))) for p in points]
+    rows = [
+        (float(p.attrib["lon"]), float(p.attrib["lat"]), float(p.findtext(f"{space}ele", ""))) for p in points
+    ]
     np.testing.assert_allclose(enu(rows), walk()["position"][::2], atol=2e-4)
     assert points[0].findtext(f"{space}time") == first
 
