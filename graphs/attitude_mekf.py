@@ -28,7 +28,6 @@ from flowgraph.blocks.kalman.learned import feed_scale, scale_of
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, bridged, find_back
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.metrics.errors import attitude_errors
-from flowgraph.blocks.models.recordings import turn_recording
 from flowgraph.blocks.orientation.commanded import (
     TURN,
     attitude_belief,
@@ -40,6 +39,7 @@ from flowgraph.blocks.orientation.commanded import (
     turn_crossing,
     turn_steps,
 )
+from flowgraph.blocks.orientation.recording import turn_recording
 from flowgraph.blocks.scoring.cases import Adapted, HeldControl, OnFlight, Smoothed, on_flight
 from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.tuning import reading_of

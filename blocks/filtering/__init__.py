@@ -15,6 +15,7 @@ from flowgraph.blocks.filtering.batch import (
     Aged,
     Derived,
     Loss,
+    Moves,
     Recording,
     cauchy,
     estimate_batch,
@@ -67,7 +68,7 @@ from flowgraph.blocks.filtering.proposals import (
 )
 from flowgraph.blocks.filtering.rewind import OLDER, Rewound, rewind
 from flowgraph.blocks.filtering.simulation import CloudSteps, backward_simulation, smoothed_cloud
-from flowgraph.blocks.filtering.switching import BankStep, BankSteps, bank_steps_of
+from flowgraph.blocks.filtering.switching import BankSteps, bank_steps_of
 from flowgraph.blocks.filtering.towards import Moved, deviations, find_cloud_back, moved_towards
 from flowgraph.blocks.filtering.weighing import weigh_cloud
 from flowgraph.blocks.geometry import SE, SE_2, SO, StateSpace, angle, euclidean, quaternion
@@ -83,6 +84,7 @@ from flowgraph.blocks.statespace import (
 from flowgraph.blocks.unscented import SigmaPoints
 
 __all__ = [
+    "Moves",
     "moved_towards",
     "deviations",
     "Moved",
@@ -141,7 +143,6 @@ __all__ = [
     "mmae",
     "Interacting",
     "BankFilter",
-    "BankStep",
     "BankSteps",
     "bank_step",
     "bank_steps_of",

@@ -29,11 +29,10 @@ import numpy.typing as npt
 from flowgraph import Array, block
 from flowgraph.blocks.filtering.gaussian import GaussianMethod
 from flowgraph.blocks.filtering.methods import Advanced, GaussianFilter, Method, extended
-from flowgraph.blocks.filtering.switching import BankStep
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import passes
 from flowgraph.blocks.particles.cloud import log_sum_exp
-from flowgraph.blocks.signals import Bank, Gaussian, KalmanInnovation
+from flowgraph.blocks.signals import Bank, BankStep, Gaussian, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import When

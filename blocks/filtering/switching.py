@@ -26,26 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flowgraph import Array, Result, Series, Signal, real
+from flowgraph import Result, Series
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.smoothing import gone_back, lag_ticks, smoother_gain
 from flowgraph.blocks.signals import Gaussian
 from flowgraph.errors import DataError
 
-__all__ = ["BankStep", "BankSteps", "bank_steps_of"]
-
-
-class BankStep(Signal):
-    """A tick of a bank of k filters, as its smoother needs it; pairs are of a filter (rows) and a motion.
-
-    chance: (k, k) that motion i becomes j over the step to this tick. prior_mean, prior_covariance: what the
-    belief of filter i at the tick before becomes with motion j. cross: (t, t) each, of both.
-    """
-
-    chance: Array = real("models", "models")
-    prior_mean: Array = real("models", "models", "n")
-    prior_covariance: Array = real("models", "models", "t", "t")
-    cross: Array = real("models", "models", "t", "t")
+__all__ = ["BankSteps", "bank_steps_of"]
 
 
 class BankSteps(NamedTuple):

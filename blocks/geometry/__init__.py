@@ -34,6 +34,7 @@ from flowgraph.blocks.geometry.geodetic import (
     as_geodetic,
     as_position,
     from_enu,
+    to_earth,
     to_enu,
 )
 from flowgraph.blocks.geometry.groups import SE, SE_2, SO, swept, turned_by
@@ -60,6 +61,7 @@ from flowgraph.blocks.geometry.tangent import linearised
 from flowgraph.blocks.geometry.views import View, array_of, joined, stacked_parts
 
 __all__ = [
+    "to_earth",
     "multiply",
     "right_product",
     "conjugate",

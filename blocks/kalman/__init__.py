@@ -57,6 +57,7 @@ from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.robust import ROBUST, Robust, huber, reweighted, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import (
+    Smoothing,
     Steps,
     fixed_lag,
     gone_back,
@@ -71,6 +72,7 @@ from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semid
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 
 __all__ = [
+    "Smoothing",
     "reweighted",
     "GROWN",
     "Robust",

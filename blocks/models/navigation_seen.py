@@ -12,15 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series, Signal, real
+from flowgraph import Array, Series
 from flowgraph.blocks.geometry.rotations import conjugate, rotate, skew
 from flowgraph.blocks.inertial.navigation import places
 from flowgraph.blocks.inertial.outdoors import Antenna
+from flowgraph.blocks.signals import TurningSpeed, TurningVelocity
 from flowgraph.blocks.statespace import MeasurementModel
 
 __all__ = [
-    "TurningSpeed",
-    "TurningVelocity",
     "antenna_seen",
     "antennas_seen",
     "compass_seen",
@@ -31,21 +30,6 @@ __all__ = [
 ]
 
 Space = Any
-
-
-class TurningVelocity(Signal):
-    """A velocity, its covariance, and what the gyroscope read at its time."""
-
-    velocity: Array = real(3, unit="m/s", frame="world")
-    covariance: Array = real(3, 3, unit="m^2/s^2", frame="world")
-    gyro: Array = real(3, unit="rad/s", frame="body")
-
-
-class TurningSpeed(Signal):
-    """A speed of wheels, and what the gyroscope read at its time."""
-
-    speed: Array = real(unit="m/s", frame="body")
-    gyro: Array = real(3, unit="rad/s", frame="body")
 
 
 def turning(series: Series, imu: Series) -> Series:

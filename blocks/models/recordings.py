@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series, Signal, real
+from flowgraph import Array, Series
 from flowgraph.blocks.filtering.batch import Aged, Derived, Moves, Recording
 from flowgraph.blocks.geometry.euler import (
     angles_from_quaternion,
@@ -31,15 +31,14 @@ from flowgraph.blocks.models import euler_ins
 from flowgraph.blocks.models.inertial_pose import INERTIAL, INERTIAL_BIASED, pose_seen
 from flowgraph.blocks.models.point import point_model
 from flowgraph.blocks.models.pose import POSE
-from flowgraph.blocks.orientation.commanded import TURN, predict_turn, turned_back
-from flowgraph.blocks.signals import Belief, BodyRate, Gaussian, Imu
+from flowgraph.blocks.signals import Belief, CameraVelocity, Gaussian, Imu
 from flowgraph.blocks.statespace import LinearMeasurement, Measurement, MeasurementModel
 from flowgraph.blocks.vision.camera import Mount
 from flowgraph.blocks.vision.motion import camera_velocity
 from flowgraph.types import unflatten
 
 __all__ = [
-    "CameraVelocity",
+    "recorded",
     "EulerPoseSeen",
     "drive_at",
     "euler_moves",
@@ -49,7 +48,6 @@ __all__ = [
     "place_seen",
     "point_recording",
     "pose_recording",
-    "turn_recording",
     "turn_seen",
     "velocity_recording",
 ]
@@ -172,7 +170,7 @@ def inertial_recording(
     if "attitude" in inputs:
         seen[turn_seen(attitude_noise)] = inputs["attitude"]
     moves = inertial_moves(noise, gravity)
-    return _recording(moves, seen, start, inputs["imu"], reading, held, position=0, velocity=3, attitude=6)
+    return recorded(moves, seen, start, inputs["imu"], reading, held, position=0, velocity=3, attitude=6)
 
 
 def pose_recording(
@@ -183,7 +181,7 @@ def pose_recording(
     """What `ekf` and `ukf` are given: `imu` and `vicon`; over `INERTIAL`."""
     seen = {pose_seen(position_noise, attitude_noise, lever=lever): inputs["vicon"]}
     moves = inertial_moves(noise, gravity, biased=False)
-    return _recording(moves, seen, start, inputs["imu"], reading, held, position=0, velocity=3, attitude=6)
+    return recorded(moves, seen, start, inputs["imu"], reading, held, position=0, velocity=3, attitude=6)
 
 
 def euler_recording(
@@ -199,17 +197,9 @@ def euler_recording(
     read = lambda pose: (pose.position, pose.attitude)
     seen = EulerPoseSeen(euler_ins.STATE, observe, R, POSE, read, order=order)
     moves = euler_moves(order, noise, gravity)
-    return _recording(
+    return recorded(
         moves, {seen: inputs["pose"]}, start, inputs["imu"], reading, held, position=0, velocity=6, attitude=3
     )
-
-
-class CameraVelocity(Signal):
-    """A camera's velocity, and the rate of the body that goes with it: from the gyroscope, with its bias, or
-    from the camera."""
-
-    velocity: Array = real(3, unit="m/s", frame="camera")
-    rate: Array = real(3, unit="rad/s", frame="body")
 
 
 def velocity_recording(
@@ -240,7 +230,7 @@ def velocity_recording(
     )  # fmt: skip
     told = motion.holding(CameraVelocity(velocity=motion["velocity"], rate=body))
     moves = euler_moves(order, noise, gravity)
-    return _recording(moves, {seen: told}, start, imu, reading, held, position=0, velocity=6, attitude=3)
+    return recorded(moves, {seen: told}, start, imu, reading, held, position=0, velocity=6, attitude=3)
 
 
 def point_recording(
@@ -250,32 +240,14 @@ def point_recording(
     """What `kalman` and `async_kalman` are given: positions, and `WorldAcceleration` as control."""
     moves = point_model(noise)
     place = LinearMeasurement(moves.space, np.eye(3, 6), position_noise**2, read=lambda z: z.position)
-    return _recording(moves, {place: seen}, start, controls, control, held, position=0, velocity=3)
+    return recorded(moves, {place: seen}, start, controls, control, held, position=0, velocity=3)
 
 
-def turn_recording(
-    inputs: Mapping[str, Series], *, start: Gaussian, rate_noise: float, attitude_noise: float, reading: str,
-    held: Held | None = None,
-) -> Recording:  # fmt: skip
-    """What `attitude_mekf` is given: `body_rate` and `magnetic_attitude`; over `TURN`."""
-
-    def linearised(x: Array, rate: BodyRate, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
-        exactly = Gaussian(mean=x, covariance=xp.zeros((3, 3), dtype=x.dtype))
-        after = predict_turn.step(exactly, rate, noise=rate_noise, dt=dt, xp=xp)
-        return after.mean, turned_back(rate, dt, xp), after.covariance
-
-    seen = MeasurementModel(TURN, lambda x, xp: x, np.repeat(attitude_noise**2, 3), measured_space=TURN)
-    rates = inputs["body_rate"]
-    return _recording(
-        Derived(TURN, linearised), {seen: inputs["magnetic_attitude"]}, start, rates, reading, held,
-        attitude=0,
-    )  # fmt: skip
-
-
-def _recording(
-    moves: Moves, seen: Mapping[Any, Series], start: Gaussian, imu: Series, reading: str,
+def recorded(
+    moves: Moves, seen: Mapping[Any, Series], start: Gaussian, controls: Series, reading: str,
     held: Held | None, **places: int,
 ) -> Recording:  # fmt: skip
-    drive: Callable[[np.ndarray], Series] = partial(drive_at, controls=imu, reading=reading)
-    aged = None if held is None else Aged(imu, held, places)
+    """What a filter with controls was given; `places` are those of its state that age with a control."""
+    drive: Callable[[np.ndarray], Series] = partial(drive_at, controls=controls, reading=reading)
+    aged = None if held is None else Aged(controls, held, places)
     return Recording(moves, seen, start, drive, None if held is None else held.longest, aged)

@@ -13,6 +13,8 @@ from flowgraph.blocks.orientation.accelerometer import (
     STATE,
     OrientationBelief,
     named_orientation,
+    orientation_crossing,
+    orientation_steps,
     roll_pitch_attitude,
     see_rate_and_gravity,
     stacked_imu,
@@ -27,6 +29,9 @@ from flowgraph.blocks.orientation.commanded import (
     predict_turn,
     see_attitude,
     start_turn,
+    turn_crossing,
+    turn_steps,
+    turned_back,
 )
 from flowgraph.blocks.orientation.complementary import (
     blend,
@@ -54,8 +59,15 @@ from flowgraph.blocks.orientation.marg import (
     predict_level,
     start_level,
 )
+from flowgraph.blocks.orientation.recording import turn_recording
 
 __all__ = [
+    "turn_recording",
+    "turned_back",
+    "turn_steps",
+    "turn_crossing",
+    "orientation_steps",
+    "orientation_crossing",
     "doubt_heading",
     "TURN",
     "attitude_belief",

@@ -14,6 +14,7 @@ from flowgraph.blocks.outdoor.belief import (
     FieldObserver,
     PositionObserver,
     clone_crossing,
+    clone_transition,
     flow_vector,
     new_picture,
     observe_distance,
@@ -21,6 +22,7 @@ from flowgraph.blocks.outdoor.belief import (
     outdoor_pose,
     outdoor_steps,
     picture_cross,
+    picture_taken,
     predict_clone,
     start_outdoor,
 )
@@ -45,6 +47,7 @@ from flowgraph.blocks.outdoor.corrections import (
 )
 from flowgraph.blocks.outdoor.errors import antenna_errors, at_antenna, directed_errors
 from flowgraph.blocks.outdoor.flight import (
+    AIDS,
     STREAMS,
     OutdoorSensors,
     OutdoorStart,
@@ -52,8 +55,19 @@ from flowgraph.blocks.outdoor.flight import (
     outdoor_flight,
     without_gaps,
 )
+from flowgraph.blocks.outdoor.recording import outdoor_recording
+from flowgraph.blocks.outdoor.tracks import as_geojson, as_gpx, as_kml, as_table, track_files
 
 __all__ = [
+    "track_files",
+    "as_table",
+    "as_kml",
+    "as_gpx",
+    "as_geojson",
+    "outdoor_recording",
+    "AIDS",
+    "picture_taken",
+    "clone_transition",
     "turned",
     "VELOCITY",
     "TURN",

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import Array, Series, Signal, real
+from flowgraph import Array, Series
 from flowgraph.blocks.filtering.batch import Aged, Derived, Recording
 from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.models.recordings import drive_at
@@ -28,18 +28,10 @@ from flowgraph.blocks.outdoor.belief import (
     predict_clone,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors
-from flowgraph.blocks.signals import Gaussian, Imu
+from flowgraph.blocks.signals import CloneDrive, Gaussian, Imu
 from flowgraph.blocks.statespace import Measurement, MeasurementModel
 
-__all__ = ["CloneDrive", "outdoor_recording"]
-
-
-class CloneDrive(Signal):
-    """What drives a step: the IMU's readings, and 1 where the step begins at a picture, else 0."""
-
-    gyro: Array = real(3, unit="rad/s", frame="body")
-    specific_force: Array = real(3, unit="m/s^2", frame="body")
-    picture: Array = real()
+__all__ = ["outdoor_recording"]
 
 
 def outdoor_recording(

@@ -24,10 +24,10 @@ from flowgraph import Case, Flight, Result, Series
 from flowgraph.blocks.filtering.batch import LOSSES, Recording, loss_of
 from flowgraph.blocks.inertial.alignment import need_usable
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.kalman.lost import PATIENCE, Held
-from flowgraph.blocks.kalman.robust import ROBUST
+from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.kalman.smoothing import Smoothing
 from flowgraph.blocks.particles.resampling import MOST_PARTICLES
+from flowgraph.blocks.scoring.gates import Adapted, Gated, Weighed
 from flowgraph.blocks.scoring.late import Late, built_for
 from flowgraph.blocks.scoring.readings import GAP, Ranges, gap_note, gap_notes, gaps, pause, taken
 from flowgraph.blocks.scoring.scorer import Errors, Scorer
@@ -35,7 +35,6 @@ from flowgraph.blocks.scoring.settings import (
     NotNegative,
     Positive,
     Settings,
-    above_one,
     count,
     one_of,
     spliced,
@@ -305,55 +304,6 @@ class Smoothed(Scored):
             )
         recording = recording if isinstance(recording, Recording) else None
         return self.smooth, self.lag, recording, loss_of(self.loss)
-
-
-@dataclass(frozen=True)
-class Gated(Settings):
-    """Which measurements are believed.
-
-    Args:
-        gate: below 1 the probability with which an honest measurement passes, from 1 on the largest NIS.
-        patience: how many refusals in a row are taken for outliers; then the gate opens again (`find_back`).
-    """
-
-    gate: Positive | None = None
-    patience: Annotated[int, count(1, 1_000_000)] = PATIENCE
-
-    def gating(self) -> dict[str, Any]:
-        """What is a setting of the graph itself, by name."""
-        return {"gate": self.gate, "patience": self.patience}
-
-
-@dataclass(frozen=True)
-class Weighed(Gated):
-    """How far a measurement is believed that is far off.
-
-    Args:
-        robust: none, and it counts as its noise is told; huber or student_t, and for less, by its distance
-            from what is left after the correction (`robust`).
-    """
-
-    robust: Annotated[str, one_of(*ROBUST)] = "none"
-
-    def gating(self) -> dict[str, Any]:
-        """What is a setting of the graph itself, by name."""
-        return {**super().gating(), "robust": ROBUST[self.robust]()}
-
-
-@dataclass(frozen=True)
-class Adapted(Weighed):
-    """How large the noise of a measurement is.
-
-    Args:
-        adaptive: over about how many measurements the size of each sensor's noise is learned; it is as told
-            if left out (`learned_scale`).
-    """
-
-    adaptive: Annotated[float | None, above_one] = None
-
-    def gating(self) -> dict[str, Any]:
-        """What is a setting of the graph itself, by name."""
-        return {**super().gating(), "adaptive": self.adaptive}
 
 
 @dataclass(frozen=True)

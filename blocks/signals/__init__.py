@@ -75,6 +75,13 @@ from flowgraph.blocks.signals.particles import (
     StateKernels,
     Weights,
 )
+from flowgraph.blocks.signals.replayed import (
+    BankStep,
+    CameraVelocity,
+    CloneDrive,
+    TurningSpeed,
+    TurningVelocity,
+)
 from flowgraph.blocks.signals.scores import (
     Bounds,
     Extremes,
@@ -107,6 +114,11 @@ from flowgraph.blocks.signals.vision import (
 )
 
 __all__ = [
+    "TurningVelocity",
+    "TurningSpeed",
+    "CloneDrive",
+    "CameraVelocity",
+    "BankStep",
     "Controller",
     "FlightCommand",
     "BodyMotion",

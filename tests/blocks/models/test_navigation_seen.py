@@ -18,8 +18,6 @@ from flowgraph.blocks.inertial.outdoors import (
 from flowgraph.blocks.kalman.filters import correct
 from flowgraph.blocks.models.navigation import navigation_space
 from flowgraph.blocks.models.navigation_seen import (
-    TurningSpeed,
-    TurningVelocity,
     antenna_seen,
     antennas_seen,
     compass_seen,
@@ -35,6 +33,8 @@ from flowgraph.blocks.signals import (
     Height,
     Imu,
     MagneticField,
+    TurningSpeed,
+    TurningVelocity,
     WheelSpeed,
 )
 
