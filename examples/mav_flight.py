@@ -37,7 +37,8 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
     """
     unit = {"gyro.bias": 0.08, "accelerometer.bias": 0.4, "gyro.noise": 1.7e-4, "accelerometer.noise": 2e-3,
             "gyro.walk": 2e-5, "accelerometer.walk": 3e-3}  # fmt: skip
-    flown = load_flight("sim", seed=seed, settings={**unit, "duration": duration, "vicon.rate": 20.0})
+    flown_with = {**unit, "duration": duration, "vicon.rate": 20.0}
+    flown = load_flight("sim", seed=seed, settings={n: str(x) for n, x in flown_with.items()})
     draw = np.random.default_rng([seed, 77])
     truth, imu, seen = flown.truth, flown.streams["imu"], flown.streams["vicon"]
     assert truth is not None
