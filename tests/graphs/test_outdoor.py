@@ -206,7 +206,8 @@ def test_the_field_shows_a_heading_of_which_nothing_is_known(graph, degrees):
 def test_a_heading_that_is_set_is_that_of_an_outdoor_start():
     for heading in (0.4, -2.0, 3.0):
         case = outdoor_eskf.case(flight(), start_heading=heading)
-        early = {name: s[s.time < 20_000_000] for name, s in case.inputs.items()}
+        inputs: Any = case.inputs
+        early = {name: s[s.time < 20_000_000] for name, s in inputs.items()}
         R = to_matrix(simulate(case.graph, early)["belief"]["attitude"][0], xp=np)
         assert abs(np.angle(np.exp(1j * (np.arctan2(R[1, 0], R[0, 0]) - heading)))) < 0.3
 

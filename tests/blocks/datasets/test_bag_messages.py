@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -306,6 +308,7 @@ def test_fixes_and_velocities_keep_their_covariances(tmp_path):
     np.testing.assert_array_equal(speeds["covariance"], [0.25 * P] * 4)
     np.testing.assert_array_equal(speeds["velocity"], [[1.0, 2.0, 3.0]] * 4)
     case = find_graph("gnss_ins").case(flight)
-    aid = case.inputs["gnss"]["covariance"]
+    inputs: Any = case.inputs
+    aid = inputs["gnss"]["covariance"]
     np.testing.assert_array_equal(aid[1:], fixes["covariance"][1:])
     assert np.all(np.linalg.eigvalsh(aid[0]) > 0.0)
