@@ -23,7 +23,7 @@ from flowgraph import Array
 from flowgraph.blocks.filtering.gaussian import GaussianMethod, innovation_log_likelihood
 from flowgraph.blocks.filtering.methods import GaussianFilter, Method
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import accepts, masked, moved, where_any
+from flowgraph.blocks.kalman.filters import accepts, masked, moved, where_any, within
 from flowgraph.blocks.signals import Gaussian, GaussianInformation, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.language.block import When
@@ -61,7 +61,7 @@ class Information(GaussianMethod):
         z, H, R = measurement.linearised(kept.mean, None, message, xp)
         apart = measurement.apart(measurement.vector(message, xp), z, xp)
         present = ~xp.isnan(apart)
-        residual = xp.where(present, apart, 0.0)
+        residual = within(xp.where(present, apart, 0.0), gate, xp)
         H, R = masked(H, R, present, xp)
         column = residual[..., None]
         weighed = xp.linalg.solve(R, xp.concat([H, column], axis=-1))  # R^-1 H and R^-1 r

@@ -194,6 +194,7 @@ def correct(
     if present is None:
         present = ~xp.isnan(residual)
         residual = xp.where(present, residual, 0.0)
+    residual = within(residual, gate, xp)
     H, R = masked(H, R, present, xp)
     HP = H @ P
     S = HP @ H.mT + R
@@ -268,6 +269,15 @@ def masked(H: Array, R: Array, present: Array, xp: Any) -> tuple[Array, Array]:
     here = xp.astype(present, H.dtype)
     both = here[..., :, None] * here[..., None, :]
     return H * here[..., :, None], R * both + xp.eye(H.shape[-2], dtype=H.dtype) * (1.0 - here)[..., None]
+
+
+FARTHEST = 1e100
+"""How far off a measurement is taken to be at most before a gate: the square of more is no number."""
+
+
+def within(residual: Array, gate: float | None, xp: Any) -> Array:
+    """A residual whose NIS is a number, which a gate can refuse; without a gate as it is."""
+    return residual if gate is None else xp.clip(residual, -FARTHEST, FARTHEST)
 
 
 def accepts(nis: Array, gate: float | None, present: Array, xp: Any) -> Array:

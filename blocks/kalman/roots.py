@@ -27,6 +27,7 @@ from flowgraph.blocks.kalman.filters import (
     moved,
     observed,
     where_any,
+    within,
 )
 from flowgraph.blocks.kalman.linear import LinearModel
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
@@ -124,6 +125,7 @@ def correct_root(
         residual, H, R, present, gate, space: as for `correct`; a missing entry of the residual is 0.
     """
     kind, m = L.dtype, H.shape[-2]
+    residual = within(residual, gate, xp)
     H, R = masked(H, R, present, xp)
     top = xp.concat([semidefinite_root(R, xp=xp), H @ L], axis=-1)
     below = xp.concat([0.0 * (H @ L).mT, L], axis=-1)

@@ -26,7 +26,16 @@ import numpy.typing as npt
 
 from flowgraph import Array, block
 from flowgraph.blocks.geometry.manifold import StateSpace
-from flowgraph.blocks.kalman.filters import Vector, accepts, innovate, masked, moved, scaled, where_any
+from flowgraph.blocks.kalman.filters import (
+    Vector,
+    accepts,
+    innovate,
+    masked,
+    moved,
+    scaled,
+    where_any,
+    within,
+)
 from flowgraph.blocks.kalman.matrices import noise_matrix
 from flowgraph.blocks.kalman.robust import Robust, reweighted
 from flowgraph.blocks.kalman.triangles import covariance_root, semidefinite_root
@@ -235,6 +244,7 @@ def through_observation(
     spread = points.covariance(around, around, scale)
     S = spread + noise
     C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), around, scale)
+    residual = within(residual, gate, xp)
     column = residual[..., None]
     solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]

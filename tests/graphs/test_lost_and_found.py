@@ -45,6 +45,17 @@ def refused(score: dict[str, float]) -> float:
     return sum(value for key, value in score.items() if key.endswith("nis_rejected"))
 
 
+@pytest.mark.parametrize("name", ["kalman", *GATED])
+def test_a_gate_refuses_what_is_too_far_off_to_be_squared(name):
+    base = flight(2.0)
+    case = find_graph(name).case(outliers(base, slice(4, 5), 1e160), gate=0.999)
+    result = simulate(case.graph, case.inputs)
+    usual = find_graph(name).case(base, gate=0.999)
+    score, right = case.score(result), usual.score(simulate(usual.graph, usual.inputs))
+    assert refused(score) >= 1
+    assert score["position_rmse_m"] < 1.5 * right["position_rmse_m"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", GATED)
 @pytest.mark.parametrize("wrong", [1, 3])
