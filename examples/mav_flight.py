@@ -3,10 +3,11 @@
 The figure of `sim`, flown by a vehicle whose inertial unit lies with its x axis upwards, in another corner
 of the hall each time, with the biases of a cheap unit and the jolts of a vehicle that is carried, started and
 set down. A laser tracker finds a prism late, loses it at times, and tells its position alone. Number formats
-for fixed point are found on such flights: the sizes of everything matter there, more than the beauty of the
-path.
+for fixed point are found on such flights:
 
     flowgraph quantise ins_eskf --data examples/mav_flight.py:mav --width 32 -o formats
+
+The sizes of everything matter there, more than the beauty of the path.
 """
 
 from __future__ import annotations
@@ -74,3 +75,19 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
             "leica_lever": PRISM,
         },
     )  # fmt: skip
+
+
+def main() -> None:
+    """Print how large everything becomes on three flights."""
+    for seed in range(3):
+        flight = mav(seed=seed, duration=10.0)
+        sizes = {
+            "force": np.abs(flight.streams["imu"]["specific_force"]).max(),
+            "rate": np.abs(flight.streams["imu"]["gyro"]).max(),
+            "place": np.abs(flight.streams["leica"]["position"]).max(),
+        }
+        print(f"{flight.name}: " + ", ".join(f"{name} up to {size:.1f}" for name, size in sizes.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -84,7 +84,7 @@ def refused_in_a_row(name: str, rows: int) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("name", ["ins_eskf", "ekf", "ins_ukf_pose"])
 def test_refusals_in_a_row_are_a_note(name):
-    assert refused_in_a_row(name, 3) == ()
+    assert not [said for said in refused_in_a_row(name, 3) if "in a row" in said]
     (said,) = refused_in_a_row(name, 6)
     assert "measurements in a row" in said
 

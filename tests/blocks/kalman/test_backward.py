@@ -10,10 +10,10 @@ from flowgraph.blocks.filtering import (
     cubature,
     extended,
     first,
-    imm,
     information,
     linear,
     particles,
+    rao_blackwellized,
     square_root,
     unscented,
 )
@@ -103,8 +103,8 @@ def test_a_filter_that_waits_for_its_first_message_is_smoothed_from_there():
 
 def test_what_cannot_be_smoothed_says_so():
     seen, _ = driven(5)
-    with pytest.raises(DeclarationError, match="no smoother that goes back"):
-        built(imm(MOTION, MOTION))
+    with pytest.raises(DeclarationError, match="no smoother"):
+        built(rao_blackwellized(20, linear="position"))
     cloud = simulate(built(particles(20)), {"position": seen})
     with pytest.raises(DataError, match=r"did not collect what a smoother needs[\s\S]*smoothing=True"):
         steps_of(cloud)
