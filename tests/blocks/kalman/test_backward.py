@@ -29,7 +29,7 @@ from flowgraph.blocks.kalman import (
 )
 from flowgraph.blocks.models.tracking import TURNING
 from flowgraph.blocks.signals import CrossCovariance, Gaussian
-from tests.blocks.filtering.turning import GPS, MOTION, built, driven, missed
+from tests.blocks.filtering.turning import GPS, built, driven, missed
 
 LEAVES = ("mean", "covariance", "lag_one")
 
