@@ -38,17 +38,13 @@ def test_the_flight_is_that_of_a_world_without_gravity():
 
 @pytest.mark.slow
 def test_our_filters_are_below_the_figures_of_the_thesis_and_reach_the_bound():
-    """Over 40 flights; and particles come near the error-state filter."""
-    rows = thesis(flights=40, smoothed="").rows
+    """Over 40 flights; of the particles `test_rbpf_settings` says it."""
+    rows = thesis(flights=40, filters="acf,ekf,ukf", smoothed="").rows
     assert {row["setting"] for row in rows} == set(SETTINGS)
-    reference = {row["setting"]: row["position_rmse_m"] for row in rows if row["filter"] == "eskf"}
     for row in rows:
         where = f"{row['setting']} {row['filter']}"
-        if row["filter"] in ("acf", "ekf", "ukf"):
-            assert row["thesis_metric_position"] < row["thesis_position"], where
-            assert row["thesis_metric_attitude"] < row["thesis_attitude"], where
-        if row["filter"] == "rbpf":
-            assert row["position_rmse_m"] <= 1.12 * reference[row["setting"]], where
+        assert row["thesis_metric_position"] < row["thesis_position"], where
+        assert row["thesis_metric_attitude"] < row["thesis_attitude"], where
         if row["filter"] == "acf":
             assert row["position_rmse_m"] > 1.2 * row["bound_position_rmse_m"], where
     for name in ("ekf", "ukf"):
