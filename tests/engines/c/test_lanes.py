@@ -195,7 +195,8 @@ def test_only_what_is_kept_is_written(built):
 def looked_up(a: Three, *, draw, xp) -> Three:
     """Draws, and entries of a table and of what was computed, at places that the lanes do not share."""
     table = xp.asarray(np.linspace(-1.0, 1.0, 11))
-    drawn = draw.normal("noise", (3,)) + draw.uniform("even", (3,))
+    many = draw.normal("many", (9, 9)) @ draw.normal("more", (9, 9))  # more than a stack should hold
+    drawn = draw.normal("noise", (3,)) + draw.uniform("even", (3,)) + 1e-3 * many[0, :3]
     place = xp.astype(xp.clip(10.0 * xp.abs(a.value), 0.0, 10.0), xp.int64)
     return Three(value=drawn + xp.take(table, place) + xp.take(drawn, place % 3))
 

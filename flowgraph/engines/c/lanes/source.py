@@ -117,8 +117,9 @@ class _LaneFile(File):
         cells = [c for r in self.pipeline.registers for c in r.cells]
         lines += [_member(n, c) for n, c in zip(self._cell_names(), cells, strict=True)]
         sizes = [(d, k, n) for d, slots in sorted(self.pool.items()) for k, n in enumerate(slots)]
+        lines.append("    fg_uint seed[2];")  # up to here it is laid out from outside
         lines += [f"    {TYPES[d]} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
-        return "\n".join([*lines, "    fg_uint seed[2];", f"}} {m}_state;", ""])
+        return "\n".join([*lines, f"}} {m}_state;", ""])
 
     def _loop(self) -> str:
         """What plays a stretch of ticks, and writes what is wanted of each lane to its own place."""
