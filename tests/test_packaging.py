@@ -93,7 +93,7 @@ def test_wheel_holds_real_files_under_one_name(wheel: Path) -> None:
         assert schemas | {"flowgraph/py.typed"} <= set(entries)
 
         # The scripts of the pages with their licences, and not what they are made from.
-        parts = ("diagram.js", "run.js", "live.js", "style.css", "NOTICES.txt")
+        parts = ("diagram.js", "run.js", "live.js", "report.js", "style.css", "NOTICES.txt")
         assert {n.rpartition("/")[2] for n in entries if n.startswith("flowgraph/drawing/pages/")} == set(
             parts
         )

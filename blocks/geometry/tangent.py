@@ -52,4 +52,6 @@ def linearised(
             one = xp.asarray(np.eye(size + more, 1, -(size + i)), dtype=x.dtype)
             along.append(xp.broadcast_to(one, (*lead, size + more, 1)) if lead else one)
     y, J = jacobian(f, whole, xp, along=along)
+    if len(J.shape) <= len(y.shape):  # the same at each of the states
+        J = xp.broadcast_to(J, (*y.shape, J.shape[-1]))
     return y, J if seen is None else seen.errors(y, J, xp)

@@ -223,7 +223,9 @@ def test_the_pictures(tmp_path):
     np.testing.assert_allclose(spans, spans[0])
     legend = axis.get_legend()
     assert legend is not None
-    assert [t.get_text() for t in legend.get_texts()] == ["observed", "truth", "estimate"]
+    assert [t.get_text() for t in legend.get_texts()] == [
+        "observed", "truth", "estimate", "start", "end",
+    ]  # fmt: skip
     figure = plot_ins(belief, made.truth, made.streams["pose"], tmp_path / "states.png")
     titles = [a.get_title(loc="left") for a in figure.axes]
     assert {"roll", "pitch", "yaw", "velocity x", "gyro bias z", "error of position"} <= set(titles)
