@@ -68,22 +68,17 @@ def _models(s: OutdoorSensors) -> dict[str, Measurement]:
     found: dict[str, Measurement] = {}
     for name, noise, lever in (("gps", s.gps, s.gps_lever), ("gps2", s.gps2, s.gps2_lever)):
         if noise is not None:
-            place = _seen(PositionObserver(lever))
+            place = PositionObserver(lever)
             found[name] = MeasurementModel(OUTDOOR, place, np.repeat(noise**2, 3))
     if s.magnetometer is not None:
-        field, tesla = _seen(FieldObserver(s.field, s.magnetometer)), s.magnetometer
+        field, tesla = FieldObserver(s.field, s.magnetometer), s.magnetometer
         found["magnetometer"] = MeasurementModel(OUTDOOR, field, np.ones(3), read=lambda z: z.field / tesla)
     if s.altimeter is not None:
         read = lambda z: z.distance[..., None]
-        found["altimeter"] = MeasurementModel(OUTDOOR, _seen(observe_distance), [s.altimeter**2], read=read)
+        found["altimeter"] = MeasurementModel(OUTDOOR, observe_distance, [s.altimeter**2], read=read)
     if s.displacement is not None and s.turn is not None:
         found["optical_flow"] = MeasurementModel(
-            OUTDOOR, _seen(observe_flow), np.repeat(np.square([s.displacement, s.turn]), 3),
+            OUTDOOR, observe_flow, np.repeat(np.square([s.displacement, s.turn]), 3),
             measured_space=FLOW, read=lambda z: (z.displacement, z.turn),
         )  # fmt: skip
     return found
-
-
-def _seen(observe: Any) -> Any:
-    """An observer of `belief` without its Jacobian."""
-    return lambda x, xp: observe(x, xp)[0]
