@@ -253,7 +253,8 @@ def simulate_together(
     graph = _program(cases[0].graph.name, program, cases[0].graph)
     streams: Any = [_streams(case, graph) for case in cases]
     start: Any = None
-    if all(case is cases[0] for case in cases):
+    whole = any(cases[0] is one for one in _wholes.values())
+    if whole and all(case is cases[0] for case in cases):  # but for the seeds they are one run
         streams, start = streams[0], start_of(cases[0].graph)
     batch = run_many(
         graph, streams, seeds, options.but(init=start or [start_of(case.graph) for case in cases])

@@ -51,17 +51,17 @@ def test_runs_on_threads_are_those_of_one_at_a_time(tmp_path):
 
 
 def test_one_compilation_serves_all_seeds_and_noises(tmp_path, monkeypatch):
-    from flowgraph.engines.c import library as engine
+    from flowgraph.engines.c.lanes import library as engine
 
     tasks._programs.clear()
     compiled: list[Any] = []
-    made = engine.Compiled.__init__
+    made = engine.Lanes.__init__
 
     def counted(self, *arguments, **keywords):
         compiled.append(arguments)
         made(self, *arguments, **keywords)
 
-    monkeypatch.setattr(engine.Compiled, "__init__", counted)
+    monkeypatch.setattr(engine.Lanes, "__init__", counted)
     points = [{"position_noise": 0.001 * k, "gyro_factor": float(k)} for k in range(3, 8)]
     done = run_study(study("c", seeds=3, points=points, chunk=4), tmp_path)
     assert not done.failed
