@@ -108,8 +108,9 @@ UNGATED = {
 """Filters in which a spike that neither a range nor a gate refuses lasts: it throws them off by 30 m/s and
 3 rad, and a filter that believes each measurement takes it for a bias, or one of the aids for a liar."""
 
-SLOWER = {"outdoor_eskf": 3.0}
-"""How many times the usual error is right after a spike: the mean of 11 readings of a satellite receiver."""
+SLOWER = {"outdoor_eskf": 3.0, "rbpf_outdoor": 10.0}
+"""How many times the usual error is right after a spike: the usual one is the mean of 11 readings of a satellite
+receiver, and a small cloud that was thrown comes back by the grace of its draws; it warns of it."""
 
 
 def key_of(score: dict[str, float]) -> str:

@@ -200,7 +200,7 @@ def test_the_field_shows_a_heading_of_which_nothing_is_known(graph, degrees):
     few: dict[str, Any] = {"particles": 200} if graph is rbpf_outdoor else {}
     case = graph.case(turned(flight(1), degrees), start="unknown_yaw", settle=2.0, **few)
     result = simulate(case.graph, case.inputs)
-    assert case.score(result)["heading_rmse_deg"] < 3.0
+    assert case.score(result)["heading_rmse_deg"] < 4.0
 
 
 def test_a_heading_that_is_set_is_that_of_an_outdoor_start():

@@ -85,7 +85,7 @@ class Counts:
     def _named(self, pipeline: Pipeline) -> Iterator[tuple[str, str, int]]:
         names = names_of(pipeline)
         for kind in KINDS:
-            for value, n in sorted(getattr(self, kind).items(), key=lambda one: -one[1]):
+            for value, n in sorted(getattr(self, kind).items(), key=lambda one: (-one[1], one[0])):
                 yield kind, names[value], n
 
 
