@@ -109,7 +109,7 @@ UNGATED = {
 3 rad, and a filter that believes each measurement takes it for a bias, or one of the aids for a liar."""
 
 SLOWER = {"outdoor_eskf": 3.0, "rbpf_outdoor": 10.0}
-"""How many times the usual error is right after a spike: the usual one is the mean of 11 readings of a satellite
+"""How many times the usual error is right after a spike: the usual one is the mean of 11 readings of a
 receiver, and a small cloud that was thrown comes back by the grace of its draws; it warns of it."""
 
 
