@@ -7,16 +7,12 @@ from typing import Any
 
 from flowgraph.engines.c.nodes import Buffer, Node
 from flowgraph.engines.c.syntax import ctype, number
+from flowgraph.engines.comparisons import COMPARISONS
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import FUNCTIONS
 
 _INFIX = {
-    "equal": "==",
-    "not_equal": "!=",
-    "less": "<",
-    "less_equal": "<=",
-    "greater": ">",
-    "greater_equal": ">=",
+    **COMPARISONS,
     "logical_and": "&&",
     "logical_or": "||",
     "logical_xor": "!=",
@@ -27,7 +23,7 @@ _INFIX = {
 _LIBM = FUNCTIONS | {"floor", "ceil", "trunc"}
 IN_LANES = ("exp", "log", "sin", "cos", "atan2")
 """Functions that have a form without branches, which vectorises: see `vector_math`."""
-_ARITHMETIC = {"add": "+", "subtract": "-", "multiply": "*"}
+ARITHMETIC = {"add": "+", "subtract": "-", "multiply": "*"}
 
 
 class Expressions:
@@ -79,7 +75,7 @@ class Expressions:
         kind = node.args[0].dtype if node.args else dtype
         if op == "const":
             return number(node.extra[0], dtype, self.real)
-        if op in _ARITHMETIC:
+        if op in ARITHMETIC:
             return self._arithmetic(op, dtype, args)
         if op == "divide":
             return f"{args[0]} / {args[1]}"
@@ -134,7 +130,7 @@ class Expressions:
 
     def _arithmetic(self, op: str, dtype: str, args: Sequence[str]) -> str:
         """Whole numbers wrap around, as in NumPy, so they go through unsigned ones."""
-        sign = _ARITHMETIC[op]
+        sign = ARITHMETIC[op]
         if dtype in ("int32", "int64"):
             wide = f"uint{dtype[3:]}_t"
             return f"({dtype}_t)(({wide}){args[0]} {sign} ({wide}){args[1]})"

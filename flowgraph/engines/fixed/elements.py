@@ -6,20 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flowgraph.engines.comparisons import COMPARISONS
 from flowgraph.engines.fixed import rules, shifts
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.fixed.text import Text
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import Spec
 
-_COMPARE = {
-    "equal": "==",
-    "not_equal": "!=",
-    "less": "<",
-    "less_equal": "<=",
-    "greater": ">",
-    "greater_equal": ">=",
-}
 _JOIN = {"logical_and": "&&", "logical_or": "||"}
 _BITS = {"bitwise_and": "&", "bitwise_or": "|", "bitwise_xor": "^"}
 _WHOLE = {"floor": 0, "ceil": 1, "trunc": 2, "round": 3}
@@ -95,8 +88,8 @@ class Elements(Text):
             )
         p, q, at = shifts.aligned(s)
         a, b = f"fx_shift({x[0]}, {self.shift(p, index)})", f"fx_shift({x[1]}, {self.shift(q, index)})"
-        if op in _COMPARE:
-            return f"{a} {_COMPARE[op]} {b}"
+        if op in COMPARISONS:
+            return f"{a} {COMPARISONS[op]} {b}"
         if op in ("maximum", "minimum"):
             order = ">=" if op == "maximum" else "<="
             return f"{a} {order} {b} ? fx_shift({x[0]}, {ends[0]}) : fx_shift({x[1]}, {ends[1]})"
@@ -114,9 +107,9 @@ class Elements(Text):
         if op in ("add", "subtract", "multiply"):
             sign = {"add": "+", "subtract": "-", "multiply": "*"}[op]
             return self.wrapped(f"{u[0]} {sign} {u[1]}", i.spec)
-        if op in _COMPARE:
+        if op in COMPARISONS:
             a, b = u if big else x
-            return f"{a} {_COMPARE[op]} {b}"
+            return f"{a} {COMPARISONS[op]} {b}"
         if op in _JOIN:
             return f"{x[0]} {_JOIN[op]} {x[1]}"
         if op == "logical_xor":

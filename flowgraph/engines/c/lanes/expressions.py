@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flowgraph.engines.c.expressions import IN_LANES, Expressions
+from flowgraph.engines.c.expressions import ARITHMETIC, IN_LANES, Expressions
 from flowgraph.engines.c.nodes import Buffer, Node
 from flowgraph.engines.c.syntax import CTYPES, ctype
+from flowgraph.engines.comparisons import COMPARISONS
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.ops import FUNCTIONS
 
@@ -18,14 +19,6 @@ TYPES = {
     "int32": "fg_int",
     "uint32": "fg_uint",
 }
-_COMPARED = {
-    "equal": "==",
-    "not_equal": "!=",
-    "less": "<",
-    "less_equal": "<=",
-    "greater": ">",
-    "greater_equal": ">=",
-}
 _JOINED = {
     "logical_and": "&",
     "bitwise_and": "&",
@@ -35,7 +28,6 @@ _JOINED = {
     "bitwise_xor": "^",
 }
 _SHIFTS = {"bitwise_left_shift": "<<", "bitwise_right_shift": ">>"}
-_SIGNS = {"add": "+", "subtract": "-", "multiply": "*"}
 _EACH = (FUNCTIONS | {"floor", "ceil", "trunc"}) - {"remainder", "floor_divide", "pow"}
 
 
@@ -97,16 +89,16 @@ class LaneExpressions(Expressions):
         op, dtype, origin = node.op, node.dtype, node.origin
         kind = node.args[0].dtype
         a, b = args[0], args[-1]
-        if op in _SIGNS:
+        if op in ARITHMETIC:
             return self._sum(op, dtype, args)
         if op == "divide":
             return f"{a} / {b}"
         if op == "negative":
             return f"-{a}" if dtype == "real" else self._sum("subtract", dtype, (self.splat(dtype, "0"), a))
-        if op in _COMPARED:
+        if op in COMPARISONS:
             if kind == "bool" and op not in ("equal", "not_equal"):
                 raise no_lanes(f"{op} of truths", origin)
-            return self.compared(kind, f"{a} {_COMPARED[op]} {b}")
+            return self.compared(kind, f"{a} {COMPARISONS[op]} {b}")
         if op in _JOINED:
             return f"{a} {_JOINED[op]} {b}"
         if op == "where":
@@ -198,10 +190,10 @@ class LaneExpressions(Expressions):
         a, b = args
         if dtype in ("int32", "int64"):
             wide = TYPES[f"u{dtype}"]
-            return f"({TYPES[dtype]})(({wide}){a} {_SIGNS[op]} ({wide}){b})"
+            return f"({TYPES[dtype]})(({wide}){a} {ARITHMETIC[op]} ({wide}){b})"
         if dtype == "bool":
             return f"{a} {'|' if op == 'add' else '&'} {b}"
-        return f"{a} {_SIGNS[op]} {b}"
+        return f"{a} {ARITHMETIC[op]} {b}"
 
     def _turned(self, text: str, dtype: str) -> str:
         return f"__builtin_convertvector({text}, {TYPES[dtype]})"
