@@ -90,7 +90,7 @@ def _hours(stretches: int, engine: str, seed: int) -> Iterator[dict[str, Any]]:
             yield {
                 "hour": (n + 1) / of_hour, "ticks": ticks, "time_s": time * 1e-9,
                 "time_error_ns": time - ((n + 1) * STRETCH * 10**9 - 10**9 // RATE),
-                "memory_bytes": _memory(), "position_rmse_m": float(np.sqrt(np.concatenate(errors).mean())),
+                "memory_bytes": memory(), "position_rmse_m": float(np.sqrt(np.concatenate(errors).mean())),
                 "nees_mean": float(np.concatenate(nees).mean()), "dimension": 3,
                 "least_eigenvalue": least, "asymmetry": asymmetry, "us_per_tick": 1e6 * wall / ticks,
             }  # fmt: skip
@@ -118,7 +118,7 @@ def _position(time: np.ndarray) -> np.ndarray:
     return np.stack([RADIUS * np.sin(angle), RADIUS * (1.0 - np.cos(angle)), np.zeros(len(time))], axis=-1)
 
 
-def _memory() -> int:
+def memory() -> int:
     """Bytes of memory that this process holds; where the system does not tell, the most that it held."""
     try:
         with open("/proc/self/statm") as file:

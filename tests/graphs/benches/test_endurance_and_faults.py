@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 
 from flowgraph import DeclarationError, UnknownNameError
-from flowgraph.graphs.benches.endurance import endurance
+from flowgraph.graphs.benches.endurance import endurance, memory
 from flowgraph.graphs.benches.fault_kinds import faults_of
 from flowgraph.graphs.benches.faults import faults
 
 
 @pytest.mark.slow
 def test_some_minutes_of_flight_keep_time_memory_and_covariance():
+    held = memory()  # other tests of this process have left it with much
     report = endurance(hours=0.1)
     (row,) = report.rows
     assert row["ticks"] == 6 * 60 * 200
@@ -19,7 +20,7 @@ def test_some_minutes_of_flight_keep_time_memory_and_covariance():
     assert row["least_eigenvalue"] > 0.0
     assert row["asymmetry"] == 0.0
     assert 1.5 < row["nees_mean"] < 6.0
-    assert row["memory_bytes"] < 2**30
+    assert row["memory_bytes"] - held < 2**28
 
 
 def test_less_than_a_minute_is_refused():
