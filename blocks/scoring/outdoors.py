@@ -180,11 +180,13 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         on.note("assumed", "magnetic north is north: declination or date says where it is")
         return 0.5 * math.pi
 
-    def estimated(self, on: OnFlight, inputs: Mapping[str, Series], lever: bool) -> tuple[str, ...]:
+    def estimated(
+        self, on: OnFlight, inputs: Mapping[str, Series], name: str | None, lever: bool
+    ) -> tuple[str, ...]:
         """What is estimated beside the fifteen.
 
         Args:
-            lever: whether the flight says where the antenna sits.
+            name: of the stream of the positions. lever: whether the flight says where the antenna sits.
 
         Raises:
             UnknownNameError: for what cannot be.
@@ -197,8 +199,13 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
             return tuple(dict.fromkeys(names))
         found = []
         if "gnss" in inputs and not lever and _good(inputs["gnss"]):
-            found += ["lever", "time_offset"]
-            on.note("assumed", "nobody says where the antenna sits and how late it is: both are estimated")
+            if f"{name}.time_offset" in on.flight.info.get("sought", ()):
+                found.append("lever")
+                on.note("assumed", f"nobody says where the antenna sits: it is estimated")
+            else:
+                found += ["lever", "time_offset"]
+                said = "nobody says where the antenna sits and how late it is: both are estimated"
+                on.note("assumed", said)
         if "barometer" in inputs:
             found.append("height_offset")
         return tuple(found)

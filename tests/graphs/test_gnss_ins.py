@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,6 +21,7 @@ from flowgraph.blocks.outdoor.errors import at_antenna, directed_errors
 from flowgraph.blocks.scoring.outdoors import declination
 from flowgraph.blocks.signals import GeodeticPosition, Position
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.graphs.benches.drives import drives
 from flowgraph.graphs.benches.outdoor import outdoor
 from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.inertial.test_outdoors import moved
@@ -197,6 +199,19 @@ def test_a_drive_is_followed_as_well_as_is_said():
     assert 5.0 < mean("nees_mean") < 14.0
     assert 0.7 < mean("gnss_nis_mean") < 1.3
     assert 0.7 < mean("gnss_velocity_nis_mean") < 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the bench runs in C, and there is no compiler")
+def test_drives_are_as_good_as_their_bound_to_what_so_many_flights_tell():
+    """Their starts are drawn as wrong as is said; a filter with a wrong noise or equation is beyond it."""
+    row, *others = drives(flights=30, units="tactical", duration=30.0).rows
+    for what in ("position", "velocity", "attitude"):
+        ratio, deviation = row[f"{what}_over_bound"], row[f"{what}_over_bound_deviation"]
+        assert 0.01 < deviation < 0.12, what
+        assert abs(ratio - 1.0) < 3.0 * deviation + 0.02, what
+    assert np.hypot(row["east_rmse_m"], row["north_rmse_m"]) < row["position_rmse_m"]
+    assert [r["heading_rmse_deg"] for r in others] == [8.9, 0.81]
 
 
 @pytest.mark.slow
