@@ -201,7 +201,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         if "gnss" in inputs and not lever and _good(inputs["gnss"]):
             if f"{name}.time_offset" in on.flight.info.get("sought", ()):
                 found.append("lever")
-                on.note("assumed", f"nobody says where the antenna sits: it is estimated")
+                on.note("assumed", "nobody says where the antenna sits: it is estimated")
             else:
                 found += ["lever", "time_offset"]
                 said = "nobody says where the antenna sits and how late it is: both are estimated"

@@ -57,7 +57,7 @@ def driven(seconds: float, *, seed: int = 1) -> Flight:
     truth = flight.truth
     assert truth is not None
     rows = np.arange(0, len(truth), 5)
-    place = truth["position"][rows] + 0.02 * np.random.default_rng(seed).normal(size=(len(rows), 3))
+    place = truth["position"][rows] + 0.003 * np.random.default_rng(seed).normal(size=(len(rows), 3))
     rtk = Series(truth.time[rows] - round(seconds * 1e9), Position(position=place), name="rtk")
     info = {"imu_noise": flight.info["imu_noise"]}
     return Flight("driven", {"imu": flight.streams["imu"], "rtk": rtk}, info=info)
