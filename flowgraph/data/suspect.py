@@ -84,8 +84,8 @@ def _spikes(name: str, leaf: str, values: np.ndarray, t: np.ndarray) -> tuple[st
     far = float((off[alone] / scale[alone]).max())
     what = f"{name}: readings of {leaf} stand alone, {alone.sum()} of them"
     return (
-        note("warning", f"{what}, from {t[row + 1]:.3g} s after the first on: off from those beside them by up"
-             f" to {far:.2g} usual differences: spikes"),
+        note("warning", f"{what}, from {t[row + 1]:.3g} s after the first on: off from those beside them by"
+             f" up to {far:.2g} usual differences: spikes"),
     )  # fmt: skip
 
 
@@ -110,6 +110,6 @@ def _rate(name: str, t: np.ndarray) -> tuple[str, ...]:
         return ()
     since = (k + 1) * each * usual
     return (
-        note("warning", f"{name}: comes at {1.0 / after[k]:.4g} Hz from about {since:.2g} s after the first on,"
-             f" at {1.0 / before[k]:.4g} Hz before: a clock or a rate that changed"),
+        note("warning", f"{name}: comes at {1.0 / after[k]:.4g} Hz from about {since:.2g} s after the first"
+             f" on, at {1.0 / before[k]:.4g} Hz before: a clock or a rate that changed"),
     )  # fmt: skip
