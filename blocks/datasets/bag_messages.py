@@ -4,7 +4,7 @@
     geometry_msgs/PoseStamped                    Pose              vicon
     geometry_msgs/TransformStamped               Pose              vicon
     geometry_msgs/PoseWithCovarianceStamped      Pose              vicon, where no topic of those two is there
-    nav_msgs/Odometry                            Pose              vicon, likewise; as a velocity, GnssVelocity
+    nav_msgs/Odometry                            Pose              vicon, likewise; its velocity: GnssVelocity
     tf2_msgs/TFMessage, tf/tfMessage             Pose              vicon, likewise
     geometry_msgs/PointStamped                   Position          leica
     sensor_msgs/NavSatFix                        GnssFix           gps
@@ -21,7 +21,7 @@ gps_velocity the velocity of an Odometry, turned into its frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple
 
