@@ -15,7 +15,7 @@ import pytest
 
 from flowgraph import Flight, Series, load_flight, simulate
 from flowgraph.blocks.flights.drive import SENSORS
-from flowgraph.blocks.geometry.rotations import rotate
+from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate, to_matrix, to_rotation_vector
 from flowgraph.blocks.inertial.outdoors import Antenna
 from flowgraph.blocks.outdoor.errors import at_antenna, directed_errors
 from flowgraph.blocks.scoring.outdoors import declination
@@ -126,6 +126,50 @@ def test_engines_agree_with_all_sensors_and_all_parameters():
     result = engines_agree(case.graph, case.inputs)
     assert result["belief"]["parameters"].shape[1] == 11
     is_lowered_and_drawn(case, "predict", "fuse_gnss", "fuse_magnetometer", "fuse_barometer", "fuse_rest")
+
+
+def angle_between(p: np.ndarray, q: np.ndarray) -> float:
+    """The angle of the turn between two attitudes, rad."""
+    return float(2.0 * np.arccos(np.clip(abs(np.sum(p * q)), 0.0, 1.0)))
+
+
+def test_a_unit_of_navigation_grade_finds_north_by_the_turn_of_the_earth():
+    """At rest for 3 s: its heading is off by what is said, to which the white noise of the gyroscope and its
+    bias add up; over many seeds the errors are as large as their deviation."""
+    shares = []
+    for seed in range(12):
+        flight = drive(4.0, "gps", seed=seed, unit="navigation", imu__rate="50")
+        assert flight.truth is not None
+        case = gnss_ins.case(flight, start="unknown_yaw", estimate="none")
+        (said,) = [n for n in case.notes if "gyro compassing" in n]
+        assert said.startswith("info: the heading at the start is that of gyro compassing")
+        start = case.graph.settings["start"]
+        covariance = start.covariance[6:9, 6:9]
+        R = to_matrix(start.attitude, xp=np)
+        heading = np.sqrt((R @ covariance @ R.T)[2, 2])
+        assert np.degrees(heading) < 1.0
+        turn = to_rotation_vector(
+            multiply(flight.truth["attitude"][0], conjugate(start.attitude, xp=np), xp=np), xp=np
+        )
+        shares.append(turn[2] / heading)
+        assert angle_between(start.attitude, flight.truth["attitude"][0]) < np.radians(3.0)
+    assert 0.5 < np.sqrt(np.mean(np.square(shares))) < 1.6
+
+
+@pytest.mark.parametrize("unit", ["consumer", "tactical"])
+def test_a_unit_whose_bias_hides_the_turn_of_the_earth_is_no_compass(unit):
+    flight = drive(4.0, "gps", unit=unit, imu__rate="50")
+    case = gnss_ins.case(flight, start="unknown_yaw", estimate="none")
+    (said,) = [n for n in case.notes if "gyro compassing" in n]
+    assert said.startswith("refused: ")
+    assert case.graph.settings["start"].covariance[6:9, 6:9].max() > 0.1
+
+
+def test_a_unit_that_is_said_to_be_better_than_it_is_is_no_compass():
+    """The consumer's bias, said to be the navigator's: what it reads cannot be the Earth's turn."""
+    flight = drive(4.0, "gps", unit="consumer", imu__rate="50")
+    case = gnss_ins.case(flight, start="unknown_yaw", estimate="none", gyro_bias=1e-7)
+    assert any(n.startswith("refused: gyro compassing") for n in case.notes)
 
 
 def test_standing_still_is_used_where_it_is_asked_for():
