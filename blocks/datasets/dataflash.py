@@ -80,7 +80,8 @@ def read_dataflash(file: Path, *wanted: str) -> Log:
     if passed > _MOST_LOST * len(content):
         raise _broken(file, "much of it is no message", f"{passed} of {len(content)} bytes between messages")
     raw = np.frombuffer(content, dtype=np.uint8)
-    found, counted = {}, {}
+    found: dict[str, dict[str, np.ndarray]] = {}
+    counted: dict[str, int] = {}
     for number, kind in kinds.items():
         at = np.array(places.get(number, ()), dtype=np.int64)
         counted[kind.name] = counted.get(kind.name, 0) + len(at)

@@ -10,7 +10,7 @@ a drive of a minute has few independent errors of its slow attitude, so that twe
 All drives of a unit are one graph, compiled once; where a drive starts is a value of its run.
 
 Beside it stands what NaveGo publishes of its own synthetic drive with its own two units, which is another
-drive, in north, east and down.
+drive, in north, east and down. The last row is what a tick takes in C, beside one of `ins_eskf`.
 
 Sources: P. Tichavsky, C. Muravchik, A. Nehorai, "Posterior Cramer-Rao bounds for discrete-time nonlinear
 filtering", IEEE TSP 46(5), 1998 (here the Riccati equation along the truth); R. Gonzalez, J. Giribet,
@@ -20,6 +20,7 @@ H. Patino, "NaveGo: a simulation framework for low-cost integrated navigation sy
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -29,8 +30,9 @@ from flowgraph import Graph, Report, Series, load_flight, simulate
 from flowgraph.blocks.flights.drive import GRADES
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
-from flowgraph.blocks.signals import Belief
+from flowgraph.blocks.signals import Belief, Position
 from flowgraph.graphs.gnss_ins import gnss_ins
+from flowgraph.graphs.ins_eskf import ins_eskf
 
 PUBLISHED = (
     {
@@ -48,6 +50,8 @@ PUBLISHED = (
         "heading_rmse_deg": 0.81,
     },
 )
+
+_RUNS = 200
 
 FIGURES = {"position_rmse_m": 1.0, "velocity_rmse_mps": 1.0, "attitude_rmse_deg": 180.0 / np.pi}
 
@@ -81,7 +85,25 @@ def drives(
         assert bounds is not None
         rows.append({"unit": unit, "flights": flights, **_row(np.array(squares), bounds)})
         rows[-1]["wall_s"] = perf_counter() - begin
-    return Report([*rows, *({**r} for r in PUBLISHED)])
+    return Report([*rows, *({**r} for r in PUBLISHED), _ticks()])
+
+
+def _ticks() -> dict[str, Any]:
+    """What a tick of gnss_ins takes in C beside one of ins_eskf: the least of some runs of one drive, of
+    positions alone for the one and with velocities for the other."""
+    flight = load_flight("sim:drive", settings={"duration": "10"})  # short: few runs are interrupted
+    gnss = gnss_ins.case(flight, estimate="none")
+    fixes = gnss.inputs["gnss"]  # type: ignore[index]
+    place = Series(fixes.time, Position(position=fixes["position"]), name="leica")
+    capture = replace(flight, streams={"imu": flight.streams["imu"], "leica": place})
+    cases = {"gnss_ins": gnss, "ins_eskf": ins_eskf.case(capture)}
+    found = dict.fromkeys(cases, np.inf)
+    for _ in range(_RUNS):  # in turn, so that what else the machine does meets both
+        for name, case in cases.items():
+            run = simulate(case.graph, case.inputs, engine="c")
+            found[name] = min(found[name], 1e6 * run.wall_s / run.ticks)
+    took = {f"{name}_us_per_tick": value for name, value in found.items()}
+    return {"unit": "a tick in C", **took, "ticks_ratio": found["gnss_ins"] / found["ins_eskf"]}
 
 
 def _row(squares: np.ndarray, bounds: np.ndarray) -> dict[str, float]:
