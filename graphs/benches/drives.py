@@ -51,7 +51,7 @@ PUBLISHED = (
     },
 )
 
-_RUNS = 200
+_RUNS = 40
 
 FIGURES = {"position_rmse_m": 1.0, "velocity_rmse_mps": 1.0, "attitude_rmse_deg": 180.0 / np.pi}
 
