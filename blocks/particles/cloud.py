@@ -46,6 +46,7 @@ __all__ = [
     "weights",
 ]
 
+DEPTH = 64.0
 _SQUARINGS = 5
 _ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
 _SPREAD = StartSpread()
@@ -84,7 +85,7 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
     error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
-    return LogLikelihood(value=xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant)
+    return LogLikelihood(value=within_depth(xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant, xp=xp))
 
 
 @block
@@ -93,8 +94,13 @@ def reweight(cloud: Cloud, position: LogLikelihood, attitude: LogLikelihood, *, 
 
     log w' = log w + log p_1 + log p_2 - log(sum over all particles).
     """
-    log_weight = cloud.log_weight + position.value + attitude.value
+    log_weight = within_depth(cloud.log_weight + position.value + attitude.value, xp=xp)
     return cloud.replace(log_weight=log_weight - log_sum_exp(log_weight, xp=xp))
+
+
+def within_depth(x: Array, *, xp: Any) -> Array:
+    least = xp.max(x) - DEPTH
+    return xp.where(x > least, x, least)
 
 
 def log_sum_exp(x: Array, *, xp: Any) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.particles.cloud import within_depth
 from flowgraph.blocks.signals import Cloud, Imu, LogLikelihood, Pose
 
 __all__ = ["correct_motion", "predict_motion"]
@@ -130,7 +131,7 @@ def correct_motion(
         position_covariance=_symmetric(r * lanes.matrix_product(inverse, P), xp),
     )
     log_likelihood = -0.5 * (distance + log_determinant + 3.0 * math.log(2.0 * math.pi))
-    return corrected, LogLikelihood(value=log_likelihood)
+    return corrected, LogLikelihood(value=within_depth(log_likelihood, xp=xp))
 
 
 def _symmetric(a: Array, xp: Any) -> Array:

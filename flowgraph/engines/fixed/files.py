@@ -8,16 +8,13 @@ the outputs, and calls `fx_end`. A real x goes in as the whole number nearest to
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
-from flowgraph.data.files import put
 from flowgraph.engines.fixed.engine import Integers, need_formats
 from flowgraph.engines.fixed.shifts import slim
 from flowgraph.engines.fixed.source import Source
-from flowgraph.errors import LoweringError, writes
+from flowgraph.errors import LoweringError
 from flowgraph.pipeline.formats import FREE
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -46,23 +43,17 @@ def patterns_with_formats(pipeline: Pipeline) -> tuple[list[int], list[int]]:
     return known, unknown
 
 
-def write_fixed(pipeline: Pipeline, folder: Path) -> Mapping[str, Path]:
-    """Write a pipeline with formats as C into a folder; returns the files by their names.
+def texts_of(pipeline: Pipeline) -> tuple[Source, dict[str, str]]:
+    """A pipeline with formats as C, and the texts of its header and source by file name.
 
     Raises:
-        DeclarationError: where it has no formats; OutputError: where the files cannot be written.
+        DeclarationError: where it has no formats.
     """
     known, unknown = patterns_with_formats(need_formats(pipeline))
     source = Source(pipeline, known)
     name = f"{pipeline.name}_fixed"
-    files = {f"{name}.h": _header(source, unknown), f"{name}.c": f"{source.text}\n{_start(source)}"}
-    found = {}
-    for file, text in files.items():
-        found[file] = folder / file
-        with writes(found[file]):
-            folder.mkdir(parents=True, exist_ok=True)
-            put(found[file], text)
-    return found
+    texts = {f"{name}.h": _header(source, unknown), f"{name}.c": f"{source.text}\n{_start(source)}"}
+    return source, texts
 
 
 def _start(source: Source) -> str:
