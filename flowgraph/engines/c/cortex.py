@@ -3,9 +3,9 @@
 A program runs on an emulated board (Arm's MPS2 with a Cortex-M4 or M7). It reads its events and prints its
 outputs through the debugger's calls (semihosting), so the program is the very one that replays on the host.
 Calls of the filter go through a meter. Each instruction takes one step of virtual time (`-icount`), which the
-system timer tells; a stretch of 1,500 known instructions says what its steps are. So counts are
-exact, and they are instructions: how many cycles a core takes for them, with its memories and its pipeline,
-no emulator says. The stack below a call is painted before and looked at behind.
+system timer tells; a stretch of 1,500 known instructions says what its steps are. So counts are good to two.
+They are of instructions: how many cycles a core takes for them, with its memories and its pipeline, no
+emulator says. The stack below a call is painted before and looked at behind.
 """
 
 from __future__ import annotations
@@ -89,79 +89,93 @@ def meter_text(headers: Sequence[str], functions: Sequence[Metered], ram: str) -
     wraps = []
     for f in functions:
         kind, rest = f.head.split(f.name, 1)
-        given = ", ".join(f.arguments)
-        wraps.append(
-            f"{kind}__real_{f.name}{rest};\n{kind}__wrap_{f.name}{rest};\n{kind}__wrap_{f.name}{rest}\n{{\n"
-            f"    paint();\n    const uint32_t begun = *value;\n    {kind}made = __real_{f.name}({given});\n"
-            f"    const uint32_t ended = *value;\n"
-            f"    told((unsigned)({f.pattern}) & 255u, begun - ended, {int(f.last)});\n    return made;\n}}\n"
-        )
+        text = _WRAP.replace("REAL", f"{kind}__real_{f.name}{rest}")
+        text = text.replace("WRAPPED", f"{kind}__wrap_{f.name}{rest}").replace("KIND ", kind)
+        text = text.replace("CALL", f"__real_{f.name}({', '.join(f.arguments)})")
+        wraps.append(text.replace("PATTERN", f.pattern).replace("LAST", str(int(f.last))))
     includes = "\n".join(f'#include "{h}"' for h in headers)
-    return f"{includes}\n#include <stdio.h>\n#define RAM ({ram})\n{_METER}\n" + "\n".join(wraps)
+    return (
+        f"{includes}\n#include <stdint.h>\n#include <stdio.h>\n#define RAM ({ram})\n{_METER}\n"
+        + "\n".join(wraps)
+    )
 
+
+_WRAP = """REAL;
+WRAPPED;
+WRAPPED
+{
+    meter_paint();
+    const uint32_t begun = *meter_value;
+    KIND made = CALL;
+    const uint32_t ended = *meter_value;
+    meter_told((unsigned)(PATTERN) & 255u, begun - ended, LAST);
+    return made;
+}
+"""
 
 _METER = r"""
 /* the system timer counts down, 24 bits */
-static volatile uint32_t *const control = (volatile uint32_t *)0xE000E010u;
-static volatile uint32_t *const reload = (volatile uint32_t *)0xE000E014u;
-static volatile uint32_t *const value = (volatile uint32_t *)0xE000E018u;
+static volatile uint32_t *const meter_control = (volatile uint32_t *)0xE000E010u;
+static volatile uint32_t *const meter_reload = (volatile uint32_t *)0xE000E014u;
+static volatile uint32_t *const meter_value = (volatile uint32_t *)0xE000E018u;
 enum { PAINTED = 32768, PAINT = 0x5AA55AA5, BELOW = 16 };
-static uint64_t spent[256], calls[256];
-static uint32_t deepest, empty, known, wrong;
+static uint64_t meter_spent[256], meter_calls[256];
+static uint32_t meter_deepest, meter_empty, meter_known, meter_wrong;
 
-static inline __attribute__((always_inline)) uint32_t *top(void)
+static inline __attribute__((always_inline)) uint32_t *meter_top(void)
 {
     uint32_t *sp;
     __asm volatile("mov %0, sp" : "=r"(sp));
     return sp - BELOW;
 }
 
-static inline __attribute__((always_inline)) void paint(void)
+static inline __attribute__((always_inline)) void meter_paint(void)
 {
-    volatile uint32_t *at = top();
+    volatile uint32_t *at = meter_top();
     for (int k = 0; k < PAINTED / 4; ++k) *--at = PAINT;
 }
 
-static inline __attribute__((always_inline)) void told(unsigned key, uint32_t steps, int last)
+static inline __attribute__((always_inline)) void meter_told(unsigned key, uint32_t steps, int last)
 {
-    const volatile uint32_t *const at = top();
+    const volatile uint32_t *const at = meter_top();
     uint32_t depth = PAINTED / 4;
     while (depth > 0 && at[-(int)depth] == PAINT) --depth;
-    if (4u * (depth + BELOW) > deepest) deepest = 4u * (depth + BELOW);
-    if ((*control >> 16 & 1u) != 0) ++wrong; /* it went through zero: more than it can count */
-    spent[key] += (steps - empty) & 0xFFFFFFu;
-    calls[key] += (uint64_t)last;
-    *value = 0;
-    (void)*control;
+    if (4u * (depth + BELOW) > meter_deepest) meter_deepest = 4u * (depth + BELOW);
+    if ((*meter_control >> 16 & 1u) != 0) ++meter_wrong; /* it went through zero: more than it can count */
+    meter_spent[key] += (steps - meter_empty) & 0xFFFFFFu;
+    meter_calls[key] += (uint64_t)last;
+    *meter_value = 0;
+    (void)*meter_control;
 }
 
-static __attribute__((constructor)) void begin(void)
+static __attribute__((constructor)) void meter_begin(void)
 {
-    *reload = 0xFFFFFFu;
-    *value = 0;
-    *control = 5u;
-    (void)*control;
-    uint32_t begun = *value, ended = *value;
-    empty = begun - ended;
-    begun = *value;
+    *meter_reload = 0xFFFFFFu;
+    *meter_value = 0;
+    *meter_control = 5u;
+    (void)*meter_control;
+    uint32_t begun = *meter_value, ended = *meter_value;
+    meter_empty = begun - ended;
+    begun = *meter_value;
     __asm volatile(".rept 1500\n nop\n .endr");
-    ended = *value;
-    known = begun - ended - empty;
-    *value = 0;
-    (void)*control;
+    ended = *meter_value;
+    meter_known = begun - ended - meter_empty;
+    *meter_value = 0;
+    (void)*meter_control;
 }
 
-static __attribute__((destructor)) void end(void)
+static __attribute__((destructor)) void meter_end(void)
 {
     const char *before = "";
     FILE *file = fopen("measured.json", "w");
     if (file == NULL) return;
     fprintf(file, "{\"ram\": %lu, \"stack\": %lu, \"known\": %lu, \"wrong\": %lu, \"patterns\": {",
-            (unsigned long)RAM, (unsigned long)deepest, (unsigned long)known, (unsigned long)wrong);
+            (unsigned long)RAM, (unsigned long)meter_deepest, (unsigned long)meter_known,
+            (unsigned long)meter_wrong);
     for (int k = 0; k < 256; ++k) {
-        if (calls[k] == 0) continue;
-        fprintf(file, "%s\"%d\": [%llu, %llu]", before, k, (unsigned long long)calls[k],
-                (unsigned long long)(spent[k] * 1500u / known));
+        if (meter_calls[k] == 0) continue;
+        fprintf(file, "%s\"%d\": [%llu, %llu]", before, k, (unsigned long long)meter_calls[k],
+                (unsigned long long)(meter_spent[k] * 1500u / meter_known));
         before = ", ";
     }
     fprintf(file, "}}\n");

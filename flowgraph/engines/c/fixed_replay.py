@@ -58,12 +58,12 @@ class _Tables:
             self.lines.append(f"static const int16_t {self._fractions[row]}[] = {{{numbers}}};")
         return self._fractions[row]
 
-    def port(self, name: str, leaves: Sequence[tuple[Leaf, int, np.ndarray | None]]) -> int:
+    def port(self, name: str, leaves: Sequence[tuple[Leaf, int, int, np.ndarray | None]]) -> int:
         rows = []
-        for leaf, place, fraction in leaves:
+        for leaf, place, bits, fraction in leaves:
             count = math.prod(leaf.shape)
-            rows.append(f"{{{place}, {count}, {self.fraction(fraction, count, leaf.shape)}}}")
-        self.lines.append(f"static const leaf {name}[] = {{{', '.join(rows) or '{0, 0, NULL}'}}};")
+            rows.append(f"{{{place}, {count}, {bits}, {self.fraction(fraction, count, leaf.shape)}}}")
+        self.lines.append(f"static const leaf {name}[] = {{{', '.join(rows) or '{0, 0, 0, NULL}'}}};")
         return len(rows)
 
 
@@ -74,7 +74,7 @@ def main_of_fixed(source: Source) -> str:
     tables, given = _Tables(), []
     for k, (port, name) in enumerate(zip(pipeline.inputs, csv_names(pipeline.inputs), strict=True)):
         leaves = [
-            (leaf, source.place[leaf.value],
+            (leaf, source.place[leaf.value], pipeline.formats.width_of(leaf.value),
              pipeline.formats.fractions.get(leaf.value, np.array(0)) if leaf.dtype == "real" else None)
             for leaf in port.leaves
         ]  # fmt: skip
@@ -88,7 +88,7 @@ def main_of_fixed(source: Source) -> str:
             if flag is None:
                 continue
             made = [
-                (leaf, source.place[n], bound.fractions[n] if leaf.dtype == "real" else None)
+                (leaf, source.place[n], 0, bound.fractions[n] if leaf.dtype == "real" else None)
                 for leaf, n in zip(pipeline.outputs[p].leaves, values, strict=True)
             ]
             count = tables.port(f"out{key}_{p}", made)
@@ -99,11 +99,10 @@ def main_of_fixed(source: Source) -> str:
         cases.append(f"    case {key}: print(ports{key}, {len(rows)}); break;")
     longest = max((len(s.encode()) for s in csv_names(pipeline.inputs)), default=0)
     numbers = max((sum(math.prod(x.shape) for x in p.leaves) for p in pipeline.inputs), default=0)
-    most = 2 ** (pipeline.formats.width - 1) - 1
     text = _TEXT.replace("TITLE", comment(pipeline.name)).replace("HEADER", f"{pipeline.name}_fixed.h")
     for mark, value in (
         ("TABLES", "\n".join(tables.lines)), ("GIVEN", ",\n    ".join(given)), ("CASES", "\n".join(cases)),
-        ("LINE", str(64 + longest + 65 * max(numbers, 1))), ("MOST", f"INT64_C({most})"),
+        ("LINE", str(64 + longest + 65 * max(numbers, 1))), 
         ("KEEPS", string(KEEPS)),
     ):  # fmt: skip
         text = text.replace(f"@{mark}@", value)
@@ -119,7 +118,7 @@ _TEXT = r"""/* Replays events through TITLE in fixed point: replay EVENTS.csv [S
 #include <stdlib.h>
 #include <string.h>
 
-typedef struct { int place, count; const int16_t *fraction; } leaf; /* without fractions: whole numbers */
+typedef struct { int place, count, bits; const int16_t *fraction; } leaf; /* no fractions: whole numbers */
 typedef struct { const char *name; int present, count; const leaf *leaves; } port;
 static const int64_t none = -((int64_t)1 << 62); /* a reading that is not there */
 
@@ -162,15 +161,16 @@ static int64_t whole(const char *text)
 }
 
 /* a number as a word: the nearest, half upwards, or the largest */
-static int64_t word(const char *text, int fraction)
+static int64_t word(const char *text, int fraction, int bits)
 {
+    const int64_t most = ((int64_t)1 << (bits - 1)) - 1;
     char *end;
     double x = strtod(text, &end);
     if (*end != 0) refuse("this is no number:", text);
     if (x - x != 0 && !keeps) refuse("not finite:", text);
     if (x != x) return none;
     x = floor(ldexp(x, fraction) + 0.5);
-    return x > (double)@MOST@ ? @MOST@ : x < -(double)@MOST@ ? -@MOST@ : (int64_t)x;
+    return x > (double)most ? most : x < -(double)most ? -most : (int64_t)x;
 }
 
 static void read(const port *p, char **rest)
@@ -179,7 +179,7 @@ static void read(const port *p, char **rest)
         const leaf *x = &p->leaves[l];
         for (int k = 0; k < x->count; ++k) {
             const char *text = field(rest);
-            w[x->place + k] = x->fraction != NULL ? word(text, x->fraction[k]) : whole(text);
+            w[x->place + k] = x->fraction != NULL ? word(text, x->fraction[k], x->bits) : whole(text);
         }
     }
 }

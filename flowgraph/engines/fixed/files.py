@@ -15,7 +15,7 @@ from flowgraph.engines.fixed.engine import Integers, need_formats
 from flowgraph.engines.fixed.shifts import slim
 from flowgraph.engines.fixed.source import Source
 from flowgraph.errors import LoweringError
-from flowgraph.pipeline.formats import FREE
+from flowgraph.pipeline.formats import FREE, Formats
 from flowgraph.pipeline.pipeline import Pipeline
 
 _MOST_INPUTS = 8
@@ -86,7 +86,7 @@ def _header(source: Source, unknown: list[int]) -> str:
         f"#define {guard}",
         "#include <stdint.h>",
         "",
-        f"/* {pipeline.name} in fixed point of {player.formats.width} bits.",
+        f"/* {pipeline.name} in fixed point of {_bits(player.formats)} bits.",
         "   A real x is the whole number nearest to x 2^fraction.",
         "   Words lie in w, each value row by row from its place on; begin with a copy of fx_first. */",
         f"enum {{ FX_WORDS = {source.size}, FX_COUNTERS = {len(source.lost)} }};",
@@ -119,6 +119,11 @@ def _header(source: Source, unknown: list[int]) -> str:
     if unknown:
         lines.append(f"/* patterns without formats: {', '.join(map(str, unknown))} */")
     return "\n".join([*lines, "", "#endif", ""])
+
+
+def _bits(formats: Formats) -> str:
+    held = f", registers and what is added up in them {formats.held_width}" if formats.held else ""
+    return f"{formats.width}{held}"
 
 
 def _place(name: str, place: int, shape: tuple[int, ...], dtype: str, fraction: np.ndarray | None) -> str:
