@@ -181,10 +181,13 @@ def _held(pipeline: Pipeline) -> frozenset[int]:
     for i in reversed(pipeline.instructions):
         if i.out in found and (i.op in MOVES or i.op in _CARRYING):
             found.update(a for a in i.args if specs[a].dtype == "real")
+        elif i.out in found and i.op == "divide":
+            found.add(i.args[0])
     return frozenset(found - set(pipeline.constants))
 
 
 _CARRYING = frozenset(["add", "subtract", "where", "maximum", "minimum"])
+"""What only adds or chooses; of a quotient, as by a norm, the numerator is carried as well."""
 
 
 def _beside_its_diagonal(size: np.ndarray) -> np.ndarray:
