@@ -123,6 +123,7 @@ def _rows(
         functions = [
             Metered(f"int {f}{takes}", f, names, "key", f == "fx_end") for f in ("fx_compute", "fx_end")
         ]
+        tables: tuple[str, ...] = ("fx_first",)
         ram = "FX_WORDS * sizeof(int64_t) + FX_WORDS + 1 + (FX_COUNTERS + 1) * sizeof(int64_t)"
     else:
         write_c(pipeline, folder, dtype)
@@ -131,11 +132,11 @@ def _rows(
         file, react = f"{m}.c", f"{m}_react"
         arguments = ("s", "time", "present", *given(source.names), *made(source.names))
         functions = [Metered(react_signature(source.names), react, arguments, "present")]
-        ram = f"sizeof({m}_state)"
+        ram, tables = f"sizeof({m}_state)", ()
     host = on_host(folder, file, events).splitlines()
     rows = []
     for core in cores:
-        took = measure(core, folder, file, functions, ram, events)
+        took = measure(core, folder, file, functions, ram, events, tables)
         rows.append({"graph": name, "core": core, "dtype": dtype} | _row(took, host))
     return rows
 

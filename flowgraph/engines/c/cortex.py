@@ -242,7 +242,7 @@ class Measured:
 
 
 def measure(core: str, folder: Path, filter_file: str, functions: Sequence[Metered], ram: str,
-            events: Path) -> Measured:  # fmt: skip
+            events: Path, tables: Sequence[str] = ()) -> Measured:  # fmt: skip
     """Build a written filter with its `main.c` for a core, replay events on it, and say what it took.
 
     Args:
@@ -252,6 +252,7 @@ def measure(core: str, folder: Path, filter_file: str, functions: Sequence[Meter
         functions: what is called of it.
         ram: the expression of the bytes that are kept for it.
         events: that `main.c` reads.
+        tables: names of constants that a program needs besides the functions.
 
     Raises:
         MissingDependencyError: where a tool is missing.
@@ -262,13 +263,13 @@ def measure(core: str, folder: Path, filter_file: str, functions: Sequence[Meter
     here.mkdir(exist_ok=True)
     flags = [*made.flags, *FLAGS, "-I.."]
     header = filter_file[:-2] + ".h"
-    for name, text in (
+    for name, body in (
         ("start.c", _START), ("link.ld", _LINK), ("meter.c", meter_text([header], functions, ram)),
     ):  # fmt: skip
-        put(here / name, text)
+        put(here / name, body)
     _do([COMPILER, *flags, "-c", f"../{filter_file}", "-o", "filter.o"], here)
     wraps = [f"-Wl,--wrap={f.name}" for f in functions]
-    kept = [f"-Wl,-u,{f.name}" for f in functions]
+    kept = [f"-Wl,-u,{name}" for name in (*(f.name for f in functions), *tables)]
     whole = ["--specs=rdimon.specs", "-T", "link.ld", *wraps, "start.c", "meter.c", "../main.c", "filter.o"]
     _do([COMPILER, *flags, "-o", "replay.elf", *whole, "-lm"], here)
     alone = ["-nostartfiles", "-Wl,--gc-sections", f"-Wl,-e,{functions[0].name}", *kept]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from flowgraph.engines.c.cortex import Metered, measure, missing, need_tools, on
 from flowgraph.engines.c.fixed_replay import write_fixed
 from flowgraph.engines.c.header import react_signature
 from flowgraph.engines.c.names import given, made
+from flowgraph.engines.fixed.files import texts_of
 from flowgraph.pipeline.optimise import COMPILED, optimise
 from flowgraph.pipeline.plain import plain
 from tests.engines.fixed.test_fixed import formats_of
@@ -108,3 +110,27 @@ def test_without_the_tools_it_is_said_what_to_install(monkeypatch):
         need_tools()
     assert "qemu-system-arm" in refused.value.fix
     assert "arm-none-eabi-gcc" in refused.value.got
+
+
+_HEAD = re.compile(r"^[A-Za-z_][\w *]*?\b(\w+)\([^;{}]*\)\s*\{", re.MULTILINE)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "fixed"])
+def test_a_filter_has_no_heap_no_recursion_and_no_jumps(dtype):
+    if dtype == "fixed":
+        pipeline = replace(plain(lower(library_case("kalman", 0.5).graph)), formats=formats_of("kalman", 24))
+        text = next(t for name, t in texts_of(pipeline)[1].items() if name.endswith(".c"))
+    else:
+        text = generate(lower(library_case("rbpf_indoor", 0.1).graph), dtype).source
+    bare = re.sub(r"#.*", "", re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL))
+    starts = list(_HEAD.finditer(bare))
+    assert len(starts) > 10
+    for k, start in enumerate(starts):
+        body = bare[start.end() : starts[k + 1].start() if k + 1 < len(starts) else len(bare)]
+        below = {s[1] for s in starts[k:]}
+        assert not below & set(re.findall(r"\b(\w+)\(", body)), start[1]
+    words = set(re.findall(r"\w+", bare))
+    assert not words & {"malloc", "calloc", "realloc", "free", "alloca", "goto", "setjmp", "longjmp"}
+    for loop in re.findall(r"\bfor \(([^{]*?;[^{]*?;[^{]*?)\)", bare):
+        assert loop.split(";")[1].strip(), "a loop without an end"
+    assert all("low < high" in w or "step <=" in w for w in re.findall(r"while \([^)]*\)", bare))
