@@ -31,6 +31,7 @@ from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.language.stamps import stamp_of
 from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
+from flowgraph.language.typed import Namespace, typed_block
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
 from flowgraph.moved import lead as _lead
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
@@ -152,6 +153,7 @@ __all__ = [
     "LiveView",
     "LoweringError",
     "MissingDependencyError",
+    "Namespace",
     "OutputError",
     "Pipeline",
     "PipelineError",
@@ -218,6 +220,7 @@ __all__ = [
     "ticks",
     "timeouts",
     "timing_of",
+    "typed_block",
     "until",
     "unzip",
     "when",

@@ -22,7 +22,7 @@ from flowgraph.verbs import verb
 if TYPE_CHECKING:
     from flowgraph.language.builder import Builder
 
-T = TypeVar("T")
+T = TypeVar("T", covariant=True)
 
 
 class Stream(Generic[T]):
@@ -156,7 +156,7 @@ class Held(Generic[T]):
         """A stream that samples this value at a clock."""
         return typing.cast("Stream[T]", _SAMPLE(self, at=clock, name=name))
 
-    def feed(self, stream: Stream[T]) -> None:
+    def feed(self, stream: Stream[T]) -> None:  # type: ignore[misc]  # what is written fits what is read
         """Write `stream` into this register at the end of each tick in which it is present."""
         self.builder.feed(self, stream)
 
