@@ -15,6 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gallery
+
 import flowgraph.blocks
 from flowgraph import Block, Signal, find_graph
 from flowgraph.data.registry import graph_names
@@ -138,6 +140,8 @@ def filled(markdown: str, drawn: Collection[str] = ()) -> str:
     for mark, text in MARKS.items():
         if mark in markdown:
             markdown = markdown.replace(mark, text())
+    if "<!-- gallery -->" in markdown:
+        markdown = markdown.replace("<!-- gallery -->", gallery.gallery(drawn))
     if "<!-- graphs -->" in markdown:
         markdown = markdown.replace("<!-- graphs -->", graphs(markdown, drawn))
     return markdown
