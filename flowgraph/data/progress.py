@@ -112,7 +112,8 @@ def _cell_of_notebook() -> Any:
     from IPython.display import DisplayHandle  # likewise
 
     shell = get_ipython()
-    return DisplayHandle() if shell is not None and hasattr(shell, "kernel") else None
+    made: Any = DisplayHandle
+    return made() if shell is not None and hasattr(shell, "kernel") else None
 
 
 def tick_count(inputs: Flight | Mapping[str, Any]) -> int | None:

@@ -82,7 +82,7 @@ def graph_cell(graph: Graph) -> dict[str, str]:
     """A graph: its diagram, and behind a line the one that unfolds."""
     bundle = {"text/plain": graph.text()}
     try:
-        picture = draw(graph)
+        picture: str | None = str(draw(graph))
     except MissingDependencyError:  # without a layout engine there is still the text
         picture = None
     if picture is not None:

@@ -156,7 +156,7 @@ class Held(Generic[T]):
         """A stream that samples this value at a clock."""
         return typing.cast("Stream[T]", _SAMPLE(self, at=clock, name=name))
 
-    def feed(self, stream: Stream[T]) -> None:  # type: ignore[misc]  # what is written fits what is read
+    def feed(self, stream: Stream[T]) -> None:
         """Write `stream` into this register at the end of each tick in which it is present."""
         self.builder.feed(self, stream)
 

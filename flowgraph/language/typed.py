@@ -11,12 +11,16 @@ nor take any away. Therefore
 - it has one to four ports, given by position, up to three outputs, and no state.
 """
 
+# The first overload that fits is meant, so they overlap: a function whose ports are three would also fit two,
+# and one that returns Any, which alone fits Never, would fit a tuple.
+# mypy: disable-error-code="overload-overlap"
+
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, Never, ParamSpec, TypeAlias, TypeVar, overload
 
 from flowgraph.language.block import Block
 from flowgraph.language.stream import Held, Stream
@@ -41,9 +45,7 @@ if TYPE_CHECKING:
     class Typed1(Block[Any], Generic[A, P, Out]):
         """A block with one port."""
 
-        def __call__(  # type: ignore[override]
-            self, a: In[A], /, *args: P.args, **settings: P.kwargs
-        ) -> Out: ...
+        def __call__(self, a: In[A], /, *args: P.args, **settings: P.kwargs) -> Out: ...
 
         def wired(
             self, *, at: object = None, name: str | None = None, draws: Any = None
@@ -52,9 +54,7 @@ if TYPE_CHECKING:
     class Typed2(Block[Any], Generic[A, B, P, Out]):
         """A block with two ports."""
 
-        def __call__(  # type: ignore[override]
-            self, a: In[A], b: In[B], /, *args: P.args, **settings: P.kwargs
-        ) -> Out: ...
+        def __call__(self, a: In[A], b: In[B], /, *args: P.args, **settings: P.kwargs) -> Out: ...
 
         def wired(
             self, *, at: object = None, name: str | None = None, draws: Any = None
@@ -63,9 +63,7 @@ if TYPE_CHECKING:
     class Typed3(Block[Any], Generic[A, B, C, P, Out]):
         """A block with three ports."""
 
-        def __call__(  # type: ignore[override]
-            self, a: In[A], b: In[B], c: In[C], /, *args: P.args, **settings: P.kwargs
-        ) -> Out: ...
+        def __call__(self, a: In[A], b: In[B], c: In[C], /, *args: P.args, **settings: P.kwargs) -> Out: ...
 
         def wired(
             self, *, at: object = None, name: str | None = None, draws: Any = None
@@ -74,7 +72,7 @@ if TYPE_CHECKING:
     class Typed4(Block[Any], Generic[A, B, C, D, P, Out]):
         """A block with four ports."""
 
-        def __call__(  # type: ignore[override]
+        def __call__(
             self, a: In[A], b: In[B], c: In[C], d: In[D], /, *args: P.args, **settings: P.kwargs
         ) -> Out: ...
 
@@ -85,70 +83,56 @@ if TYPE_CHECKING:
 
 @overload
 def typed_block(
+    step: Callable[Concatenate[A, B, C, D, P], Never], /
+) -> Typed4[A, B, C, D, P, Stream[Any]]: ...
+@overload
+def typed_block(
     step: Callable[Concatenate[A, B, C, D, P], tuple[X | None, Y | None, Z | None]], /
 ) -> Typed4[A, B, C, D, P, tuple[Stream[X], Stream[Y], Stream[Z]]]: ...
-
-
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, C, D, P], tuple[X | None, Y | None]], /
 ) -> Typed4[A, B, C, D, P, tuple[Stream[X], Stream[Y]]]: ...
-
-
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, C, D, P], X | None], /
 ) -> Typed4[A, B, C, D, P, Stream[X]]: ...
-
-
+@overload
+def typed_block(step: Callable[Concatenate[A, B, C, P], Never], /) -> Typed3[A, B, C, P, Stream[Any]]: ...
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, C, P], tuple[X | None, Y | None, Z | None]], /
 ) -> Typed3[A, B, C, P, tuple[Stream[X], Stream[Y], Stream[Z]]]: ...
-
-
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, C, P], tuple[X | None, Y | None]], /
 ) -> Typed3[A, B, C, P, tuple[Stream[X], Stream[Y]]]: ...
-
-
 @overload
 def typed_block(step: Callable[Concatenate[A, B, C, P], X | None], /) -> Typed3[A, B, C, P, Stream[X]]: ...
-
-
+@overload
+def typed_block(step: Callable[Concatenate[A, B, P], Never], /) -> Typed2[A, B, P, Stream[Any]]: ...
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, P], tuple[X | None, Y | None, Z | None]], /
 ) -> Typed2[A, B, P, tuple[Stream[X], Stream[Y], Stream[Z]]]: ...
-
-
 @overload
 def typed_block(
     step: Callable[Concatenate[A, B, P], tuple[X | None, Y | None]], /
 ) -> Typed2[A, B, P, tuple[Stream[X], Stream[Y]]]: ...
-
-
 @overload
 def typed_block(step: Callable[Concatenate[A, B, P], X | None], /) -> Typed2[A, B, P, Stream[X]]: ...
-
-
+@overload
+def typed_block(step: Callable[Concatenate[A, P], Never], /) -> Typed1[A, P, Stream[Any]]: ...
 @overload
 def typed_block(
     step: Callable[Concatenate[A, P], tuple[X | None, Y | None, Z | None]], /
 ) -> Typed1[A, P, tuple[Stream[X], Stream[Y], Stream[Z]]]: ...
-
-
 @overload
 def typed_block(
     step: Callable[Concatenate[A, P], tuple[X | None, Y | None]], /
 ) -> Typed1[A, P, tuple[Stream[X], Stream[Y]]]: ...
-
-
 @overload
 def typed_block(step: Callable[Concatenate[A, P], X | None], /) -> Typed1[A, P, Stream[X]]: ...
-
-
 def typed_block(step: Callable[..., Any], /) -> Any:
     """A block whose calls a type checker checks: `@typed_block`; otherwise as `@block`.
 
