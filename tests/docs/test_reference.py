@@ -74,6 +74,8 @@ def test_every_public_name_has_an_entry_in_the_reference(monkeypatch: pytest.Mon
         assert f"[`{name}`](flowgraph.md#flowgraph.{name})" in pages["api/index.md"]
     for package in reference.packages():
         for name in reference.names(package):
+            if not str(getattr(getattr(package, name), "__module__", "")).startswith("flowgraph"):
+                continue  # the name of a type, which has no docstring
             assert (getattr(package, name).__doc__ or "").strip(), (
                 f"{package.__name__}.{name} has no docstring"
             )
