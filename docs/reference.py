@@ -31,7 +31,10 @@ def packages() -> list[ModuleType]:
 
 def names(package: ModuleType) -> list[str]:
     """The public names of a package, without its modules, which have pages or docstrings of their own."""
-    return [n for n in package.__all__ if not inspect.ismodule(getattr(package, n))]
+    modules = {info.name for info in pkgutil.iter_modules(package.__path__)}
+    return [
+        n for n in package.__all__ if n not in modules or not inspect.ismodule(getattr(package, n, package))
+    ]
 
 
 def place(package: ModuleType) -> str:

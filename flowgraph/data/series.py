@@ -436,7 +436,7 @@ class Flight:
                 path=self.name,
                 expected=f"streams {', '.join(names)}",
                 got=", ".join(self.streams) or "no stream",
-                fix=f"{fix}, or build {graph} with your own sources",
+                fix=f"{fix}, or a graph that fits: flowgraph inspect names them",
             )
         for name in names:
             if not len(self.streams[name]):
