@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph.errors import DataError
 
@@ -22,7 +22,8 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
     found = np.full((len(angles), 4), np.nan)
     if whole.any():
         picked = angles[whole][:, ["xyz".index(axis) for axis in order]]
-        found[whole] = Rotation.from_euler(order.upper(), picked).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        turned = scipy.spatial.transform.Rotation.from_euler(order.upper(), picked)
+        found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found
 
 
@@ -54,5 +55,6 @@ def from_matrices(values: np.ndarray, where: Callable[[int], str], *, by_rows: b
             got=str(np.round(matrices[k], 4).tolist()),
             fix="check the order of the columns, or mend or delete the row",
         )
-    found[whole] = Rotation.from_matrix(matrices[whole]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    turned = scipy.spatial.transform.Rotation.from_matrix(matrices[whole])
+    found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found
