@@ -45,8 +45,17 @@ def place(package: ModuleType) -> str:
 def page(package: ModuleType) -> str:
     """The text of a package's page, which the docstrings are put into when it is built."""
     parts = [f"# {package.__name__}", inspect.getdoc(package) or ""]
-    parts += [f"::: {package.__name__}.{name}" for name in names(package)]
+    parts += [entry(package, name) for name in names(package)]
     return "\n\n".join(parts) + "\n"
+
+
+def entry(package: ModuleType, name: str) -> str:
+    """What stands for a name: its docstring, or of a constant and of the name of a type what it is."""
+    thing, full = getattr(package, name), f"{package.__name__}.{name}"
+    if str(getattr(thing, "__module__", "")).startswith("flowgraph") and hasattr(thing, "__name__"):
+        return f"::: {full}"
+    value = " ".join(repr(thing).split())
+    return f"## {name} {{ #{full} }}\n\n```text\n{value if len(value) <= 300 else value[:300] + ' ...'}\n```"
 
 
 def contents() -> str:
