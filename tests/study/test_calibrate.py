@@ -73,6 +73,7 @@ def test_the_vectors_of_two_streams_tell_the_offset_whichever_is_moved(seconds, 
     assert back.offset == pytest.approx(-seconds, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("flown", "seconds"), [("path_2", 0.12), ("path_11", 0.47), ("path_23", -0.61)])
 def test_where_sizes_do_not_agree_vectors_do(flown, seconds):
     """A quadrotor: its force is hardly more than gravity. The offsets are those of a correlation by the
