@@ -9,7 +9,7 @@ import scipy  # its parts are loaded when they are used
 
 from flowgraph.errors import DataError
 
-__all__ = ["ORDERS", "from_angles", "from_matrices"]
+__all__ = ["ORDERS", "from_angles", "from_matrices", "from_ned_attitude"]
 
 ORDERS = ("zyx", "zxy", "xyz", "xzy", "yxz", "yzx")
 """In which order the body turns about its own axes; the first is that of yaw, pitch, roll."""
@@ -23,6 +23,23 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
     if whole.any():
         picked = angles[whole][:, ["xyz".index(axis) for axis in order]]
         turned = scipy.spatial.transform.Rotation.from_euler(order.upper(), picked)
+        found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    return found
+
+
+_ENU, _FLU = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+"""North, east, down to east, north, up; forward, left, up to forward, right, down."""
+
+
+def from_ned_attitude(q: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4), w first, of forward, left, up in east, north, up, of those of forward, right, down
+    in north, east, down; rows with a NaN are NaN."""
+    whole = np.isfinite(q).all(axis=1)
+    found = np.full(q.shape, np.nan)
+    if whole.any():
+        Rotation = scipy.spatial.transform.Rotation
+        enu, flu = Rotation.from_matrix(_ENU), Rotation.from_matrix(_FLU)
+        turned = enu * Rotation.from_quat(q[whole][:, [1, 2, 3, 0]]) * flu
         found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found
 
