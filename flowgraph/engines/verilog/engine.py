@@ -1,0 +1,48 @@
+"""The engine `verilog`: the pipeline as a microcoded machine in Verilog, played in Verilator."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from flowgraph.data.files import put
+from flowgraph.engines.contract import PipelineEngine, Player
+from flowgraph.engines.fixed.engine import need_formats
+from flowgraph.engines.fixed.files import patterns_with_formats
+from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.simulate import Simulated, verilator
+from flowgraph.engines.verilog.text import texts
+from flowgraph.errors import writes
+from flowgraph.pipeline.pipeline import Pipeline
+
+
+class VerilogEngine(PipelineEngine):
+    """Registers, multipliers and block memory, clock by clock; equal to the engine `fixed` to the bit."""
+
+    name = "verilog"
+    dtypes = ("fixed", "float64")  # the second is what a user gets who leaves dtype out
+    writes = True
+
+    def need(self) -> None:
+        verilator()
+
+    def prepare(
+        self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
+    ) -> Player:
+        pipeline.need_numbers("fixed")
+        return Simulated(need_formats(pipeline), patterns)
+
+    def write(
+        self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
+    ) -> Mapping[str, Path]:
+        known, _ = patterns_with_formats(need_formats(pipeline))
+        found = {}
+        for name, text in texts(Image(pipeline, known)).items():
+            found[name] = folder / name
+            with writes(found[name]):
+                folder.mkdir(parents=True, exist_ok=True)
+                put(found[name], text)
+        return found
+
+
+ENGINE = VerilogEngine()
