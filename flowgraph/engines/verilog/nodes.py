@@ -152,7 +152,7 @@ class Nodes:
         total = 0
         for t in terms:
             t = self._plain(t)
-            value = self._value(t, floor)
+            value = self._value(t, floor, limit != NO_LIMIT)
             if value is None:
                 kept.append(t)
             else:
@@ -197,14 +197,14 @@ class Nodes:
         shift = 63 if t.shift > 62 else max(t.shift, -62)
         return t if shift == t.shift else Term(t.kind, t.a, t.b, shift, t.minus)
 
-    def _value(self, t: Term, floor: bool) -> int | None:
+    def _value(self, t: Term, floor: bool, cut: bool) -> int | None:
         """The value of a term before its sign, where it is known."""
         if t.kind == "ZERO" or (t.shift == 63 and t.kind not in ("DYN", "TAKE")):
             return 0
         a, b = self.known(t.a), self.known(t.b)
         if t.kind == "MUL":
             if a is not None and b is not None:
-                return shifted(a * b, t.shift, floor)
+                return shifted(a * b, t.shift, floor, cut)
             return 0 if 0 in (a, b) and t.a not in self.doubtful and t.b not in self.doubtful else None
         if t.kind in ("SEL", "SELN"):
             return 0 if a == 0 else None
@@ -214,7 +214,7 @@ class Nodes:
             return None
         if t.kind in ("AND", "OR", "XOR"):
             made = {"AND": a & b, "OR": a | b, "XOR": a ^ b}[t.kind]
-            return shifted(made, t.shift, floor)
+            return shifted(made, t.shift, floor, cut)
         return abs(a).bit_length() if t.kind == "BITS" else None
 
     def _ended(self, total: int, end: int, mode: str, floor: bool) -> int:
@@ -235,7 +235,7 @@ class Nodes:
         """Terms that make a known number."""
         if -(2**32) < total < 2**32:
             return [Term("MUL", self.constant(total), self.one)]
-        places = (total & -total).bit_length() - 1
+        places = min((total & -total).bit_length() - 1, 32)
         rest = total >> places
         if -(2**32) < rest < 2**32:
             return [Term("MUL", self.constant(rest), self.one, -places)]
@@ -263,14 +263,14 @@ class Nodes:
         return node.mode in ("FIT", "LT", "LE", "EQ", "NE")
 
 
-def shifted(x: int, by: int, floor: bool = False) -> int:
+def shifted(x: int, by: int, floor: bool = False, cut: bool = True) -> int:
     """x 2^-by as the machine shifts: to the nearest, halves upwards; to the left up to +-2^62."""
     if by > 62:
         return 0
     if by >= 0:
         return x >> by if floor or by == 0 else (x + (1 << (by - 1))) >> by
     by = min(-by, 62)
-    return max(min(x << by, z.LIMIT), -z.LIMIT)
+    return max(min(x << by, z.LIMIT), -z.LIMIT) if cut else x << by
 
 
 NONE_WORD = -(1 << 35)
