@@ -39,7 +39,7 @@ from flowgraph.verbs import provide as _provide
 if _TYPE_CHECKING:
     from flowgraph.data.arrival import batched, delayed, reorder, replayed, timeouts
     from flowgraph.data.batch import Batch
-    from flowgraph.data.export import write_table, write_tum
+    from flowgraph.data.export.text import write_table, write_tum
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
@@ -64,8 +64,8 @@ _LATER = {
     "replayed": "flowgraph.data.arrival",
     "timeouts": "flowgraph.data.arrival",
     "Batch": "flowgraph.data.batch",
-    "write_table": "flowgraph.data.export",
-    "write_tum": "flowgraph.data.export",
+    "write_table": "flowgraph.data.export.text",
+    "write_tum": "flowgraph.data.export.text",
     "arrays": "flowgraph.data.inputs",
     "clocks_of": "flowgraph.data.inputs",
     "ticks": "flowgraph.data.inputs",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Annotated
 
 import typer
@@ -11,6 +12,7 @@ from flowgraph.cli.options import AsJson, Seed, Settings, Truth, pairs
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, table
 from flowgraph.data.contents import contents, graphs_for
 from flowgraph.data.registry import flight_settings, load_flight
+from flowgraph.data.suspect import suspect_readings
 from flowgraph.errors import UnknownNameError
 
 
@@ -32,11 +34,10 @@ def inspect(
     flight = load_flight(spec, seed=seed, settings=given, truth=truth)
     rows = contents(flight)
     graphs = graphs_for(flight)
+    notes = [*flight.notes, *chain.from_iterable(map(suspect_readings, flight.streams.values()))]
     if as_json:
-        return print_json(
-            {"flight": flight.name, "streams": rows, "graphs": graphs, "notes": list(flight.notes)}
-        )
-    for note in flight.notes:
+        return print_json({"flight": flight.name, "streams": rows, "graphs": graphs, "notes": notes})
+    for note in notes:
         err_console.print(f"note: {note}", markup=False)
     shown = [
         {

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
+from flowgraph.cli.export import EXPORT_HELP, exported, wanted_forms
 from flowgraph.cli.options import (
     SEED_HELP,
     AsJson,
@@ -47,7 +48,7 @@ from flowgraph.cli.terminal import (
     without_font_warnings,
     writing,
 )
-from flowgraph.data.export import write_tum
+from flowgraph.data.export.text import write_tum
 from flowgraph.data.files import put
 from flowgraph.data.notes import note
 from flowgraph.data.progress import ProgressBar
@@ -120,6 +121,7 @@ def run(
     settings: Settings = None,
     settings_file: SettingsFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="For diagram, plots and metrics.")] = None,
+    export: Annotated[str | None, typer.Option(metavar="FORMS", help=EXPORT_HELP)] = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A page of the run, with diagram, plots and a slider.")
     ] = None,
@@ -149,6 +151,7 @@ def run(
     graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
     truth, settings = command.truth, command.settings
     kept = kept_in(checkpoint, every, resume, command)
+    forms = wanted_forms(export, out)
     if out is not None:
         make_ready(out)
     others = runs_before(html, beside)
@@ -177,6 +180,9 @@ def run(
     report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
     report |= {"truth": truth} if truth else {}
     report["notes"] = list(notes)
+    if out is not None and forms:
+        say(tuple(exported(forms, out, case, flight, result)))
+        report["notes"] = list(notes)
     if out is not None:
         report["notes"] += _write_report(out, case, flight, result, report)
     if html is not None:

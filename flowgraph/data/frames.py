@@ -15,7 +15,7 @@ import numpy as np
 from flowgraph.errors import DataError, DeclarationError, MissingDependencyError, UnknownNameError
 from flowgraph.types import ArrayType, StructType, Type, leaves_of, struct_type
 
-__all__ = ["frame_of", "part_words", "signal_of", "stamps_of"]
+__all__ = ["columns_of", "frame_of", "part_words", "signal_of", "stamps_of"]
 
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 """Of numbers that are stamps, in ns."""
@@ -223,6 +223,11 @@ def frame_of(time: np.ndarray, leaves: Mapping[str, np.ndarray], type_: Type) ->
         MissingDependencyError: without pandas.
     """
     pandas = _pandas("to_pandas")
+    return pandas.DataFrame(columns_of(leaves, type_), index=pandas.Index(time, name="time"))
+
+
+def columns_of(leaves: Mapping[str, np.ndarray], type_: Type) -> dict[str, np.ndarray]:
+    """A column (n,) a number, by the name of its field and part: `position.x`, `covariance.0.1`."""
     columns: dict[str, np.ndarray] = {}
     for name, array in leaves.items():
         lone = isinstance(type_, ArrayType)
@@ -230,7 +235,7 @@ def frame_of(time: np.ndarray, leaves: Mapping[str, np.ndarray], type_: Type) ->
             words = [] if lone else [name]
             words += part_words(name, array.shape[1:], at)
             columns[".".join(words) or name] = array[(slice(None), *at)]
-    return pandas.DataFrame(columns, index=pandas.Index(time, name="time"))
+    return columns
 
 
 def part_words(name: str, shape: tuple[int, ...], at: tuple[int, ...]) -> list[str]:

@@ -27,6 +27,7 @@ from flowgraph.data.notes import said
 from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
+from flowgraph.data.suspect import suspect_readings
 from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
@@ -71,11 +72,13 @@ class Case:
         return {n: s for n, s in inputs.items() if isinstance(s, Series) and n in self.graph.sources}
 
     def remarks(self, result: Result) -> tuple[str, ...]:
-        """All notes on a run: the case's, the result's, those of the score, and where a NIS is far from 1."""
+        """All notes on a run: the case's, the result's, those of the score, where a NIS is far from 1, and
+        what the readings show of their own sensors."""
         tell = getattr(self.score, "remarks", None)
         told = tell(result) if tell is not None else ()
         far = (far_nis(measured(name), s) for name, s in result.series.items() if "nis" in s.leaves)
-        return said((*self.notes, *result.notes, *told, *chain.from_iterable(far)))
+        suspect = map(suspect_readings, self.recorded.values())
+        return said((*self.notes, *result.notes, *told, *chain.from_iterable((*far, *suspect))))
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flowgraph.data.export import to_xarray
-from flowgraph.data.series import Series
-from flowgraph.errors import UnknownNameError
+from flowgraph.data.export.mcap_file import write_mcap
+from flowgraph.data.export.rerun_file import write_rerun
+from flowgraph.data.export.tables import write_parquet
+from flowgraph.data.export.text import write_table
+from flowgraph.data.export.trees import to_xarray
+from flowgraph.data.series import Flight, Series
+from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.verbs import verb
 
@@ -76,6 +80,65 @@ class Result:
     def to_pandas(self) -> dict[str, Any]:
         """A pandas `DataFrame` a stream, by name, each with a `time` of its own (int64 ns). Needs pandas."""
         return {name: series.to_pandas() for name, series in self.series.items()}
+
+    def to_csv(self, file: str | Path, *, also: Mapping[str, Series] | None = None) -> None:
+        """One csv table of all streams, which `table:FILE` reads; see `flowgraph.write_table`."""
+        write_table(Flight(self.graph, self._with(also)), file)
+
+    def to_parquet(self, folder: str | Path, *, also: Mapping[str, Series] | None = None) -> dict[str, Path]:
+        """A Parquet file a stream, a row a time; see `flowgraph.data.export.tables`. Needs pyarrow.
+
+        Args:
+            folder: for NAME.parquet.
+            also: series beside the outputs, by a name that no output has.
+
+        Returns:
+            The files by stream.
+        """
+        return write_parquet(self._with(also), folder, about=self.about)
+
+    def to_mcap(self, file: str | Path, *, also: Mapping[str, Series] | None = None) -> tuple[str, ...]:
+        """An MCAP file, which Foxglove opens; see `flowgraph.data.export.mcap_file`. Needs mcap.
+
+        Args:
+            file: to be written.
+            also: series beside the outputs, such as `{"truth": flight.truth}`.
+
+        Returns:
+            Notes on what could not be placed.
+        """
+        return write_mcap(self._with(also), file, about=self.about)
+
+    def to_rerun(self, file: str | Path, *, also: Mapping[str, Series] | None = None) -> tuple[str, ...]:
+        """A recording of Rerun; see `flowgraph.data.export.rerun_file`. Needs rerun-sdk. As `to_mcap`."""
+        return write_rerun(self._with(also), file, name=self.graph, about=self.about)
+
+    @property
+    def about(self) -> dict[str, object]:
+        """What is said of a run in the files that it goes out in: graph, engine, ticks, counts and notes."""
+        notes = {f"note {k}": words for k, words in enumerate(self.notes, 1)}
+        return {"graph": self.graph, "engine": self.engine, "ticks": self.ticks, **self.stats, **notes}
+
+    def _with(self, also: Mapping[str, Series] | None) -> dict[str, Series]:
+        """The streams, and others beside them.
+
+        Raises:
+            DeclarationError: where two are called the same.
+        """
+        both = sorted({*self.series} & {*(also or {})})
+        if both:
+            raise DeclarationError(
+                "two series are called the same",
+                path=f"{self.graph}: {both[0]}",
+                expected="a name that no output has",
+                got=f"an output {both[0]!r} already",
+                fix="give what is written beside the outputs another name",
+            )
+        return {**self.series, **(also or {})}
+
+    def __dir__(self) -> list[str]:
+        """The outputs are attributes too."""
+        return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})
 
     def __repr__(self) -> str:
         return f"<Result of {self.graph} ({self.engine}): {self.ticks} ticks, {', '.join(self.series)}>"

@@ -69,14 +69,14 @@ _FIGURES = re.compile(r"[-+]?\d[\d.e+-]*")
 _SAYS = ("warning: ", "bridged: ", "refused: ", "counted: ", "skipped: ", "diverged: ")
 
 
-def faults(*, graphs: str = "all", kinds: str = "all", seed: int = 0, engine: str = "python") -> Report:
+def faults(*, graphs: str = "all", kinds: str = "all", seed: int = 0, engine: str | None = None) -> Report:
     """Each fault of each sensor on every pose filter, gates on and off: recovered, covered, said, or silent.
 
     Args:
         graphs: names, with commas between; all if left out.
         kinds: words with which the names of faults begin, with commas between, such as "dropout,late".
         seed: of the flights.
-        engine: that flies them; a flight is short, so that C pays for clouds alone.
+        engine: that flies them; if left out C for clouds, and Python for all else, since a flight is short.
 
     Raises:
         UnknownNameError: for a graph that is none of those that are flown here.
@@ -86,9 +86,13 @@ def faults(*, graphs: str = "all", kinds: str = "all", seed: int = 0, engine: st
         if name not in FLOWN:
             raise UnknownNameError("graph of this bench", name, FLOWN)
     wanted = ("",) if kinds == "all" else tuple(kinds.split(","))
-    rows = [row for name in names for row in _rows(name, wanted, seed, engine)]
+    rows = [row for name in names for row in _rows(name, wanted, seed, engine or _quick(name))]
     counts = {v: sum(r["verdict"] == v for r in rows) for v in dict.fromkeys(r["verdict"] for r in rows)}
     return Report(rows, notes=("info: " + ", ".join(f"{n} {v}" for v, n in sorted(counts.items())),))
+
+
+def _quick(name: str) -> str:
+    return "c" if "particles" in FLOWN[name][1] else "python"
 
 
 @dataclass(frozen=True)

@@ -496,6 +496,32 @@ class _Breaks:
         raise RuntimeError("no ink")
 
 
+@pytest.mark.slow
+def test_a_run_is_exported_beside_its_flight(tmp_path):
+    reader = pytest.importorskip("mcap.reader", reason="needs the extra mcap")
+    done = invoke(*RUN, "--out", str(tmp_path), "--export", "csv, mcap", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert f"wrote {tmp_path / 'run.mcap'}" in done.stderr
+    head = (tmp_path / "streams.csv").read_text().partition("\n")[0]
+    assert "belief.position.x [m]" in head
+    assert "flight.truth.attitude.w" in head
+    with open(tmp_path / "run.mcap", "rb") as stream:
+        channels = reader.make_reader(stream).get_summary().channels.values()
+    assert {"/belief/pose", "/flight/truth/pose", "/flight/imu", "/tf"} <= {c.topic for c in channels}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [(("--export", "mcap"), "--out DIR"), (("--out", "{}", "--export", "mcap,xls"), "'xls'")],
+)
+def test_what_cannot_be_exported_is_refused_before_the_run(options, words, tmp_path, monkeypatch):
+    monkeypatch.setattr("flowgraph.cli.filters.simulate", None)
+    done = invoke(*RUN, *(o.format(tmp_path / "new") for o in options))
+    assert done.exit_code != 0
+    assert words in done.stderr
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("what", ["Graph.draw", "drawing.canvas.new_figure", "drawing.trajectory.plot_space"])
 def test_a_picture_that_fails_takes_no_results_with_it(what, tmp_path, monkeypatch):
     monkeypatch.setattr(f"flowgraph.{what}", _Breaks)

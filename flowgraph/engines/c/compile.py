@@ -121,8 +121,8 @@ def _home() -> str:
         return ""
 
 
-def _places() -> Iterator[Path]:
-    """Folders for libraries, the best first; another than the user's is said once."""
+def places() -> Iterator[Path]:
+    """Folders for libraries and texts, the best first; another than the user's is said once."""
     first = cache_folder()
     if first is not None:
         yield first
@@ -246,7 +246,7 @@ def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
     stem = next((n[:-2] for n in files if n.endswith(".c")), "code")
     name = f"{stem}-{hashlib.sha256(said.encode()).hexdigest()[:40]}.so"
     refused: OutputError | None = None
-    for folder in _places():
+    for folder in places():
         target = folder / name
         if _is_whole(target):
             return target, False
@@ -331,10 +331,10 @@ def _workplace(folder: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Kept:
-    """A compiled filter in the cache.
+    """A compiled filter in the cache, or the text that it is compiled from.
 
     Args:
-        file: of the library.
+        file: of the library or text.
         filter: whose it is.
         bytes: its size.
         made: when, in seconds since 1970.
@@ -347,9 +347,9 @@ class Kept:
 
 
 def kept(folder: Path) -> list[Kept]:
-    """The compiled filters in a cache folder, the newest first."""
+    """What is kept of filters in a cache folder, compiled ones and their texts, the newest first."""
     found = []
-    for file in folder.glob("*.so"):
+    for file in (*folder.glob("*.so"), *folder.glob("*.json")):
         name = _NAME.fullmatch(file.stem)
         with suppress(OSError):
             if name:  # not a library of the user's own
@@ -378,7 +378,7 @@ def clear(folder: Path) -> int:
 
 def _sweep(folder: Path) -> None:
     """Remove what killed processes have left: folders to compile in, and halves of libraries."""
-    for old in [*folder.glob(f"{_WORK}*"), *folder.glob(".*.so.part")]:
+    for old in [*folder.glob(f"{_WORK}*"), *folder.glob(".*.so.part"), *folder.glob(".*.json.part")]:
         with suppress(OSError):
             descriptor = os.open(old, os.O_RDONLY)
             try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,9 @@ import numpy as np
 
 from flowgraph.engines.c.compile import FLAGS, LOOPS, load
 from flowgraph.engines.c.loop import loop_text
+from flowgraph.engines.c.names import names_of
 from flowgraph.engines.c.source import every_pattern, generate
+from flowgraph.engines.c.texts import kept_text, presence_of_rows, presence_rows
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
@@ -85,11 +87,18 @@ class Outputs:
     Args:
         pipeline: that is played.
         real: float64 or float32.
-        source: its `presence_of` tells by a pattern of inputs what is present.
+        presence: by pattern of inputs, or None for all, the outputs that are present for certain and those
+            that can be, a bit each.
     """
 
-    def __init__(self, pipeline: Pipeline, real: Any, source: Any) -> None:
-        self.pipeline, self.real, self.source = pipeline, np.dtype(real), source
+    def __init__(
+        self, pipeline: Pipeline, real: Any, presence: Mapping[int | None, tuple[int, int]]
+    ) -> None:
+        self.pipeline, self.real, self._presence = pipeline, np.dtype(real), presence
+
+    def presence_of(self, key: int) -> tuple[int, int]:
+        """The outputs that are present for certain in a tick of this pattern, and those that can be."""
+        return self._presence.get(None if None in self._presence else key, (0, 0))
 
     def kind(self, dtype: str) -> np.dtype[Any]:
         """What a leaf's numbers are kept as."""
@@ -100,13 +109,13 @@ class Outputs:
         counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
         found = []
         for port in range(len(self.pipeline.outputs)):
-            bits = [(n, *(p >> port & 1 for p in self.source.presence_of(k))) for k, n in counts.items()]
+            bits = [(n, *(p >> port & 1 for p in self.presence_of(k))) for k, n in counts.items()]
             found.append((sum(n for n, _, may in bits if may), all(m == must for _, must, m in bits)))
         return found
 
     def present(self, key: np.ndarray, port: int) -> np.ndarray:
         """(T,) bool: where an output is whose presence follows from the patterns alone."""
-        there = {int(k): bool(self.source.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
+        there = {int(k): bool(self.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
         if len(set(there.values())) == 1:
             return np.full(len(key), next(iter(there.values())))
         return np.isin(key, [k for k, holds in there.items() if holds])
@@ -143,28 +152,32 @@ class Compiled(Outputs):
         flags: tuple[str, ...] | None = None,
         passes: tuple[str, ...] = (),
     ) -> None:
-        every = every_pattern(pipeline) is not None
-        source = generate(
-            pipeline,
-            np.dtype(real).name,
-            patterns=None if every else keys,
-            tidy=lambda program: optimise(program, passes),
-            checked=False,  # faults and what is not finite are looked for by whoever plays
-        )
-        super().__init__(pipeline, real, source)
-        m = self.source.names.module
-        files = {
-            f"{m}.h": self.source.header,
-            f"{m}.c": self.source.source,
-            "fg_loop.c": loop_text(pipeline, self.source),
-        }
-        self._library = load(files, flags or (LOOPS if source.longest >= _LONG else FLAGS))
+        patterns = None if every_pattern(pipeline) is not None else sorted(keys)
+        dtype = np.dtype(real).name
+
+        def write() -> dict[str, Any]:
+            source = generate(
+                pipeline,
+                dtype,
+                patterns=patterns,
+                tidy=lambda program: optimise(program, passes),
+                checked=False,  # faults and what is not finite are looked for by whoever plays
+            )
+            m = source.names.module
+            loop = loop_text(pipeline, source)
+            files = {f"{m}.h": source.header, f"{m}.c": source.source, "fg_loop.c": loop}
+            presence = presence_rows(source.presence)
+            return {"files": files, "longest": source.longest, "presence": presence}
+
+        names = names_of(pipeline)
+        text = kept_text(pipeline, names.module, ("whole", dtype, patterns, passes), write)
+        super().__init__(pipeline, real, presence_of_rows(text["presence"]))
+        self._library = load(text["files"], flags or (LOOPS if text["longest"] >= _LONG else FLAGS))
         self.play_ticks = self._library.fg_play
         self.play_ticks.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 7]
         self.play_ticks.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
         self.size = int(self._library.fg_size())
-        names = self.source.names
         self._inputs = [
             self._struct(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)
         ]

@@ -113,7 +113,7 @@ VERILATOR ?= verilator
 SOURCES = {name}.v {modules}
 
 obj/V{name}: $(SOURCES) bench.cpp
-\t$(VERILATOR) --cc --exe --build -O3 -CFLAGS -O2 --top-module {name} --Mdir obj $(SOURCES) bench.cpp
+\t$(VERILATOR) --cc --exe --build -CFLAGS -O1 --top-module {name} --Mdir obj $(SOURCES) bench.cpp
 
 lint:
 \t$(VERILATOR) --lint-only -Wall --top-module {name} $(SOURCES)

@@ -13,7 +13,9 @@ from flowgraph.engines.c.compile import FLAGS, CompileError, load
 from flowgraph.engines.c.lanes.expressions import NoLanesError
 from flowgraph.engines.c.lanes.source import WIDTH, generate_lanes
 from flowgraph.engines.c.library import Outputs, Room, Structs, pointers
+from flowgraph.engines.c.names import names_of
 from flowgraph.engines.c.source import every_pattern
+from flowgraph.engines.c.texts import kept_text, presence_of_rows, presence_rows
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
@@ -34,14 +36,20 @@ class Lanes(Outputs):
     """
 
     def __init__(self, pipeline: Pipeline, keys: Sequence[int], passes: tuple[str, ...]) -> None:
-        source = generate_lanes(pipeline, keys, lambda program: optimise(program, passes))
-        super().__init__(pipeline, np.float64, source)
-        self._library = load({f"{source.names.module}_lanes.c": source.text}, FLAGS)
+        names, file = names_of(pipeline), f"{names_of(pipeline).module}_lanes.c"
+
+        def write() -> dict[str, Any]:
+            source = generate_lanes(pipeline, keys, lambda program: optimise(program, passes))
+            return {"files": {file: source.text}, "presence": presence_rows(source.presence)}
+
+        patterns = None if every_pattern(pipeline) is not None else sorted(keys)
+        text = kept_text(pipeline, names.module, ("lanes", patterns, passes), write)
+        super().__init__(pipeline, np.float64, presence_of_rows(text["presence"]))
+        self._library = load(text["files"], FLAGS)
         self._library.fg_play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 6]
         self._library.fg_play.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
         self.size = int(self._library.fg_size())
-        names = source.names
         self._inputs = [
             self._lanes(p.leaves, n) for p, n in zip(pipeline.inputs, names.input_leaves, strict=True)
         ]

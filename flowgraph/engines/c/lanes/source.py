@@ -36,10 +36,6 @@ class LaneSource:
     text: str
     presence: Mapping[int | None, tuple[int, int]]
 
-    def presence_of(self, key: int) -> tuple[int, int]:
-        """The outputs that are present for certain in a tick of this pattern, and those that can be."""
-        return self.presence.get(key, (0, 0))
-
 
 def generate_lanes(pipeline: Pipeline, keys: Sequence[int], tidy: Callable[[Program], Program]) -> LaneSource:
     """The C of a pipeline for `WIDTH` runs at once, in double precision.

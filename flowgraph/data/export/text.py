@@ -1,4 +1,4 @@
-"""Recordings and what a run gave back, in forms that other tools read: TUM text, tables, xarray.
+"""Text that other tools read: a trajectory as TUM, the streams of a flight as one csv table.
 
 Times go out as exactly as they came: all nanoseconds of a stamp are written.
 """
@@ -6,18 +6,14 @@ Times go out as exactly as they came: all nanoseconds of a stamp are written.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flowgraph.data.files import put
 from flowgraph.data.frames import part_words
 from flowgraph.data.series import Flight, Series
-from flowgraph.errors import DataError, MissingDependencyError, UnknownNameError
+from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import leaves_of
-
-if TYPE_CHECKING:
-    from flowgraph.data.result import Result
 
 
 def write_tum(series: Series, file: str | Path) -> None:
@@ -60,10 +56,11 @@ def write_table(flight: Flight, file: str | Path) -> None:
     """Write the streams and the truth of a flight as one csv table, which `table:FILE` reads.
 
     The head is `time`, in seconds with nine decimals, and a column a number, with its unit:
-    `fix.position.0 [m]`. A row is a time at which any of them has a value; what has none then is empty.
+    `fix.position.0 [m]`. A row is a time at which any of them has a value; what has none then is empty. What
+    is true is 1, what is not 0.
 
     Args:
-        flight: of streams of real numbers.
+        flight: of streams of numbers.
         file: to be written.
 
     Raises:
@@ -80,7 +77,8 @@ def write_table(flight: Flight, file: str | Path) -> None:
                 word = [] if field == "value" else [field]
                 names.append(".".join([stream, *word, *part_words(field, array.shape[1:], at)]) + unit)
                 column = [""] * len(times)
-                values = array[(slice(None), *at)].tolist()
+                part = array[(slice(None), *at)]
+                values = (part.astype(np.int64) if part.dtype == bool else part).tolist()
                 for row, value in zip(rows.tolist(), values, strict=True):
                     column[row] = repr(value) if value == value else ""
                 columns.append(column)
@@ -95,47 +93,4 @@ def _seconds(time: int) -> str:
     return f"{sign}{seconds}.{rest:09d}"
 
 
-_AXES = {3: ["x", "y", "z"], 4: ["w", "x", "y", "z"]}
-
-
-def to_xarray(result: Result) -> Any:
-    """An `xarray.DataTree` with a dataset a stream, each with a `time` of its own.
-
-    A variable has the dimension `time` (int64 ns), and one more for each axis of its field, named
-    FIELD_axis, or FIELD_axis0 and so on; vectors and attitudes have coordinates x, y, z and w, x, y, z. Unit
-    and frame are attributes.
-
-    Raises:
-        MissingDependencyError: without xarray.
-    """
-    try:
-        import xarray  # may be absent
-    except ImportError:
-        raise MissingDependencyError(
-            "to_xarray needs xarray",
-            expected="the Python package xarray",
-            got="it cannot be imported",
-            fix='pip install "flowgraph-filters[xarray]"',
-        ) from None
-    about = {"graph": result.graph, "engine": result.engine, "ticks": result.ticks, **result.stats}
-    streams = {}
-    for name, series in result.series.items():
-        variables: dict[str, Any] = {}
-        coordinates: dict[str, Any] = {"time": ("time", series.time, {"long_name": "time", "units": "ns"})}
-        for (field, type_), array in zip(leaves_of(series.type), series.leaves.values(), strict=True):
-            many = len(type_.shape) > 1
-            dims = [f"{field}_axis{k if many else ''}" for k in range(len(type_.shape))]
-            said = {k: v for k, v in (("units", type_.unit), ("frame", type_.frame)) if v}
-            variables[field] = (["time", *dims], array, said)
-            words = ("attitude", "quaternion", "orientation")
-            if len(dims) == 1 and (
-                array.shape[1] == 3 or (array.shape[1] == 4 and any(w in field for w in words))
-            ):
-                coordinates[dims[0]] = (dims[0], _AXES[array.shape[1]])
-        streams[name] = xarray.Dataset(variables, coordinates)
-    tree = xarray.DataTree.from_dict(streams, name=result.graph)
-    tree.attrs.update(about)
-    return tree
-
-
-__all__ = ["to_xarray", "write_table", "write_tum"]
+__all__ = ["write_table", "write_tum"]

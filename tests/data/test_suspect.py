@@ -1,0 +1,107 @@
+"""Readings that show a stuck sensor, spikes or another rate of a clock, and those that only look like it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowgraph import Series
+from flowgraph.blocks.signals import Gyro, Position
+from flowgraph.data.suspect import suspect_readings
+
+RNG = np.random.default_rng(3)
+
+
+def gyro(rate: float = 100.0, seconds: float = 20.0, noise: float = 0.01, jitter: float = 0.0) -> Series:
+    n = round(rate * seconds)
+    t = np.arange(n) / rate
+    time = np.round((t + RNG.uniform(-0.5, 0.5, n) * jitter / rate) * 1e9).astype(np.int64)
+    turning = np.stack([np.sin(t), np.cos(2 * t), 0.3 * t], axis=-1)
+    return Series(time, Gyro(rate=turning + noise * RNG.normal(size=(n, 3))), name="gyro")
+
+
+def changed(series: Series, rows: slice | np.ndarray, to: np.ndarray) -> Series:
+    rate = np.array(series["rate"])
+    rate[rows] = to
+    return Series(series.time, Gyro(rate=rate), name=series.name, gaps=True)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2, 0.9])
+@pytest.mark.parametrize("rate", [10.0, 100.0, 400.0])
+def test_nothing_is_said_of_an_honest_sensor(rate, jitter):
+    assert suspect_readings(gyro(rate, 2000.0 / rate, jitter=jitter)) == ()
+
+
+def test_nothing_is_said_of_few_readings():
+    assert suspect_readings(gyro()[:6]) == ()
+    assert suspect_readings(gyro()[:0]) == ()
+
+
+@pytest.mark.parametrize("seconds", [0.3, 2.0])
+def test_a_stuck_sensor(seconds):
+    series = gyro()
+    stuck = changed(series, slice(300, 300 + round(100 * seconds)), series["rate"][299])
+    (said,) = suspect_readings(stuck)
+    assert said.startswith(f"warning: gyro: the same reading for {seconds:g} s, from 2.99 s")
+
+
+def test_what_is_always_repeated_is_not_stuck():
+    rate = np.repeat(RNG.normal(size=(100, 3)), 10, axis=0)  # read ten times as often as it measures
+    series = gyro(50.0)
+    assert suspect_readings(changed(series, slice(None), rate)) == ()
+    assert suspect_readings(changed(series, slice(None), np.zeros(3))) == ()
+
+
+def test_a_reading_that_comes_twice_is_not_stuck():
+    series = gyro()
+    rows = np.repeat(np.arange(len(series)), 1 + (np.arange(len(series)) % 20 == 3))
+    again = Series(series.time[rows], Gyro(rate=series["rate"][rows]), name="gyro")
+    assert suspect_readings(again) == ()
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_spikes(count):
+    series = gyro()
+    rows = 700 + 20 * np.arange(count)
+    (said,) = suspect_readings(changed(series, rows, series["rate"][rows] + 3.0))
+    assert said.startswith(
+        f"warning: gyro: readings of rate stand alone, {count} of them, from 7 s after the first on"
+    )
+
+
+def test_a_jump_and_a_jolt_are_no_spikes():
+    series, t = gyro(), np.arange(2000) / 100.0
+    jump = np.where(t > 5.0, 10.0, 0.0)[:, None]
+    assert suspect_readings(changed(series, slice(None), series["rate"] + jump)) == ()
+    jolt = 10.0 * np.exp(-np.maximum(t - 5.0, 0.0) / 0.1) * np.sin(60.0 * (t - 5.0)) * (t > 5.0)
+    assert suspect_readings(changed(series, slice(None), series["rate"] + jolt[:, None])) == ()
+
+
+def test_absent_readings_are_no_spikes():
+    series = gyro()
+    assert suspect_readings(changed(series, slice(500, 600), np.full(3, np.nan))) == ()
+
+
+def test_a_smooth_signal_without_noise_has_no_spikes():
+    t = np.arange(2000) / 100.0
+    moved = np.clip(t - 5.0, 0.0, 1.0)
+    place = (moved**3 * (10 - 15 * moved + 6 * moved**2))[:, None] * np.ones(3)
+    series = Series((t * 1e9).astype(np.int64), Position(place), name="position")
+    assert not any("stand alone" in said for said in suspect_readings(series))
+
+
+@pytest.mark.parametrize(("rate", "jitter"), [(4.0, 0.0), (100.0, 0.0), (100.0, 0.1), (400.0, 0.3)])
+def test_a_clock_that_begins_to_run_fast(rate, jitter):
+    series = gyro(rate, max(20.0, 160 / rate), jitter=jitter)
+    t = series.time * 1e-9
+    begins = 0.3 * t[-1]
+    time = series.time + np.round(np.maximum(t - begins, 0.0) * 0.01 * 1e9).astype(np.int64)
+    (said,) = suspect_readings(Series(time, Gyro(rate=series["rate"]), name="gyro"))
+    assert said.startswith("warning: gyro: comes at ")
+    assert "a clock or a rate that changed" in said
+
+
+def test_a_pause_is_no_other_rate():
+    series = gyro()
+    kept = series[(series.time < 3 * 10**9) | (series.time > 9 * 10**9)]
+    assert suspect_readings(kept) == ()
