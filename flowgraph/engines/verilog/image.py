@@ -72,7 +72,9 @@ class Image:
         first = base + len(constants)
         self.words = first + max((s.words for s in schedules), default=0)
         self.place_bits = max(4, (self.words - 1).bit_length())
-        self.units = sorted({UNITS[s.node.unit] for x in schedules for s in x.slots if s and s.mode == "START"})
+        self.units = sorted(
+            {UNITS[s.node.unit] for x in schedules for s in x.slots if s and s.mode == "START"}
+        )
         self.memory = [0] * self.words
         for word, place in constants.items():
             self.memory[place] = in_memory(word)
@@ -109,10 +111,14 @@ class Image:
         """Place and word of each part of a value: reals as words, others as they are."""
         places = self.places[value]
         if self.pipeline.specs[value].dtype == "real":
-            return [(p, in_memory(w)) for p, w in zip(places.ravel().tolist(), np.ravel(x).tolist(), strict=True)]
+            return [
+                (p, in_memory(w)) for p, w in zip(places.ravel().tolist(), np.ravel(x).tolist(), strict=True)
+            ]
         found = []
         signed = self.pipeline.specs[value].dtype == "int64"
-        for row, number in zip(places.reshape(-1, places.shape[-1]).tolist(), np.ravel(x).tolist(), strict=True):
+        for row, number in zip(
+            places.reshape(-1, places.shape[-1]).tolist(), np.ravel(x).tolist(), strict=True
+        ):
             n = int(number)
             if len(row) == 1:
                 found.append((row[0], in_memory(n)))
@@ -144,7 +150,9 @@ class Image:
             if flag is None:
                 outputs.append(None)
                 continue
-            places = [np.vectorize(lambda n: at(plan.outputs.get(n, n)), otypes=[np.int64])(x) for x in leaves]
+            places = [
+                np.vectorize(lambda n: at(plan.outputs.get(n, n)), otypes=[np.int64])(x) for x in leaves
+            ]
             outputs.append((at(plan.outputs.get(flag, flag)), places))
         self.entries.append(Entry(key, start, len(slots), outputs, sum(s is not None for s in slots)))
 

@@ -15,7 +15,21 @@ from dataclasses import dataclass, field
 from flowgraph.engines.fixed import integers as z
 from flowgraph.pipeline.formats import NOT_A_NUMBER
 
-KINDS = ("ZERO", "MUL", "SEL", "SELN", "DYN", "AND", "OR", "XOR", "BITS", "NORM", "NORM_EVEN", "TAKE", "ISNAN")
+KINDS = (
+    "ZERO",
+    "MUL",
+    "SEL",
+    "SELN",
+    "DYN",
+    "AND",
+    "OR",
+    "XOR",
+    "BITS",
+    "NORM",
+    "NORM_EVEN",
+    "TAKE",
+    "ISNAN",
+)
 """What a term makes of its words a and b, by number in a microword.
 
 MUL a b; SEL a where b is not 0, SELN where it is; DYN a 2^-b; AND, OR, XOR of bits; BITS the length of |a|;
@@ -120,7 +134,9 @@ class Nodes:
             self.nodes.append(node)
             self.line.append(self.here)
             if isinstance(node, Sum) and node.mode in ("FIT", "RAW"):
-                passing = any(t.a in self.doubtful or (t.kind == "MUL" and t.b in self.doubtful) for t in node.terms)
+                passing = any(
+                    t.a in self.doubtful or (t.kind == "MUL" and t.b in self.doubtful) for t in node.terms
+                )
                 if passing and all(t.kind in ("MUL", "SEL", "SELN", "DYN") for t in node.terms):
                     self.doubtful.add(found)
         return found
@@ -175,7 +191,9 @@ class Nodes:
         place = UNITS.index(unit)
         return self.add(Sum(tuple(operands), "START", 0, 0, odd, place))
 
-    def take(self, begun: int, *, shift: int = 0, minus: bool = False, mode: str = "FIT", floor: bool = False) -> int:
+    def take(
+        self, begun: int, *, shift: int = 0, minus: bool = False, mode: str = "FIT", floor: bool = False
+    ) -> int:
         """What a unit has made of what it was given."""
         node = self.nodes[begun]
         assert isinstance(node, Sum)
@@ -187,7 +205,11 @@ class Nodes:
             chosen = self.known(t.b)
             if chosen is not None:
                 taken = (chosen != 0) == (t.kind == "SEL")
-                return Term("MUL", t.a, self.one, t.shift, t.minus) if taken else Term("ZERO", self.one, self.one)
+                return (
+                    Term("MUL", t.a, self.one, t.shift, t.minus)
+                    if taken
+                    else Term("ZERO", self.one, self.one)
+                )
         if t.kind == "DYN" and (by := self.known(t.b)) is not None:
             return Term("MUL", t.a, self.one, t.shift + by, t.minus)
         if t.kind == "MUL" and self.known(t.a) is not None and self.known(t.b) is None:
@@ -245,7 +267,12 @@ class Nodes:
 
     def _same(self, t: Term, end: int, mode: str) -> int | None:
         """The word that a sum of one term is, if it is one unchanged."""
-        if t.minus or t.kind != "MUL" or mode not in ("FIT", "RAW") or (mode == "FIT" and not self._fits(t.a)):
+        if (
+            t.minus
+            or t.kind != "MUL"
+            or mode not in ("FIT", "RAW")
+            or (mode == "FIT" and not self._fits(t.a))
+        ):
             return None
         factor = self.known(t.b)
         if factor is None or factor <= 0 or factor & (factor - 1):

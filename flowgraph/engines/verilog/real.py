@@ -163,7 +163,10 @@ class Real(Functions):
 
     def _sign(self, s: Site, a: np.ndarray) -> np.ndarray:
         def one(x: int, out: int) -> int:
-            above, below = self.compared("less", self.zero, x, 0, 0), self.compared("less", x, self.zero, 0, 0)
+            above, below = (
+                self.compared("less", self.zero, x, 0, 0),
+                self.compared("less", x, self.zero, 0, 0),
+            )
             return self.sum([self.plain(above), self.plain(below, 0, True)], end=-out)
 
         return self._each(s.i.spec.shape, one, a, s.out)

@@ -62,7 +62,9 @@ class Plan:
 
     def _copies(self) -> None:
         tick, nodes = self.tick, self.tick.nodes
-        wanted = [n for flag, leaves in tick.outputs if flag is not None for x in leaves for n in x.ravel().tolist()]
+        wanted = [
+            n for flag, leaves in tick.outputs if flag is not None for x in leaves for n in x.ravel().tolist()
+        ]
         wanted += [flag for flag, _ in tick.outputs if flag is not None]
         uses: dict[int, int] = {}
         for n, node in enumerate(nodes):

@@ -122,7 +122,9 @@ class Simulated(Player):
             for k, port in enumerate(pipeline.inputs):
                 if key >> k & 1:
                     for leaf, x in zip(port.leaves, next(present), strict=True):
-                        write(leaf.value, player.words(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x)
+                        write(
+                            leaf.value, player.words(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x
+                        )
             script.append(f"go {key}")
             env: dict[int, Any] = {}
             if self.check:
@@ -238,5 +240,7 @@ def _joined(
         raw = np.array([NOT_A_NUMBER if w == NONE_WORD else w for w in row], dtype=np.int64).reshape(shape)
         return raw if fraction is None else real_numbers(raw, fraction)
     halves = places.shape[-1]
-    whole = [low + (high << 32) for low, high in zip(row[::2], row[1::2], strict=True)] if halves == 2 else row
+    whole = (
+        [low + (high << 32) for low, high in zip(row[::2], row[1::2], strict=True)] if halves == 2 else row
+    )
     return np.array(whole).astype(DTYPES[dtype]).reshape(shape)

@@ -60,9 +60,7 @@ def _top(image: Image) -> str:
         "  fg_machine #(",
         f"      .WIDTH({image.width}), .PLACE({image.place_bits}), .STEP({image.step_bits}),",
         f"      .WORDS({len(image.memory)}), .STEPS({len(image.program)}),",
-        "      "
-        + ", ".join(f".{_PARAMETER[u]}({int(u in image.units)})" for u in UNITS)
-        + ",",
+        "      " + ", ".join(f".{_PARAMETER[u]}({int(u in image.units)})" for u in UNITS) + ",",
         f'      .MEMORY("{name}_memory.hex"), .PROGRAM("{name}_program.hex")',
         "  ) machine (",
         "      .clk(clk), .reset(reset), .ready(ready), .start(start), .from(from), .put(put), .at(at),",
@@ -85,7 +83,9 @@ def layout(image: Image) -> list[str]:
             lines.append(f"input {k} {port.name}.{leaf.name}: {_range(image.places[leaf.value])}, {what}")
     for entry in image.entries:
         bound = image.player.bind(entry.key)
-        for port, found, (_, values) in zip(pipeline.outputs, entry.outputs, bound.program.outputs, strict=True):
+        for port, found, (_, values) in zip(
+            pipeline.outputs, entry.outputs, bound.program.outputs, strict=True
+        ):
             if found is None:
                 continue
             lines.append(f"key {entry.key}, output {port.name}: there where [{found[0]}] is not 0")
@@ -99,7 +99,11 @@ def _range(places: np.ndarray) -> str:
     row = places.ravel().tolist()
     if not row:
         return "nothing"
-    return f"[{row[0]}..{row[-1]}]" if row == list(range(row[0], row[0] + len(row))) else str(row).replace(" ", "")
+    return (
+        f"[{row[0]}..{row[-1]}]"
+        if row == list(range(row[0], row[0] + len(row)))
+        else str(row).replace(" ", "")
+    )
 
 
 def _fractions(fraction: np.ndarray | None) -> str:
@@ -118,5 +122,3 @@ obj/V{name}: $(SOURCES) bench.cpp
 lint:
 \t$(VERILATOR) --lint-only -Wall --top-module {name} $(SOURCES)
 """
-
-

@@ -92,7 +92,9 @@ class Tick(Whole):
         if -(2**32) < word < 2**32:
             return (self.constant(word),)
         high = word >> 32
-        return self.constant(word & 0xFFFFFFFF), self.constant(high if dtype == "int64" else high & 0xFFFFFFFF)
+        return self.constant(word & 0xFFFFFFFF), self.constant(
+            high if dtype == "int64" else high & 0xFFFFFFFF
+        )
 
     def _held(self, value: int, spec: Spec) -> np.ndarray:
         size, real = math.prod(spec.shape), spec.dtype == "real"
@@ -160,7 +162,9 @@ class Tick(Whole):
             return np.asarray(OPS[i.op].run(NUMPY, *args, **i.attrs))
         most = max(a.shape[-1] for a in args)
         alike = [a if a.shape[-1] == most else self._longer(a) for a in args]
-        halves = [np.asarray(OPS[i.op].run(NUMPY, *[a[..., k] for a in alike], **i.attrs)) for k in range(most)]
+        halves = [
+            np.asarray(OPS[i.op].run(NUMPY, *[a[..., k] for a in alike], **i.attrs)) for k in range(most)
+        ]
         return np.stack(halves, axis=-1)
 
     def _longer(self, a: np.ndarray) -> np.ndarray:
@@ -180,7 +184,9 @@ class Tick(Whole):
         if real:
             at = shifts.common_along(s.real(0), axes)
             by = np.transpose(shifts.between(s.real(0), np.broadcast_to(at, x.shape)), [*inner, *axes])
-            ends = (np.transpose(at, [*inner, *axes]).ravel() - np.broadcast_to(s.out, i.spec.shape).ravel()).tolist()
+            ends = (
+                np.transpose(at, [*inner, *axes]).ravel() - np.broadcast_to(s.out, i.spec.shape).ravel()
+            ).tolist()
             made = [
                 (self._extreme(i.op, row[:, 0].tolist(), b.tolist(), end),)
                 for row, b, end in zip(rows, by.reshape(-1, count), ends, strict=True)
@@ -221,7 +227,9 @@ class Tick(Whole):
             if c.dtype == "real":
                 by = shifts.between(self.bound.fractions[n], self.bound.fractions[c.read])
                 by = np.broadcast_to(by, c.shape)
-                new = self._each(c.shape, lambda x, b: self.sum([self.plain(x, b)]), np.broadcast_to(new, c.shape), by)
+                new = self._each(
+                    c.shape, lambda x, b: self.sum([self.plain(x, b)]), np.broadcast_to(new, c.shape), by
+                )
             elif new.shape[-1] < old.shape[-1]:
                 new = self._longer(new)
             new = np.broadcast_to(new, old.shape)

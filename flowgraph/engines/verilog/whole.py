@@ -138,7 +138,11 @@ class Whole(Real):
             raise no_form(s.i)
         if len(a) == 2:
             if by == 32:
-                return (a[1], self.zero) if s.i.spec.dtype == "uint64" else self.halves(self.terms(a), "int64", 32)
+                return (
+                    (a[1], self.zero)
+                    if s.i.spec.dtype == "uint64"
+                    else self.halves(self.terms(a), "int64", 32)
+                )
             return self.halves(self.terms(a), s.i.spec.dtype, by)
         return (self.sum([self.plain(a[0])], mode="RAW", end=by, floor=True),)
 

@@ -56,7 +56,13 @@ def mixed(x: Three, y: Scalar, *, dt: float, xp) -> Three:
     most = xp.max(turned) - xp.min(x) + xp.log(xp.abs(y) + 0.25) + dt
     kept = xp.minimum(x, y) @ xp.stack([x, up, turned])
     ends = xp.ceil(3.0 * x) + xp.trunc(5.0 * up) - xp.round(2.0 * x) + xp.sign(x)
-    return kept * most + xp.remainder(4.0 * x + y, 1.5) + xp.copysign(up, x) + some * xp.asarray(count, dtype=x.dtype) - ends
+    return (
+        kept * most
+        + xp.remainder(4.0 * x + y, 1.5)
+        + xp.copysign(up, x)
+        + some * xp.asarray(count, dtype=x.dtype)
+        - ends
+    )
 
 
 @graph
@@ -96,7 +102,9 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     for (times, leaves), series in zip(outcome.outputs, ours.series.values(), strict=True):
         np.testing.assert_array_equal(times, series.time)
         np.testing.assert_array_equal(leaves[0], series.value)
-    again = Simulated.__new__(Simulated)  # the same machine as an engine plays it, without the interpreter beside
+    again = Simulated.__new__(
+        Simulated
+    )  # the same machine as an engine plays it, without the interpreter beside
     vars(again).update(vars(player), check=False)
     played = again.play(tape, cells, seed_words(0), None)
     for a, b in zip(played.cells, outcome.cells, strict=True):
@@ -121,7 +129,9 @@ def test_a_filter_with_readings_that_are_not_there_is_equal():
 
 def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(made):
     _, _, pipeline, tape = made
-    player = Integers(pipeline, [c.reset for r in pipeline.registers for c in r.cells], np.zeros(2, np.uint32))
+    player = Integers(
+        pipeline, [c.reset for r in pipeline.registers for c in r.cells], np.zeros(2, np.uint32)
+    )
     plan = Plan(Tick(player, tape.patterns[-1]))
     found = schedule(plan)
     nodes = plan.tick.nodes
@@ -140,7 +150,11 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
                 assert t >= at[r] + LATENCY
                 assert lies[found.place.get(r, -1 - r)] == r
         if slot.term.kind == "TAKE":
-            assert t >= started[slot.node.unit][1] + UNIT_LATENCY[("divide", "root", "logarithm", "angle")[slot.node.unit]]
+            assert (
+                t
+                >= started[slot.node.unit][1]
+                + UNIT_LATENCY[("divide", "root", "logarithm", "angle")[slot.node.unit]]
+            )
             assert started[slot.node.unit][0] == nodes[slot.term.a]
         if slot.mode == "START":
             started[slot.node.unit] = (slot.node, t)
@@ -163,7 +177,9 @@ def test_what_is_known_costs_nothing():
     assert nodes.sum([Term("MUL", half, half)]) == nodes.constant((1 << 23) - 1)  # cut to a word
 
 
-@pytest.mark.parametrize(("x", "by", "made"), [(5, 1, 3), (-5, 1, -2), (-6, 2, -1), (3, -62, 1 << 62), (1, 63, 0)])
+@pytest.mark.parametrize(
+    ("x", "by", "made"), [(5, 1, 3), (-5, 1, -2), (-6, 2, -1), (3, -62, 1 << 62), (1, 63, 0)]
+)
 def test_shifts_round_halves_upwards_and_keep_to_62_bits(x, by, made):
     assert shifted(x, by) == made
 
