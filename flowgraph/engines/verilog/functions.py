@@ -29,36 +29,29 @@ class Functions(Nodes):
         begun = self.begin("divide", [Term("NORM", a, self.one, -62), Term("NORM", b, self.one, -31)])
         return self.take(begun, shift=31 - up)
 
-    def _of_sizes(self, a: int, b: int, p: int, q: int) -> int:
-        """The whole part of |a 2^-p| / |b 2^-q|, for shifts to the left."""
-        begun = self.begin("divide", [Term("NORM", a, self.one, -62), Term("NORM", b, self.one, -31)])
-        return self.take(begun, shift=31 + p - q, mode="RAW", floor=True)
-
     def rest(self, a: int, b: int, p: int, q: int, end: int) -> int:
-        """The remainder of a 2^-p by b 2^-q, with the sign of b; 0 for b = 0."""
-        quotient = self._signed(a, b, p, q)
-        rest = self.sum([self.plain(a, p), Term("MUL", quotient, b, q, True)], mode="RAW")
-        below, b_below = (self.sum([self.plain(x)], mode="LT") for x in (rest, b))
-        other = self.sum([Term("XOR", below, b_below)], mode="RAW")
-        some = self.sum([self.plain(rest)], mode="NE")
-        turned = self.sum([Term("SEL", other, some)], mode="RAW")
-        made = self.sum([self.plain(rest), Term("SEL", b, turned, q)], end=end)
-        return self.sum([Term("SEL", made, b)])
-
-    def _signed(self, a: int, b: int, p: int, q: int) -> int:
-        """The quotient rounded towards zero; its sign is applied behind the rounding."""
-        return self._of_sizes(a, b, p, q)
+        """The remainder of a 2^-p by b 2^-q, for shifts to the left, with the sign of b; 0 for b = 0."""
+        _, rest, turned = self._divided(a, b, p, q)
+        return self.sum([Term("SEL", self.sum([self.plain(rest), Term("SEL", b, turned, q)], end=end), b)])
 
     def floor_quotient(self, a: int, b: int, p: int, q: int, end: int) -> int:
-        """The quotient rounded down, shifted; 0 for b = 0."""
-        quotient = self._signed(a, b, p, q)
+        """a 2^-p by b 2^-q rounded down, for shifts to the left, then shifted; 0 for b = 0."""
+        quotient, _, turned = self._divided(a, b, p, q)
+        made = self.sum([self.plain(quotient), self.plain(turned, 0, True)], end=end)
+        return self.sum([Term("SEL", made, b)])
+
+    def _divided(self, a: int, b: int, p: int, q: int) -> tuple[int, int, int]:
+        """The quotient rounded towards zero, what it leaves, and whether that has not the sign of b.
+
+        The quotient fits a word: arguments of `remainder` are not 2^30 times the divisor.
+        """
+        begun = self.begin("divide", [Term("NORM", a, self.one, -62), Term("NORM", b, self.one, -31)])
+        quotient = self.take(begun, shift=31 + p - q, mode="RAW", floor=True)
         rest = self.sum([self.plain(a, p), Term("MUL", quotient, b, q, True)], mode="RAW")
         below, b_below = (self.sum([self.plain(x)], mode="LT") for x in (rest, b))
         other = self.sum([Term("XOR", below, b_below)], mode="RAW")
         some = self.sum([self.plain(rest)], mode="NE")
-        turned = self.sum([Term("SEL", other, some)], mode="RAW")
-        made = self.sum([self.plain(quotient), self.plain(turned, 0, True)], end=end)
-        return self.sum([Term("SEL", made, b)])
+        return quotient, rest, self.sum([Term("SEL", other, some)], mode="RAW")
 
     def square_root(self, x: int, fraction: int, out: int) -> int:
         known = self.known(x)
@@ -68,7 +61,7 @@ class Functions(Nodes):
         return self.take(begun, shift=((fraction + 62) >> 1) - out)
 
     def _folded(self, made: np.ndarray) -> int:
-        most = 2 ** (self.width - 1) - 1
+        most = (1 << (self.width - 1)) - 1
         return self.constant(max(min(int(made), most), -most))
 
     def _polynomial(self, coefficients: list[int], u: int) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ class Entry:
         start: its first step.
         cycles: microwords in it; the machine is ready some cycles later.
         outputs: for each output, where the truth value lies that tells whether it is there, and for each leaf
-            the places of its words, with an axis of one or two halves behind those of a leaf that is not real;
+            the places of its words, with an axis of one or two halves behind those of a leaf that is no real;
             None where the output never is there.
         terms: microwords that are not empty.
     """
@@ -99,7 +99,7 @@ class Image:
         return found
 
     def _used(self, plan: Plan) -> list[int]:
-        found = [t for n in plan.order for x in plan.tick.nodes[n].terms for t in (x.a, x.b)]
+        found = [t for n in plan.order for x in plan.tick.made(n).terms for t in (x.a, x.b)]
         return found + list(plan.kept)
 
     def put(self, value: int, x: np.ndarray) -> None:
@@ -160,7 +160,7 @@ class Image:
         halves = 1 if held.real else self.places[held.value].shape[-1]
         return held.place * halves + int(held.high)
 
-    def _microword(self, slot: Slot | None, at, last: bool) -> int:
+    def _microword(self, slot: Slot | None, at: Callable[[int], int], last: bool) -> int:
         if slot is None:
             return int(last) << 31
         t, node = slot.term, slot.node
@@ -180,7 +180,7 @@ class Image:
         bits = self.place_bits
         return code | to << 32 | b << 32 + bits | a << 32 + 2 * bits
 
-    def _said(self, slot: Slot | None, at) -> str:
+    def _said(self, slot: Slot | None, at: Callable[[int], int]) -> str:
         if slot is None:
             return "-"
         t = slot.term

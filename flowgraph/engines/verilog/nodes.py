@@ -1,9 +1,9 @@
 """What the machine computes: sums of a few terms, each sum a word of the memory, made once.
 
-A term is two words, what is made of them, and a shift; a sum of terms is shifted again and cut to a word. That
-is all that the machine knows, so every operation of a pipeline becomes such sums, element by element. Sums
-that are equal are one; terms that are known to be zero are left out, sums of known words are known, and a
-sum that is one word unchanged is that word. So a product with a sparse matrix costs what its entries cost,
+A term is two words, what is made of them, and a shift; a sum of terms is shifted again and cut to a word.
+That is all that the machine knows, so every operation of a pipeline becomes such sums, element by element.
+Sums that are equal are one; terms that are known to be zero are left out, sums of known words are known, and
+a sum that is one word unchanged is that word. So a product with a sparse matrix costs what its entries cost,
 and of a symmetric matrix each entry is computed once.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import SupportsInt
 
 from flowgraph.engines.fixed import integers as z
 from flowgraph.pipeline.formats import NOT_A_NUMBER
@@ -37,7 +38,8 @@ NORM |a| at full length, NORM_EVEN with an even shift; TAKE what unit b has made
 """
 
 MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START")
-"""What becomes of a sum: cut to a word of a real number, kept, 32 bits of it, compared with 0, given to a unit."""
+"""What becomes of a sum: cut to a word of a real number, kept, 32 bits of it, compared with 0, or given to a
+unit."""
 
 UNITS = ("divide", "root", "logarithm", "angle")
 
@@ -141,13 +143,19 @@ class Nodes:
                     self.doubtful.add(found)
         return found
 
-    def constant(self, word: int) -> int:
+    def constant(self, word: SupportsInt) -> int:
         return self.add(Constant(int(word)))
 
     def known(self, n: int) -> int | None:
         """The word, where it is known."""
         node = self.nodes[n]
         return node.word if isinstance(node, Constant) else None
+
+    def made(self, n: int) -> Sum:
+        """The sum of that number."""
+        node = self.nodes[n]
+        assert isinstance(node, Sum)
+        return node
 
     def sum(
         self,
@@ -241,7 +249,7 @@ class Nodes:
 
     def _ended(self, total: int, end: int, mode: str, floor: bool) -> int:
         x = shifted(total, end, floor)
-        most = 2 ** (self.width - 1) - 1
+        most = (1 << (self.width - 1)) - 1
         match mode:
             case "FIT":
                 return max(min(x, most), -most)
@@ -286,7 +294,7 @@ class Nodes:
         if isinstance(node, Held):
             return node.real
         if isinstance(node, Constant):
-            return abs(node.word) < 2 ** (self.width - 1)
+            return abs(node.word) < 1 << (self.width - 1)
         return node.mode in ("FIT", "LT", "LE", "EQ", "NE")
 
 

@@ -1,6 +1,9 @@
-"""Operations on real numbers as sums of the machine, one element at a time; the shifts are the interpreter's."""
+"""Operations on real numbers as sums of the machine, element by element; the shifts are the interpreter's."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +45,7 @@ class Real(Functions):
             raise no_form(i)
         return np.asarray(make(s, *wide), dtype=np.int64).reshape(shape)
 
-    def _each(self, shape: tuple[int, ...], make, *arrays) -> np.ndarray:
+    def _each(self, shape: tuple[int, ...], make: Callable[..., int], *arrays: Any) -> np.ndarray:
         """`make` of the elements of arrays that broadcast to a shape."""
         flat = [np.broadcast_to(a, shape).ravel().tolist() for a in arrays]
         return np.array([make(*row) for row in zip(*flat, strict=True)], dtype=np.int64).reshape(shape)
@@ -68,7 +71,7 @@ class Real(Functions):
     def _divide(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return self._each(s.i.spec.shape, self.quotient, a, b, shifts.shift_of_quotient(s))
 
-    def _of_one(self, function, s: Site, a: np.ndarray) -> np.ndarray:
+    def _of_one(self, function: Callable[[int, int, int], int], s: Site, a: np.ndarray) -> np.ndarray:
         f = shifts.bound_fraction(s.real(0))
 
         def one(x: int, fraction: int, out: int) -> int:

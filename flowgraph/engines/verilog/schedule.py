@@ -1,7 +1,7 @@
 """When each sum is made, and where its word lies: list scheduling on one lane, and memory used again.
 
-A sum of n terms takes n cycles one after the other; its word can be read some cycles after the last. Of the sums
-that could be made, the one goes first from which the way to the end is longest. Words of registers are
+A sum of n terms takes n cycles one after the other; its word can be read some cycles after the last. Of the
+sums that could be made, the one goes first from which the way to the end is longest. Words of registers are
 overwritten once nobody reads them any more in the tick, so that a tick ends with its registers in place.
 """
 
@@ -23,7 +23,7 @@ UNIT_LATENCY = {"divide": 45, "root": 45, "logarithm": 193, "angle": 93}
 
 @dataclass(frozen=True)
 class Slot:
-    """One microword: a term of a sum, with the numbers of the words that it reads; `writes` is set in the last."""
+    """One microword: a term of a sum; `writes` is the number of the word that the last term of it makes."""
 
     term: Term
     first: bool
@@ -67,7 +67,7 @@ class Plan:
         ]
         wanted += [flag for flag, _ in tick.outputs if flag is not None]
         uses: dict[int, int] = {}
-        for n, node in enumerate(nodes):
+        for node in nodes:
             if isinstance(node, Sum):
                 for r in _reads(node):
                     uses[r] = uses.get(r, 0) + 1
@@ -79,8 +79,8 @@ class Plan:
         taken: set[int] = set()
         for held, source in tick.writes.items():
             node = nodes[source]
-            direct = isinstance(node, Sum) and not uses.get(source) and source not in taken
-            if direct and not any(isinstance(nodes[r], Held) for r in _reads(node)):
+            alone = isinstance(node, Sum) and not uses.get(source) and source not in taken
+            if alone and not any(isinstance(nodes[r], Held) for r in _reads(tick.made(source))):
                 taken.add(source)
                 self.fixed[source] = held
                 continue
@@ -110,7 +110,7 @@ class Plan:
         self.order = sorted(live)
         by_held: dict[Held, list[int]] = {}
         for n in self.order:
-            for r in _reads(nodes[n]):
+            for r in _reads(self.tick.made(n)):
                 node = nodes[r]
                 if isinstance(node, Held):
                     by_held.setdefault(node, []).append(n)
@@ -131,8 +131,8 @@ def _reads(node: Sum) -> list[int]:
 
 def schedule(plan: Plan) -> Schedule:
     """The order of a tick's sums."""
-    nodes, order = plan.tick.nodes, plan.order
-    needs = {n: sorted({r for r in _reads(nodes[n]) if isinstance(nodes[r], Sum)}) for n in order}
+    nodes, order, made = plan.tick.nodes, plan.order, plan.tick.made
+    needs = {n: sorted({r for r in _reads(made(n)) if isinstance(nodes[r], Sum)}) for n in order}
     users: dict[int, list[int]] = {n: [] for n in order}
     for n in order:
         for r in needs[n]:
@@ -144,10 +144,10 @@ def schedule(plan: Plan) -> Schedule:
     missing = {n: len(needs[n]) + len(plan.after.get(n, ())) for n in order}
     urgent: dict[int, int] = {}
     for n in sorted(order, reverse=True):
-        node = nodes[n]
+        node = made(n)
         behind = max((urgent[u] for u in users[n]), default=0)
         urgent[n] = behind + _latency(node) + len(node.terms)
-    takes = {n: len(users[n]) for n in order if nodes[n].mode == "START"}
+    takes = {n: len(users[n]) for n in order if made(n).mode == "START"}
     ready: dict[int, int] = {}
     waiting: list[tuple[int, int]] = []
     free: list[tuple[int, int]] = []
@@ -158,7 +158,7 @@ def schedule(plan: Plan) -> Schedule:
     earliest_after: dict[int, int] = dict.fromkeys(order, 0)
 
     def offer(n: int) -> None:
-        heapq.heappush(waiting, (max(_start(nodes[n], ready)[0], earliest_after[n]), n))
+        heapq.heappush(waiting, (max(_start(made(n), ready)[0], earliest_after[n]), n))
 
     for n in order:
         if missing[n] == 0:
@@ -171,7 +171,7 @@ def schedule(plan: Plan) -> Schedule:
             slots += [None] * (waiting[0][0] - len(slots))
             continue
         _, n = heapq.heappop(free)
-        node = nodes[n]
+        node = made(n)
         if node.mode == "START":
             if busy[node.unit]:
                 blocked[node.unit].append((-urgent[n], n))

@@ -84,7 +84,7 @@ class Simulated(Player):
 
     Attributes:
         cycles: of each tick of the last run.
-        compared, differing: with `check`, words compared with the interpreter's so far, and those that differ.
+        compared, differing: with `check`, words compared with the interpreter's, and those that differ.
     """
 
     def __init__(self, pipeline: Pipeline, patterns: Sequence[int], *, check: bool = False) -> None:
@@ -128,12 +128,13 @@ class Simulated(Player):
             script.append(f"go {key}")
             env: dict[int, Any] = {}
             if self.check:
-                bound, env = player.values(time, key, values)
+                _, env = player.values(time, key, values)
                 player.tick(time, key, values)
-            for port, found in enumerate(entries[key].outputs):
+            for out, found in enumerate(entries[key].outputs):
                 if found is None:
                     continue
-                flag, leaves = player.bind(key).program.outputs[port]
+                flag, leaves = player.bind(key).program.outputs[out]
+                assert flag is not None
                 read(np.array([found[0]]), None if not self.check else np.array([env.get(flag, 1)]))
                 there = self.check and bool(env.get(flag, True))
                 for places, n in zip(found[1], leaves, strict=True):

@@ -187,7 +187,7 @@ class Tick(Whole):
             ends = (
                 np.transpose(at, [*inner, *axes]).ravel() - np.broadcast_to(s.out, i.spec.shape).ravel()
             ).tolist()
-            made = [
+            made: list[tuple[int, ...]] = [
                 (self._extreme(i.op, row[:, 0].tolist(), b.tolist(), end),)
                 for row, b, end in zip(rows, by.reshape(-1, count), ends, strict=True)
             ]
@@ -242,7 +242,7 @@ class Tick(Whole):
 
 
 def held_values(pipeline: Pipeline) -> dict[int, Spec]:
-    """The values that the memory holds before a tick, and their kinds: registers, inputs, the time, the seed."""
+    """The values that the memory holds before a tick, with their kinds: registers, inputs, time, seed."""
     found = {c.read: Spec(c.shape, c.dtype) for r in pipeline.registers for c in r.cells}
     found |= {leaf.value: Spec(leaf.shape, leaf.dtype) for port in pipeline.inputs for leaf in port.leaves}
     return found | {pipeline.time: Spec((), "int64"), pipeline.seed: Spec((2,), "uint32")}

@@ -1,14 +1,11 @@
 """Whole numbers and truth values as sums of the machine.
 
-A truth value is 0 or 1, a number of 32 bits is a word. Numbers of 64 bits, times above all, are two words, the
-lower one without a sign; sums of them are made whole and cut in two again. What counts places in an array is a
-word, whatever its declared kind.
+A truth value is 0 or 1, a number of 32 bits is a word. Numbers of 64 bits, times above all, are two words,
+the lower one without a sign; sums of them are made whole and cut in two again. What counts places in an array
+is a word, whatever its declared kind.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -90,19 +87,15 @@ class Whole(Real):
     def long(self, a: Pair) -> Pair:
         return a if len(a) == 2 else self.halves(self.terms(a), "int64")
 
-    def _picked_whole(self, s: Site, a: Pair, b: Pair, mode: str) -> Pair:
-        first = self.sum([*self.terms(a), *self.terms(b, True)], mode=mode, limit=NO_LIMIT)
-        return self.int_where(s, (first,), a, b)
-
     def int_minimum(self, s: Site, a: Pair, b: Pair) -> Pair:
-        return self._picked_whole(s, a, b, "LE")
+        return self.int_where(s, (self._not_above(a, b),), a, b)
 
     def int_maximum(self, s: Site, a: Pair, b: Pair) -> Pair:
-        return self._picked_whole(s, b, a, "LE")[::1] if a == b else self._picked_whole_max(s, a, b)
+        return self.int_where(s, (self._not_above(b, a),), a, b)
 
-    def _picked_whole_max(self, s: Site, a: Pair, b: Pair) -> Pair:
-        first = self.sum([*self.terms(b), *self.terms(a, True)], mode="LE", limit=NO_LIMIT)
-        return self.int_where(s, (first,), a, b)
+    def _not_above(self, a: Pair, b: Pair) -> int:
+        """Whether a <= b."""
+        return self.sum([*self.terms(a), *self.terms(b, True)], mode="LE", limit=NO_LIMIT)
 
     def int_abs(self, s: Site, a: Pair) -> Pair:
         below = self.sum(self.terms(a), mode="LT", limit=NO_LIMIT)
@@ -216,6 +209,3 @@ def stacked(made: list[Pair], shape: tuple[int, ...], nodes: Whole) -> np.ndarra
     if most == 2:
         made = [nodes.long(x) for x in made]
     return np.array(made, dtype=np.int64).reshape(*shape, most)
-
-
-Make = Callable[..., Any]
