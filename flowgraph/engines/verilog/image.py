@@ -139,6 +139,9 @@ class Image:
                 return int(self.places[held.value].reshape(-1)[self._part(held)])
             return first + made.place[n]
 
+        def ended(n: int) -> int:
+            return at(plan.outputs.get(n, n))
+
         start = len(self.program)
         slots = made.slots or [None]
         for t, slot in enumerate(slots):
@@ -150,10 +153,9 @@ class Image:
             if flag is None:
                 outputs.append(None)
                 continue
-            places = [
-                np.vectorize(lambda n: at(plan.outputs.get(n, n)), otypes=[np.int64])(x) for x in leaves
-            ]
-            outputs.append((at(plan.outputs.get(flag, flag)), places))
+            rows = [[ended(n) for n in x.ravel().tolist()] for x in leaves]
+            places = [np.array(r, dtype=np.int64).reshape(x.shape) for r, x in zip(rows, leaves, strict=True)]
+            outputs.append((ended(flag), places))
         self.entries.append(Entry(key, start, len(slots), outputs, sum(s is not None for s in slots)))
 
     def _part(self, held: Held) -> int:

@@ -22,6 +22,7 @@ from flowgraph.engines.fixed.engine import Integers
 from flowgraph.engines.options import Meter
 from flowgraph.engines.verilog.image import Entry, Image
 from flowgraph.engines.verilog.nodes import NONE_WORD
+from flowgraph.engines.verilog.script import Script
 from flowgraph.engines.verilog.text import texts
 from flowgraph.errors import MissingDependencyError
 from flowgraph.pipeline.formats import NOT_A_NUMBER, real_numbers
@@ -93,72 +94,27 @@ class Simulated(Player):
         self.check = check
         self.cycles: list[int] = []
         self.compared = self.differing = 0
-        self.first_difference = ""
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
-        image, pipeline = self.image, self.pipeline
-        player = Integers(pipeline, cells, seed)
+        image = self.image
+        script = Script(image, tape, cells, seed, self.check)
+        player = script.player
         entries = {e.key: e for e in image.entries}
-        rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
-        held = [c for r in pipeline.registers for c in r.cells]
-        script: list[str] = []
-        wanted: list[int | None] = []
-
-        def write(value: int, x: Any) -> None:
-            script.extend(f"put {p} {_signed(w)}" for p, w in image.words_of(value, np.asarray(x)))
-
-        def read(places: np.ndarray, expected: Any = None) -> None:
-            flat = places.ravel().tolist()
-            script.extend(f"get {p}" for p in flat)
-            wanted.extend(_parts(expected, places) if expected is not None else [None] * len(flat))
-
-        for c, v in zip(held, player.cells, strict=True):
-            write(c.read, v)
-        write(pipeline.seed, seed)
-        for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
-            values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
-            write(pipeline.time, np.int64(time))
-            present = iter(values)
-            for k, port in enumerate(pipeline.inputs):
-                if key >> k & 1:
-                    for leaf, x in zip(port.leaves, next(present), strict=True):
-                        write(
-                            leaf.value, player.words(leaf.value, x, leaf.shape) if leaf.dtype == "real" else x
-                        )
-            script.append(f"go {key}")
-            env: dict[int, Any] = {}
-            if self.check:
-                _, env = player.values(time, key, values)
-                player.tick(time, key, values)
-            for out, found in enumerate(entries[key].outputs):
-                if found is None:
-                    continue
-                flag, leaves = player.bind(key).program.outputs[out]
-                assert flag is not None
-                read(np.array([found[0]]), None if not self.check else np.array([env.get(flag, 1)]))
-                there = self.check and bool(env.get(flag, True))
-                for places, n in zip(found[1], leaves, strict=True):
-                    read(places, env[n] if there else None)
-            if self.check:
-                for c, v in zip(held, player.cells, strict=True):
-                    read(image.places[c.read], v)
-        if not self.check:
-            for c in held:
-                read(image.places[c.read])
         start = perf_counter()
-        lines = self._run(script)
+        lines = self._run(script.lines)
         wall = perf_counter() - start
         self.cycles = [int(line.split()[1]) for line in lines if line.startswith("cycles")]
         got = [int(line) for line in lines if not line.startswith("cycles")]
         if self.check:
-            pairs = [(g, w) for g, w in zip(got, wanted, strict=True) if w is not None]
+            pairs = [(g, w) for g, w in zip(got, script.wanted, strict=True) if w is not None]
             self.compared += len(pairs)
             self.differing += sum(g != w for g, w in pairs)
         words = iter(got)
         outputs = self._outputs(tape, entries, player, words)
         if self.check:
             return Outcome(player.reals(), outputs, wall, {"cycles": max(self.cycles, default=0)})
-        player.cells = [self._cell(c, image.places[c.read], words) for c in held]
+        held = [c for r in self.pipeline.registers for c in r.cells]
+        player.cells = [_joined(c.dtype, c.shape, image.places[c.read], words, None) for c in held]
         return Outcome(player.reals(), outputs, wall, {"cycles": max(self.cycles, default=0)})
 
     def _run(self, script: list[str]) -> list[str]:
@@ -210,26 +166,6 @@ class Simulated(Player):
             )
             for (times, kept), port in zip(found, pipeline.outputs, strict=True)
         ]
-
-    def _cell(self, c: Any, places: np.ndarray, words: Any) -> Any:
-        return _joined(c.dtype, c.shape, places, words, None)
-
-
-def _signed(word: int) -> int:
-    return word - (1 << 36) if word >> 35 else word
-
-
-def _parts(expected: Any, places: np.ndarray) -> list[int]:
-    """The words that an array of the interpreter has in the memory."""
-    row = np.ravel(expected).tolist()
-    count = places.size // max(len(row), 1)
-    found: list[int] = []
-    for x in map(int, row):
-        if count == 1:
-            found.append(NONE_WORD if x == NOT_A_NUMBER else x)
-        else:
-            found += [x & 0xFFFFFFFF, x >> 32]
-    return found
 
 
 def _joined(

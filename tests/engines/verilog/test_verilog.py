@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -23,6 +24,7 @@ from flowgraph import (
 from flowgraph.engines.fixed.engine import Integers
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
+from flowgraph.engines.verilog import ENGINE as VERILOG
 from flowgraph.engines.verilog import simulate as simulation
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.nodes import Constant, Held, Nodes, Sum, Term, shifted
@@ -90,7 +92,7 @@ def made():
     return built, formats, with_formats(subject.pipeline, formats), subject.tape(flight())
 
 
-def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(made):
+def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(made, tmp_path):
     need_verilator()
     built, formats, pipeline, tape = made
     assert len(tape.patterns) == 3
@@ -111,6 +113,27 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     for a, b in zip(played.cells, outcome.cells, strict=True):
         np.testing.assert_array_equal(a, b)
     assert max(again.cycles) == max(player.cycles) > 100
+
+    # the script that is written for the bench compares by itself, and sees a single wrong word
+    file = tmp_path / "script"
+    assert VERILOG.write_events(pipeline, flight(), file) == len(tape.time)
+    lines = file.read_text().splitlines()
+    compared = sum(line.startswith("is") for line in lines)
+    assert compared == player.compared
+    assert _bench(player, file) == (0, compared, 0)
+    last = max(k for k, line in enumerate(lines) if line.startswith("is"))
+    lines[last] = f"{lines[last]}1"
+    file.write_text("\n".join(lines))
+    assert _bench(player, file) == (1, compared, 1)
+
+
+def _bench(player, file):
+    run = [str(player.built.program), str(file)]
+    done = subprocess.run(
+        run, cwd=player.built.program.parent.parent, capture_output=True, text=True, check=False
+    )
+    said = dict(line.split() for line in done.stderr.splitlines() if line.startswith("values_"))
+    return done.returncode, int(said["values_compared"]), int(said["values_differing"])
 
 
 @pytest.mark.slow

@@ -48,19 +48,23 @@ module fg_machine #(
   (* ram_style = "block" *) reg [CODE-1:0] program_[0:STEPS-1];
   initial $readmemh(PROGRAM, program_);
   reg [STEP-1:0] step;
-  reg [CODE-1:0] fetched, code;
-  reg running, live1, live2;
+  // Two registers behind the memory: its own clock-to-out is the longest of all.
+  reg [CODE-1:0] fetched, next_code, code;
+  reg running, live1, live2, live3;
   reg [5:0] draining;
   assign ready = !running && draining == 6'd0;
   always @(posedge clk) begin
     fetched <= program_[step];
-    code <= live1 ? fetched : {CODE{1'b0}};
+    next_code <= fetched;
+    code <= live2 ? next_code : {CODE{1'b0}};
     live1 <= running;
     live2 <= live1;
+    live3 <= live2;
     if (reset) begin
       running <= 1'b0;
       live1 <= 1'b0;
       live2 <= 1'b0;
+      live3 <= 1'b0;
       draining <= 6'd0;
       step <= {STEP{1'b0}};
     end else if (start && ready) begin
@@ -69,12 +73,13 @@ module fg_machine #(
       draining <= DEPTH + 6'd2;
     end else if (running) begin
       step <= step + 1'b1;
-      if (live2 && code[HALT]) begin
+      if (live3 && code[HALT]) begin
         running <= 1'b0;
         live1 <= 1'b0;
+        live2 <= 1'b0;
       end
     end else if (draining != 6'd0) draining <= draining - 6'd1;
-    if (live2 && code[HALT]) code <= {CODE{1'b0}};
+    if (live3 && code[HALT]) code <= {CODE{1'b0}};
   end
 
   // Each microword goes along beside what it does: `w(n)` is n registers behind the decoder.
