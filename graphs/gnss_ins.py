@@ -200,7 +200,7 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
     """
     inputs, world, name = filter.inputs(on)
     antenna, measured = filter.antenna(on, name)
-    estimated = filter.estimated(on, inputs, measured)
+    estimated = filter.estimated(on, inputs, name, measured)
     start, inputs, invariant = filter.started(on, inputs, world, estimated, antenna)
     simulated = "noise" in on.flight.info or "still" in on.flight.info
     known: dict[str, Any] = {

@@ -19,12 +19,15 @@ stream declares are refused.
 from __future__ import annotations
 
 from flowgraph.blocks.datasets import (
+    ardupilot,
     broad,
     course,
     csv_file,
     ese650,
     euroc,
+    gins,
     kitti,
+    navego,
     nmea,
     outdoor_quadrotor,
     px4,
@@ -37,12 +40,15 @@ from flowgraph.blocks.datasets import (
 )
 
 __all__ = [
+    "ardupilot",
     "broad",
     "course",
     "csv_file",
     "ese650",
     "euroc",
+    "gins",
     "kitti",
+    "navego",
     "nmea",
     "outdoor_quadrotor",
     "px4",

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph.blocks.datasets.settings import MOST_OFFSET, chosen, number, offset
 from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate
@@ -85,7 +85,8 @@ def adjustment(given: Mapping[str, Any], name: str, path: str) -> Adjustment:
     turn = _three(given, f"{name}.mount", path)
     mount = None
     if turn is not None:
-        x, y, z, w = Rotation.from_rotvec(turn, degrees=True).as_quat(canonical=True).tolist()
+        turned = scipy.spatial.transform.Rotation.from_rotvec(turn, degrees=True)
+        x, y, z, w = turned.as_quat(canonical=True).tolist()
         mount = np.array([w, x, y, z])
     return Adjustment(
         shift=offset(given, f"{name}.time_offset", path),

@@ -4,7 +4,7 @@
     geometry_msgs/PoseStamped                    Pose              vicon
     geometry_msgs/TransformStamped               Pose              vicon
     geometry_msgs/PoseWithCovarianceStamped      Pose              vicon, where no topic of those two is there
-    nav_msgs/Odometry                            Pose              vicon, likewise
+    nav_msgs/Odometry                            Pose              vicon, likewise; its velocity: GnssVelocity
     tf2_msgs/TFMessage, tf/tfMessage             Pose              vicon, likewise
     geometry_msgs/PointStamped                   Position          leica
     sensor_msgs/NavSatFix                        GnssFix           gps
@@ -14,8 +14,8 @@
 
 A message says what it did not measure: a negative first variance (ROS has -1), and a NavSatFix by its status.
 Such numbers are NaN. Fixes and velocities keep the covariance of each message; one that is not known is zero.
-A stream that is called gyro or accelerometer takes that part of an Imu, and one that is called velocity the
-velocity of an Odometry, turned into its frame.
+A stream that is called gyro or accelerometer takes that part of an Imu, and one that is called velocity or
+gps_velocity the velocity of an Odometry, turned into its frame.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.signals import (
     GnssFix,
     GnssVelocity,
@@ -37,7 +40,7 @@ from flowgraph.blocks.signals import (
     Velocity,
 )
 
-__all__ = ["KINDS", "TRANSFORMS", "Kind", "kind_of"]
+__all__ = ["KINDS", "TRANSFORMS", "VELOCITIES", "Kind", "kind_of"]
 
 
 class Kind(NamedTuple):
@@ -89,14 +92,15 @@ def _transform(m: Any) -> list[float]:
 
 
 def _world_velocity(m: Any) -> list[float]:
-    """The velocity of an Odometry, which is in the axes of its body, in those of its frame."""
-    (w, *u), v = _quaternion(m.pose.pose.orientation), _vector(m.twist.twist.linear)
-    t = [2.0 * c for c in _cross(u, v)]
-    return [a + w * b + c for a, b, c in zip(v, t, _cross(u, t), strict=True)]
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    """The velocity of an Odometry, which is in the axes of its body, in those of its frame, and its block of
+    the covariance, turned with it."""
+    twist = _twist(m)
+    q = np.array([_quaternion(m.pose.pose.orientation)])
+    if not np.any(q):  # which is refused with the poses
+        return twist
+    R = np.asarray(to_matrix(q / np.linalg.norm(q), xp=np))[0]
+    covariance = R @ np.reshape(twist[3:], (3, 3)) @ R.T
+    return [*(R @ twist[:3]).tolist(), *covariance.ravel().tolist()]
 
 
 def _orientation(m: Any) -> list[str]:
@@ -131,6 +135,7 @@ def _moved(velocity: Any, covariance: Any) -> GnssVelocity:
 
 _POSE = {"position": slice(0, 3), "attitude": slice(3, 7)}
 _VELOCITY = {"velocity": slice(0, 3)}
+_WITH_ITS_OWN = {"velocity": slice(0, 3), "covariance": slice(3, 12)}
 _TRANSFORMS = Kind("vicon", _transform, _POSE, Pose, parts=lambda m: m.transforms, first=False)
 _WITH_COVARIANCE = {"pose.covariance": slice(0, 7)}
 
@@ -189,13 +194,16 @@ KINDS: Mapping[str, Kind] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": Kind(
         "velocity",
         _twist,
-        {"velocity": slice(0, 3), "covariance": slice(3, 12)},
+        _WITH_ITS_OWN,
         _moved,
         {"twist.covariance": slice(0, 3)},
         named=True,
     ),
 }
 """What is read of a bag, by type of message."""
+
+VELOCITIES = ("velocity", "gps_velocity", "gnss_velocity")
+"""Names of streams of a velocity."""
 
 _PARTS: Mapping[tuple[str, str], Kind] = {
     ("sensor_msgs/msg/Imu", "gyro"): Kind(
@@ -213,11 +221,15 @@ _PARTS: Mapping[tuple[str, str], Kind] = {
         {"linear_acceleration_covariance": slice(0, 3)},
     ),
     ("nav_msgs/msg/Odometry", "velocity"): Kind(
-        "velocity", _world_velocity, _VELOCITY, Velocity, {"twist.covariance": slice(0, 3)}
+        "velocity",
+        _world_velocity,
+        _WITH_ITS_OWN,
+        _moved,
+        {"twist.covariance": slice(0, 3)},
     ),
 }
 
 
 def kind_of(message: str, stream: str) -> Kind:
     """How messages of a type of `KINDS` are read into a stream of that name."""
-    return _PARTS.get((message, stream), KINDS[message])
+    return _PARTS.get((message, "velocity" if stream in VELOCITIES else stream), KINDS[message])

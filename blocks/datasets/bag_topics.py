@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from flowgraph.blocks.datasets.bag_file import Bag
-from flowgraph.blocks.datasets.bag_messages import KINDS, TRANSFORMS
+from flowgraph.blocks.datasets.bag_messages import KINDS, TRANSFORMS, VELOCITIES
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 
@@ -27,7 +27,12 @@ def wanted(text: str, given: Mapping[str, Any]) -> list[tuple[str, str]]:
             )
     names = [name for name, _, _ in pairs]
     what = [  # one topic may be read twice where that is not the same
-        (t, given.get(f"{n}.body"), given.get(f"{n}.frame"), n in ("gyro", "accelerometer", "velocity") and n)
+        (
+            t,
+            given.get(f"{n}.body"),
+            given.get(f"{n}.frame"),
+            n in ("gyro", "accelerometer", *VELOCITIES) and n,
+        )
         for n, _, t in pairs
     ]
     if len({*names}) < len(names) or len({*what}) < len(what):

@@ -19,6 +19,7 @@ import numpy as np
 from flowgraph import Flight
 from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
+from flowgraph.blocks.datasets.places import from_ned
 from flowgraph.blocks.datasets.shape import (
     MEASURED_NOISE,
     NOISE_SETTINGS,
@@ -47,11 +48,14 @@ from flowgraph.blocks.datasets.units import (
 from flowgraph.blocks.signals import (
     Attitude,
     GeodeticPosition,
+    Height,
     Imu,
     MagneticField,
     NavigationState,
     Pose,
     Position,
+    Velocity,
+    WheelSpeed,
 )
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
@@ -67,7 +71,10 @@ STREAMS: Mapping[str, Mapping[str, tuple[int, Mapping[str, float]]]] = {
     "vicon": {"position": (3, LENGTH), **_TURNS},
     "leica": {"position": (3, LENGTH)},
     "gps": {"latitude": (1, ANGLE), "longitude": (1, ANGLE), "height": (1, LENGTH)},
+    "gps_velocity": {"velocity": (3, SPEED)},
     "magnetometer": {"field": (3, FIELD)},
+    "barometer": {"height": (1, LENGTH)},
+    "wheels": {"speed": (1, SPEED)},
     "truth": {
         "position": (3, LENGTH),
         **_TURNS,
@@ -86,9 +93,18 @@ _SIGNALS: Mapping[frozenset[str], Any] = {
     frozenset(("position",)): Position,
     frozenset(("attitude",)): Attitude,
     frozenset(STREAMS["gps"]): GeodeticPosition,
+    frozenset(STREAMS["gps_velocity"]): Velocity,
     frozenset(STREAMS["magnetometer"]): MagneticField,
+    frozenset(STREAMS["barometer"]): Height,
+    frozenset(STREAMS["wheels"]): WheelSpeed,
     frozenset(STREAMS["truth"]) - {"angles", "matrix"}: NavigationState,
 }
+_TRUTHS = [
+    frozenset(("attitude",)),
+    frozenset(("position",)),
+    frozenset(("position", "attitude")),
+    frozenset(STREAMS["truth"]) - {"angles", "matrix"},
+]
 _TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
 """Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
 _INDEX = ("index", "row", "row.names")
@@ -116,6 +132,7 @@ SETTINGS: Mapping[str, str] = {
         for field, (_, units) in fields.items()
         if len(units) > 1
     },
+    "gps_velocity.axes": "of its three columns: enu (left out: east, north, up) or ned",
     **{
         f"{stream}.angles.order": "of the turns, each about an axis of the turned body: " + ", ".join(ORDERS)
         for stream in ("vicon", "truth")
@@ -182,6 +199,11 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             group = places[stream, field]
             parts = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
             name, values = _converted(given, sheet, stream, field, group, np.stack(parts, axis=1), made.notes)
+            if (
+                stream == "gps_velocity"
+                and chosen(given, "gps_velocity.axes", ("enu", "ned"), "csv") == "ned"
+            ):
+                values = from_ned(values)
             columns[name] = values
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
@@ -260,7 +282,7 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
         ways = [f for f in found if f in _TURNS]
         kinds = frozenset("attitude" if f in _TURNS else f for f in found)
         needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
-        if len(ways) > 1 or kinds not in _SIGNALS or (stream != "truth" and set(kinds) != needed):
+        if len(ways) > 1 or kinds not in (_TRUTHS if stream == "truth" else [needed]):
             raise DeclarationError(
                 f"{stream} lacks a field" if len(ways) < 2 else f"{stream} has its attitude twice",
                 path=f"csv.{stream}",

@@ -47,7 +47,8 @@ def read_mat(file: Path, fields: Mapping[str, tuple[int | None, ...]]) -> dict[s
 
 
 def read_structs(file: Path, *names: str, also: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The variables of a .mat file, structs as dictionaries: `names`, which must be there, and `also`.
+    """The variables of a .mat file, structs as dictionaries: `names`, which must be there, and `also`; all
+    where none are named.
 
     Raises:
         DataError: the file is missing, cut off or no .mat file, or lacks a variable.
@@ -109,7 +110,8 @@ def _content(file: Path, names: list[str], also: tuple[str, ...] = (), **how: An
     try:
         content = content_of(file, most=2**40)
         _check_parts(content)
-        found: dict[str, Any] = loadmat(io.BytesIO(content), variable_names=[*names, *also], **how)
+        wanted = [*names, *also] or None  # all
+        found: dict[str, Any] = loadmat(io.BytesIO(content), variable_names=wanted, **how)
         held = [name for name, _, _ in whosmat(io.BytesIO(content))] if set(names) - set(found) else []
     except NotImplementedError:
         raise DataError(

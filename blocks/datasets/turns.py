@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph.errors import DataError
 
-__all__ = ["ORDERS", "from_angles", "from_matrices"]
+__all__ = ["ORDERS", "from_angles", "from_matrices", "from_ned_attitude"]
 
 ORDERS = ("zyx", "zxy", "xyz", "xzy", "yxz", "yzx")
 """In which order the body turns about its own axes; the first is that of yaw, pitch, roll."""
@@ -22,7 +22,26 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
     found = np.full((len(angles), 4), np.nan)
     if whole.any():
         picked = angles[whole][:, ["xyz".index(axis) for axis in order]]
-        found[whole] = Rotation.from_euler(order.upper(), picked).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        turned = scipy.spatial.transform.Rotation.from_euler(order.upper(), picked)
+        found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    return found
+
+
+_ENU, _FLU = (
+    Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+    Rotation.from_matrix(np.diag([1, -1, -1])),
+)
+"""North, east, down to east, north, up; forward, left, up to forward, right, down."""
+
+
+def from_ned_attitude(q: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4), w first, of forward, left, up in east, north, up, of those of forward, right, down
+    in north, east, down; rows with a NaN are NaN."""
+    whole = np.isfinite(q).all(axis=1)
+    found = np.full(q.shape, np.nan)
+    if whole.any():
+        turned = _ENU * Rotation.from_quat(q[whole][:, [1, 2, 3, 0]]) * _FLU
+        found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found
 
 
@@ -54,5 +73,6 @@ def from_matrices(values: np.ndarray, where: Callable[[int], str], *, by_rows: b
             got=str(np.round(matrices[k], 4).tolist()),
             fix="check the order of the columns, or mend or delete the row",
         )
-    found[whole] = Rotation.from_matrix(matrices[whole]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    turned = scipy.spatial.transform.Rotation.from_matrix(matrices[whole])
+    found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found

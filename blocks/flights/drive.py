@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.geodetic import from_enu
@@ -204,7 +204,7 @@ class _Road:
         turns = np.cumsum(draw.normal(0.0, 0.7, count))
         steps = 80.0 * np.stack([np.cos(turns), np.sin(turns), draw.normal(0.0, 0.03, count)], axis=-1)
         places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self.curve = make_interp_spline(np.arange(len(places)), places, k=5)
+        self.curve = scipy.interpolate.make_interp_spline(np.arange(len(places)), places, k=5)
         self.tangent = self.curve.derivative()
         # how fast: at rest, away, around, and one stop on the way
         knots = np.linspace(0.0, max(duration, 1.0), max(int(duration / 6.0), 2) + 1)
@@ -218,9 +218,9 @@ class _Road:
         fine = np.linspace(0.0, max(float(t[-1]), 1e-3), max(int(t[-1] * 200), 2) + 1)
         begun = np.clip((fine - _REST) / 4.0, 0.0, 1.0)
         begun = begun**3 * (10.0 - 15.0 * begun + 6.0 * begun**2)
-        spline = make_interp_spline(self.knots, self.pace, k=min(3, len(self.knots) - 1))
+        spline = scipy.interpolate.make_interp_spline(self.knots, self.pace, k=min(3, len(self.knots) - 1))
         pace = begun * np.clip(spline(fine), 0.0, None)
-        whole = make_interp_spline(fine, pace, k=3).antiderivative()
+        whole = scipy.interpolate.make_interp_spline(fine, pace, k=3).antiderivative()
         return np.asarray(whole(t) - whole(0.0))
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.flights import drive, figure, plane, worlds
@@ -153,7 +153,7 @@ def trajectory(seconds: np.ndarray, *, seed: int = 0) -> dict[str, np.ndarray]:
 
 def _quaternion(R: np.ndarray) -> np.ndarray:
     """Quaternions (n, 4) of rotation matrices (n, 3, 3), each with the sign nearest to the one before it."""
-    q = Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
+    q = scipy.spatial.transform.Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
     flips = np.sign(np.einsum("ni,ni->n", q[1:], q[:-1]))
     signs = np.cumprod(np.concatenate([[math.copysign(1.0, q[0, 0])], flips]))
     return np.asarray(q * signs[:, None])

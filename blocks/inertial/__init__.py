@@ -6,7 +6,8 @@ error-state Kalman filter's prediction, and `ImuNoise`, the densities by which a
 to start from, `calibration` takes out what a unit reads too much while it rests, and `imu_calibration` finds
 what a count of its converters is worth by what a motion capture saw. Over the Earth, `navigation` predicts
 where it turns and is round, and estimates more; `outdoors` aids by satellites, heights, directions and
-wheels; `moving` aligns a body in motion by the positions that come after.
+wheels; `moving` aligns a body in motion by the positions that come after, `compassing` one at rest by the
+turn of the Earth.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from flowgraph.blocks.inertial.alignment import (
     usable,
 )
 from flowgraph.blocks.inertial.calibration import silence_frozen_gyro, subtract_rest_bias
+from flowgraph.blocks.inertial.compassing import Compassed, compass_by_gyro
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, carried, error_jacobian, predict
 from flowgraph.blocks.inertial.imu_calibration import (
     CountsCalibration,
@@ -62,6 +64,8 @@ from flowgraph.blocks.inertial.outdoors import (
 )
 
 __all__ = [
+    "Compassed",
+    "compass_by_gyro",
     "need_usable",
     "usable",
     "GRAVITY",

@@ -44,7 +44,11 @@ __all__ = [
     "reweight",
     "start_cloud",
     "weights",
+    "within_depth",
 ]
+
+DEPTH = 60.0
+"""How far a particle falls behind the best in one reading at most: exp(-60) is nothing in a sum."""
 
 _SQUARINGS = 5
 _ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
@@ -76,7 +80,8 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
 
         log p(z | q) = -|Log(q^-1 * z)|^2 / (2 noise^2) - 3 log(noise) - 3/2 log(2 pi)
 
-    An attitude with a NaN in it was not measured: all particles explain it alike.
+    An attitude with a NaN in it was not measured: all particles explain it alike. What is more than 60 below
+    the best particle's is put there.
 
     Args:
         noise: standard deviation about each body axis, rad; small, so that the circle does not matter.
@@ -84,17 +89,29 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
     error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
-    return LogLikelihood(value=xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant)
+    return LogLikelihood(
+        value=within_depth(xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant, xp=xp)
+    )
 
 
 @block
 def reweight(cloud: Cloud, position: LogLikelihood, attitude: LogLikelihood, *, xp: Any) -> Cloud:
     """Multiply the weights by the likelihoods of two independent measurements, and normalise.
 
-    log w' = log w + log p_1 + log p_2 - log(sum over all particles).
+    log w' = log w + log p_1 + log p_2 - log(sum over all particles), the largest less 60 at least.
     """
-    log_weight = cloud.log_weight + position.value + attitude.value
+    log_weight = within_depth(cloud.log_weight + position.value + attitude.value, xp=xp)
     return cloud.replace(log_weight=log_weight - log_sum_exp(log_weight, xp=xp))
+
+
+def within_depth(x: Array, *, xp: Any) -> Array:
+    """Logarithms of likelihoods or weights (n), those far below the largest put at `DEPTH` below it.
+
+    A weight of exp(-60) adds nothing to any sum. But where a few particles are 1e5 below, words of a fixed
+    number of bits that hold these hold the others to 0.001 alone.
+    """
+    least = xp.max(x) - DEPTH
+    return xp.where(x > least, x, least)
 
 
 def log_sum_exp(x: Array, *, xp: Any) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.inertial.imu import GRAVITY
+from flowgraph.blocks.particles.cloud import within_depth
 from flowgraph.blocks.signals import Cloud, Imu, LogLikelihood, Pose
 
 __all__ = ["correct_motion", "predict_motion"]
@@ -106,7 +107,8 @@ def correct_motion(
         lever: the point in body coordinates, m.
 
     Returns:
-        The cloud with corrected motion and its weights as they were, and the log-likelihoods for `reweight`.
+        The cloud with corrected motion and its weights as they were, and the log-likelihoods for `reweight`,
+        those more than 60 below the best particle's put there.
     """
     kind = cloud.position.dtype
     V, C, P = cloud.velocity_covariance, cloud.cross_covariance, cloud.position_covariance
@@ -130,7 +132,7 @@ def correct_motion(
         position_covariance=_symmetric(r * lanes.matrix_product(inverse, P), xp),
     )
     log_likelihood = -0.5 * (distance + log_determinant + 3.0 * math.log(2.0 * math.pi))
-    return corrected, LogLikelihood(value=log_likelihood)
+    return corrected, LogLikelihood(value=within_depth(log_likelihood, xp=xp))
 
 
 def _symmetric(a: Array, xp: Any) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from flowgraph import Series
 from flowgraph.blocks.geometry.geodetic import to_enu
 from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds, start_belief, usable
+from flowgraph.blocks.inertial.compassing import compass_by_gyro
 from flowgraph.blocks.inertial.moving import align_moving
 from flowgraph.blocks.inertial.navigation import PARAMETERS, Earth, earth_at, extended, gravity_at
 from flowgraph.blocks.inertial.outdoors import Antenna, Resting
@@ -36,6 +37,9 @@ POSITIONS = ("gnss", "gps", "rtk", "leica", "vicon")
 
 USUAL = {"position": 2.5, "velocity": 0.2}
 """m and m/s, an axis: of a receiver of which nothing is known."""
+
+_LONGEST_REST = 120.0  # s, that are looked at for north
+_COMPASSED = 0.1  # rad, of a heading by the Earth's turn that is good enough
 
 _RIDE = 100_000_000  # ns, between two looks at how a vehicle rolls, where no wheel tells its speed
 
@@ -67,6 +71,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         speed_noise, slip: m/s, of wheels along and across.
         non_holonomic: whether the body is a vehicle that moves along its x axis, with wheels or without.
         zero_velocity: whether standing still is looked for.
+        gyro_bias, accelerometer_bias: rad/s and m/s^2, deviations of the unit's constant biases; the flight's
+            if it tells them. Where the first is small enough, a body at rest finds north by the Earth's turn.
     """
 
     position_noise: Positive | None = None
@@ -80,6 +86,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
     slip: Positive = 0.1
     non_holonomic: bool = False
     zero_velocity: bool = False
+    gyro_bias: Positive | None = None
+    accelerometer_bias: Positive | None = None
 
     def inputs(self, on: OnFlight) -> tuple[dict[str, Series], World, str | None]:
         """The inputs of the graph, the world that they are in, and the name of the stream of positions.
@@ -180,11 +188,13 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         on.note("assumed", "magnetic north is north: declination or date says where it is")
         return 0.5 * math.pi
 
-    def estimated(self, on: OnFlight, inputs: Mapping[str, Series], lever: bool) -> tuple[str, ...]:
+    def estimated(
+        self, on: OnFlight, inputs: Mapping[str, Series], name: str | None, lever: bool
+    ) -> tuple[str, ...]:
         """What is estimated beside the fifteen.
 
         Args:
-            lever: whether the flight says where the antenna sits.
+            name: of the stream of the positions. lever: whether the flight says where the antenna sits.
 
         Raises:
             UnknownNameError: for what cannot be.
@@ -197,8 +207,13 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
             return tuple(dict.fromkeys(names))
         found = []
         if "gnss" in inputs and not lever and _good(inputs["gnss"]):
-            found += ["lever", "time_offset"]
-            on.note("assumed", "nobody says where the antenna sits and how late it is: both are estimated")
+            if f"{name}.time_offset" in on.flight.info.get("sought", ()):
+                found.append("lever")
+                on.note("assumed", "nobody says where the antenna sits: it is estimated")
+            else:
+                found += ["lever", "time_offset"]
+                said = "nobody says where the antenna sits and how late it is: both are estimated"
+                on.note("assumed", said)
         if "barometer" in inputs:
             found.append("height_offset")
         return tuple(found)
@@ -221,7 +236,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         """The belief to start from, the inputs from then on, and whether next to nothing is known of its
         heading.
 
-        The truth's, or what the file shows at rest; else that of an alignment in motion, of which the
+        The truth's, or what the file shows at rest; else, of a unit that is good enough and rests, what the
+        Earth's turn shows; else that of an alignment in motion, of which the
         heading is as sure as the motion makes it; else a level body with a heading of which nothing is known.
         """
         begin = self.pose(on, inputs, position=inputs.get("gnss"))
@@ -232,6 +248,15 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         if begin.told and on.flight.truth is not None and "velocity" in on.flight.truth.leaves:
             row = int(np.argmin(np.abs(on.flight.truth.time - begin.time)))
             velocity = on.flight.truth["velocity"][row]
+        north = self._north(on, imu, world) if begin.unknown else None
+        if north is not None:
+            compassed, spread = north
+            self._said(on, spread.tilt, spread.velocity, spread.heading)
+            if "gnss" in kept:
+                size = 3.0 * float(np.sqrt(kept["gnss"]["covariance"][0, 0, 0])) + 0.1
+                spread = replace(spread, position=size)
+            belief = start_belief(position, compassed, spread=spread)
+            return extended(belief, estimated, lever=antenna.lever), kept, False
         if begin.unknown and "gnss" in kept:
             size = max(0.3, float(np.sqrt(np.median(kept["gnss"]["covariance"][:, 0, 0]))))
             moving = align_moving(imu, kept["gnss"], gravity=world.gravity, noise=size)
@@ -267,6 +292,39 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         )
         arm = (0.0, 0.0, 0.0) if begin.told and "lever" not in estimated else antenna.lever
         return extended(belief, estimated, lever=arm), kept, spread.heading >= UNKNOWN_HEADING
+
+    def _north(self, on: OnFlight, imu: Series, world: World) -> tuple[np.ndarray, StartSpread] | None:
+        """The attitude by the Earth's turn and how sure it is, where the unit is good enough to tell; a note
+        says how sure it is, or would be."""
+        told = on.flight.info.get("start_spread", (None, None))
+        bias, push = given(self.gyro_bias, told[0]), given(self.accelerometer_bias, told[1])
+        noise = on.flight.info.get("imu_noise")
+        if world.earth is None or bias is None or noise is None or on.weightless:
+            return None
+        white = 6.0 * np.array([noise.gyro, noise.accelerometer]) / math.sqrt(0.1)  # of means of a tenth
+        rate, force = np.minimum(white, [0.03, 0.3]).tolist()
+        rest = rest_seconds(imu, rate=rate, force=force, most=_LONGEST_REST)
+        if rest < 1.0:
+            return None
+        found = compass_by_gyro(
+            imu, rest, turn=world.earth.turn, noise=noise, gyro_bias=bias,
+            accelerometer_bias=given(push, StartSpread().accelerometer_bias),
+        )  # fmt: skip
+        sure = f"{math.degrees(found.heading):.2g} degrees"
+        if found.heading > _COMPASSED:
+            on.note("refused", f"gyro compassing: by a unit of this bias north is known to {sure} only")
+            return None
+        if not found.believed:
+            off = f"{found.missed:.1f} deviations"
+            on.note("refused", f"gyro compassing: what turns about the vertical is not the Earth, by {off}")
+            return None
+        on.note(
+            "info", f"the heading at the start is that of gyro compassing over {rest:.3g} s: known to {sure}"
+        )
+        return found.attitude, StartSpread(
+            velocity=0.05, tilt=max(found.tilt, 1e-5), heading=max(found.heading, 1e-5), gyro_bias=bias,
+            accelerometer_bias=given(push, StartSpread().accelerometer_bias),
+        )  # fmt: skip
 
     def _said(self, on: OnFlight, tilt: float, velocity: float, heading: float | None = None) -> None:
         """A note on how sure the start is."""

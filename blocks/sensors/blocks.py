@@ -28,7 +28,9 @@ from flowgraph.blocks.signals import (
     Attitude,
     BodyMotion,
     Imu,
+    MagneticField,
     NavigationState,
+    OpticalFlow,
     Pose,
     Position,
     Range,
@@ -40,7 +42,9 @@ __all__ = [
     "drift",
     "read_altimeter",
     "read_attitude",
+    "read_flow",
     "read_imu",
+    "read_magnetometer",
     "read_pose",
     "read_position",
     "true_state",
@@ -130,6 +134,45 @@ def read_altimeter(
     here = upright >= math.cos(min(most_tilt, math.radians(89.9)))
     distance = motion.position[2] / xp.where(here, upright, 1.0) + noise * draw.normal("noise", ())
     return when(here, Range(distance=distance))  # type: ignore[return-value]
+
+
+@block
+def read_magnetometer(
+    motion: BodyMotion,
+    *,
+    field: tuple[float, float, float],
+    hard_iron: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    noise: float,
+    draw: Any,
+    xp: Any,
+) -> MagneticField:
+    """The field R^T m + hard iron + error (3), T, in the body; `field` is m in the world (`earth_field`)."""
+    there = rotate(conjugate(motion.attitude, xp=xp), xp.asarray(field, dtype=motion.attitude.dtype), xp=xp)
+    body = xp.asarray(hard_iron, dtype=there.dtype)
+    return MagneticField(field=there + body + noise * draw.normal("noise", (3,)))
+
+
+@block
+def read_flow(
+    before: Pose, motion: BodyMotion, *, noise: float, turn_noise: float, dt: float, draw: Any, xp: Any
+) -> tuple[Pose, OpticalFlow | None]:
+    """How the body moved and turned since this fired last, R(q0)^T (p1 - p0) + error and q0^-1 q1 Exp(error).
+
+    noise, turn_noise: standard deviations, m and rad. Nothing comes of the first picture.
+
+    State: the pose at the picture before."""
+    back = conjugate(before.attitude, xp=xp)
+    moved = rotate(back, motion.position - before.position, xp=xp) + noise * draw.normal("place", (3,))
+    error = from_rotation_vector(turn_noise * draw.normal("turn", (3,)), xp=xp)
+    turn = multiply(multiply(back, motion.attitude, xp=xp), error, xp=xp)
+    seconds = xp.asarray(dt, dtype=moved.dtype)
+    flow = OpticalFlow(displacement=moved, turn=turn, interval=seconds)
+    return Pose(position=motion.position, attitude=motion.attitude), when(seconds > 0.0, flow)  # type: ignore[return-value]
+
+
+@read_flow.init
+def _(motion: Any, *, noise: float, turn_noise: float) -> Pose:
+    return Pose(position=np.zeros(3), attitude=np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 @block

@@ -16,9 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.sparse import csr_matrix
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.geometry.rotations import skew
@@ -257,7 +255,7 @@ class _Problem:
         Y = self.corners(x)[self.tag_of] @ R.mT + cameras[self.camera_of, None, 3:]
         return np.asarray(((Y[..., :2] / Y[..., 2:] - self.seen) * self.focal).ravel())
 
-    def jacobian(self, x: np.ndarray) -> csr_matrix:
+    def jacobian(self, x: np.ndarray) -> scipy.sparse.csr_matrix:
         """d residuals / d x. A rotation vector's change d turns R into R Exp(J d), J its right Jacobian."""
         cameras, tags = self._split(x)
         R, J = _rotations(cameras[:, :3])[self.camera_of], _right_jacobians(cameras[:, :3])[self.camera_of]
@@ -280,11 +278,11 @@ class _Problem:
             -1, self.columns.shape[1]
         )
         values = (blocks[self.used], (self.rows[self.used], self.columns[self.used]))
-        return csr_matrix(values, shape=(len(self.rows), len(self.start)))
+        return scipy.sparse.csr_matrix(values, shape=(len(self.rows), len(self.start)))
 
     def adjust(self) -> tuple[np.ndarray, float]:
         """The adjusted x, and the median distance in px."""
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             self.residuals,
             self.start,
             jac=self.jacobian,
@@ -301,11 +299,11 @@ class _Problem:
 
 
 def _pose_vector(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), t])
+    return np.concatenate([scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec(), t])
 
 
 def _rotations(r: np.ndarray) -> np.ndarray:
-    return np.asarray(Rotation.from_rotvec(r).as_matrix())
+    return np.asarray(scipy.spatial.transform.Rotation.from_rotvec(r).as_matrix())
 
 
 def _skews(v: np.ndarray) -> np.ndarray:

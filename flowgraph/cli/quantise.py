@@ -24,6 +24,9 @@ def quantise(
     held_out_seeds: Annotated[int, typer.Option(min=1, help="Other flights, that judge them.")] = 3,
     first_seed: Annotated[int, typer.Option(min=0, help="Of the first flight.")] = 0,
     width: Annotated[int, typer.Option(help="Bits of a word at most.")] = 32,
+    held_width: Annotated[
+        int, typer.Option(help="Bits of inputs, registers and what is added up in them, where they are more.")
+    ] = 0,
     least: Annotated[int, typer.Option(help="Bits below which none is tried.")] = 8,
     bound: Annotated[
         list[str] | None,
@@ -61,8 +64,9 @@ def quantise(
 
     held_out = flown(first_seed + seeds, held_out_seeds)
     found = search(
-        flown(first_seed, seeds), held_out, width=width, bounds=bounds, margin=margin, least=least, say=say
-    )
+        flown(first_seed, seeds), held_out, width=width, bounds=bounds, margin=margin, least=least, say=say,
+        held_width=held_width,
+    )  # fmt: skip
     report = {
         "graph": graph, "data": data, "settings": given, "seeds": seeds, "held_out_seeds": held_out_seeds,
         "first_seed": first_seed, "margin": margin, "bounds": bounds, **found.figures,

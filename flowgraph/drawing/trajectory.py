@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+import scipy  # its parts are loaded when they are used
 
 from flowgraph.data.series import Series
 from flowgraph.drawing import canvas
@@ -218,8 +218,8 @@ def _state(
     axis.set_ylim(middle - 0.75 * around, middle + 0.75 * around)
 
 
-def _rotations(series: Series) -> Rotation:
-    return Rotation.from_quat(series["attitude"][:, [1, 2, 3, 0]])
+def _rotations(series: Series) -> Any:
+    return scipy.spatial.transform.Rotation.from_quat(series["attitude"][:, [1, 2, 3, 0]])
 
 
 def _attitude(
@@ -260,7 +260,7 @@ def _errors(axes: Any, estimate: Series, truth: Series, seconds: np.ndarray) -> 
     axes[0].set_ylabel("[m]")
     if len(time) and len(truth) > 1:
         start = truth.time[0]
-        true = Slerp(truth.time - start, _rotations(truth))(time - start)
+        true = scipy.spatial.transform.Slerp(truth.time - start, _rotations(truth))(time - start)
         turn = (true.inv() * _rotations(estimate)[inside]).magnitude()
         axes[1].plot(at, np.degrees(turn), color=COLOURS[3], lw=1)
     axes[1].set_title("error of attitude", loc="left", fontsize=9)

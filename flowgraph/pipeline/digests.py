@@ -107,11 +107,11 @@ def _source_digest(source: str) -> str:
 
 
 def structure(pipeline: Pipeline) -> tuple[Any, ...]:
-    """Everything of a pipeline but the values of its real constants, other than tables, and of its registers
-    at the start.
+    """Everything of a pipeline but the values of its `settings_of`, and of its registers at the start.
 
     Two pipelines of one structure are one program on different numbers.
     """
+    free = settings_of(pipeline)
     return (
         pipeline.name,
         pipeline.time,
@@ -120,7 +120,7 @@ def structure(pipeline: Pipeline) -> tuple[Any, ...]:
         _ports(pipeline.outputs),
         tuple((r.path, r.role, _cells(r)) for r in pipeline.registers),
         tuple(
-            (n, a.shape, a.dtype.str, None if a.dtype.kind == "f" and not is_table(a) else a.tobytes())
+            (n, a.shape, a.dtype.str, None if n in free else a.tobytes())
             for n, a in pipeline.constants.items()
         ),
         tuple((i.op, i.args, _plain(i.attrs), i.out) for i in pipeline.instructions),
@@ -131,7 +131,17 @@ def structure(pipeline: Pipeline) -> tuple[Any, ...]:
 _PLAIN = (0.0, 0.5, 1.0, 2.0)
 
 
-def is_table(array: np.ndarray) -> bool:
+def settings_of(pipeline: Pipeline) -> dict[int, np.ndarray]:
+    """The real constants that a program need not know: all but tables (`_is_table`) and exponents."""
+    exponents = {i.args[1] for i in pipeline.instructions if i.op == "pow"}
+    return {
+        n: a
+        for n, a in pipeline.constants.items()
+        if a.dtype.kind == "f" and n not in exponents and not _is_table(a)
+    }
+
+
+def _is_table(array: np.ndarray) -> bool:
     """Whether a constant is a matrix of whole numbers, as that of a product of quaternions is, or one of 0,
     1/2, 1 and 2 but for the sign.
 

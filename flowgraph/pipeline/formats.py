@@ -1,9 +1,11 @@
 """Number formats: how each real value of a pipeline is kept as a whole number.
 
-A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included; the
-fraction f is chosen for each element from the largest size that the element takes, since the entries of one
-covariance differ by many powers of ten. Elements along an axis of particles share one. Values that are only
-moved (an element, a row, a transpose) keep the formats that they had.
+A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included, but for
+those of registers and of what is added up in them, which may be wider: what is held gathers the rounding of
+many ticks, and an adder costs less than a multiplier. The fraction f is chosen for each element from the
+largest size that the element takes, since the entries of one covariance differ by many powers of ten.
+Elements along an axis of particles share one. Values that are only moved (an element, a row, a transpose)
+keep the formats that they had.
 """
 
 from __future__ import annotations
@@ -42,6 +44,8 @@ class Formats:
         margin: by how much the sizes were widened that the fractions were chosen from.
         absent: the inputs and registers that may be NaN: readings that are not there.
         structure: a digest of the plain pipeline that they are for; empty where nobody asks.
+        held: the inputs, registers and values that are kept in wider words.
+        held_width: bits of those; 0 where there are none.
 
     Raises:
         DeclarationError: for a width that no word has.
@@ -52,16 +56,24 @@ class Formats:
     margin: float = 1.0
     absent: frozenset[int] = frozenset()
     structure: str = ""
+    held: frozenset[int] = frozenset()
+    held_width: int = 0
 
     def __post_init__(self) -> None:
-        if not NARROWEST <= self.width <= WIDEST:
-            raise DeclarationError(
-                "no word has this width",
-                path="width",
-                expected=f"{NARROWEST} to {WIDEST} bits",
-                got=str(self.width),
-                fix=f"choose {WIDEST} or fewer: products of two words are kept in 64 bits",
-            )
+        wide = self.held_width or self.width
+        for name, width, least in (("width", self.width, NARROWEST), ("held_width", wide, self.width)):
+            if not least <= width <= WIDEST:
+                raise DeclarationError(
+                    "no word has this width",
+                    path=name,
+                    expected=f"{least} to {WIDEST} bits",
+                    got=str(width),
+                    fix=f"choose {WIDEST} or fewer: products of two words are kept in 64 bits",
+                )
+
+    def width_of(self, value: int) -> int:
+        """Bits of the words of a value that is no move of another."""
+        return self.held_width if value in self.held else self.width
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
@@ -72,6 +84,7 @@ class Formats:
             "margin": self.margin,
             "absent": sorted(self.absent),
             "structure": self.structure,
+            **({"held": {"width": self.held_width, "values": sorted(self.held)}} if self.held else {}),
             "fractions": [
                 {"value": n, "fraction": np.asarray(f).tolist()} for n, f in sorted(self.fractions.items())
             ],
@@ -93,12 +106,15 @@ class Formats:
             if found.dtype.kind != "i":
                 raise ValueError(f"the fraction of value {one['value']} is no array of integers")
             fractions[int(one["value"])] = found.astype(np.int64)
+        held = data.get("held", {"width": 0, "values": []})
         return cls(
             int(data["width"]),
             fractions,
             float(data["margin"]),
             frozenset(map(int, data["absent"])),
             str(data["structure"]),
+            frozenset(map(int, held["values"])),
+            int(held["width"]),
         )
 
 

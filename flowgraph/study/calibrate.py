@@ -32,6 +32,7 @@ _POINTS, _WIDTHS = 13, (0.03, 0.02)
 """Of a parabola, and how far it reaches to both sides, s: first and then."""
 
 _GRID = 11
+_APART = 0.05  # s, between clocks that are not the same
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def calibrate(
     if measure not in MEASURES:
         raise UnknownNameError("measure", measure, MEASURES, path="calibrate")
     check_fits(graph, fits, recordings, (), settings)
-    problem = Trials(graph, recordings, settings, measure, metric, engine)
+    problem = Trials(graph, recordings, settings, measure, metric, engine, [f.name for f in fits])
     offsets = [f for f in fits if f.name.rpartition(".")[2] == OFFSET]
     others = [f for f in fits if f not in offsets]
     found: dict[str, Parameter] = {f.name: start_of_fit(graph, f) for f in fits}
@@ -98,9 +99,10 @@ def calibrate(
         known = [g for g in told if g is not None and g.sure]
         if known:
             guesses[f.name] = known[0]
-            found[f.name] = float(np.mean([g.offset for g in known]))
+            found[f.name] = float(np.median([g.offset for g in known]))  # one of another clock moves it least
             said = f"{f.name}: begun at {found[f.name]:.4g} s, by {known[0].by}"
             notes.append(note("info", f"{said}, whose correlation is {known[0].correlation:.3f} there"))
+            notes += _apart(f.name, recordings, told, found[f.name])
         else:
             grid = np.linspace(f.low, f.high, _GRID)
             found[f.name] = float(grid[int(tried.along(f.name, grid, found).argmin())])
@@ -129,6 +131,17 @@ def calibrate(
                 ends = ended.at_bound.items()
                 notes += [note("warning", f"{n} ended at its {side} bound: widen it") for n, side in ends]
     return Calibrated(graph, found, deviations, tried.count, guesses, tuple(dict.fromkeys(notes)))
+
+
+def _apart(
+    name: str, recordings: Sequence[Recording], told: Sequence[Guess | None], here: float
+) -> list[str]:
+    """Notes on recordings whose clocks are others than those of most."""
+    return [
+        note("warning", f"{name}: {one.data} says {g.offset:.4g} s, and is of another clock: leave it out")
+        for one, g in zip(recordings, told, strict=True)
+        if g is not None and g.sure and abs(g.offset - here) > _APART
+    ]
 
 
 class _Tried:

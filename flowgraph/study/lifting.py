@@ -9,14 +9,13 @@ run's last bit, does not depend on what else a study asks for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flowgraph.language.graph import CallNode, Graph, RegisterNode, join_states
-from flowgraph.pipeline.digests import is_table
+from flowgraph.pipeline.digests import settings_of
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Cell, Pipeline, Register
 from flowgraph.types import ArrayType, flatten
@@ -35,12 +34,13 @@ def lifted(graph: Graph) -> Graph:
     """
     pipeline = lower(graph)
     registers, nodes = [], []
-    for number, array in real_constants(pipeline.constants).items():
+    moving = settings_of(pipeline)
+    for number, array in moving.items():
         path, unnamed = f"{CONSTANTS}{number}", (None,) * array.ndim
         cell = Cell("value", number, number, array.shape, "real", array, axes=unnamed)
         registers.append(Register(path, "delay", (cell,)))
         nodes.append(RegisterNode(path, "delay", ArrayType(array.shape, "real"), array))
-    rest = {n: a for n, a in pipeline.constants.items() if n not in real_constants(pipeline.constants)}
+    rest = {n: a for n, a in pipeline.constants.items() if n not in moving}
     moved = replace(pipeline, registers=(*pipeline.registers, *registers), constants=rest)
     return replace(graph, nodes=(*graph.nodes, *nodes), plans={"pipeline": moved})
 
@@ -53,7 +53,7 @@ def start_of(graph: Graph) -> dict[str, Any]:
         for index, node in graph.registers
         if node.role != "stamp" and index not in joins
     }
-    found.update({f"{CONSTANTS}{n}": a for n, a in real_constants(lower(graph).constants).items()})
+    found.update({f"{CONSTANTS}{n}": a for n, a in settings_of(lower(graph)).items()})
     return found
 
 
@@ -99,8 +99,3 @@ def _skeleton(graph: Graph) -> list[Any]:
         else:
             found.append((node.path, node.type, node.clock, node.clock.timing))
     return found
-
-
-def real_constants(constants: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """Those constants of a pipeline that are lifted; tables stay (`digests.is_table`)."""
-    return {n: a for n, a in constants.items() if a.dtype.kind == "f" and not is_table(a)}

@@ -83,7 +83,7 @@ class Quantised:
             {
                 "value": n,
                 "name": names.get(n, f"v{n}"),
-                "bits": self.formats.width,
+                "bits": self.formats.width_of(n),
                 "fraction": [int(np.min(f)), int(np.max(f))],
             }
             for n, f in sorted(self.formats.fractions.items())
@@ -98,6 +98,7 @@ def quantise(
     bounds: Mapping[str, float],
     margin: float = MARGIN,
     least: int = NARROWEST,
+    held_width: int = 0,
     say: Say = lambda words: None,
 ) -> Quantised:
     """The narrowest words, of `width` bits at most, in which a graph keeps the bounds.
@@ -109,6 +110,7 @@ def quantise(
         bounds: figures of `FIGURES`, and the most that each may be.
         margin: the sizes that occurred times this fit.
         least: bits below which nothing is tried.
+        held_width: bits of inputs, registers and what is added up in them, where they are more.
         say: told what is going on.
 
     Raises:
@@ -127,7 +129,7 @@ def quantise(
             got=f"{len(flights)} and {len(held_out)} held out",
             fix="write --seeds 4 --held-out-seeds 3",
         )
-    search = _Search(flights, held_out, margin, say)
+    search = _Search(flights, held_out, margin, say, held_width)
     tried: list[Mapping[str, Any]] = []
     best: tuple[Formats, Mapping[str, Any]] | None = None
     bits, step = width, 2
@@ -152,11 +154,14 @@ def quantise(
 
 
 def _said(figures: Mapping[str, Any]) -> str:
-    return ", ".join(f"{k} {v:.3g}" for k, v in figures.items() if k != "bits")
+    return ", ".join(f"{k} {v:.3g}" for k, v in figures.items() if not k.endswith("bits") or k == "lost_bits")
 
 
 class _Search:
-    def __init__(self, flights: Sequence[Flown], held_out: Sequence[Flown], margin: float, say: Say) -> None:
+    def __init__(
+        self, flights: Sequence[Flown], held_out: Sequence[Flown], margin: float, say: Say, held_width: int
+    ) -> None:
+        self._held_width = held_width
         self._flights = [_Ready(f) for f in flights]
         self._held = [_Ready(f) for f in held_out]
         self._margin, self._say = margin, say
@@ -181,12 +186,12 @@ class _Search:
     def at(self, bits: int) -> tuple[Formats, dict[str, Any]]:
         """Formats of so many bits, and their figures on the flights that were held out."""
         for _ in range(_ROUNDS):
-            formats = self.sizes.formats(bits, self._margin)
+            formats = self.sizes.formats(bits, self._margin, self._held_width)
             player = self._player(formats, self._flights)
             if not self._widened(player, self._flights, "the flights of the sizes", bits):
                 break
         for _ in range(_ROUNDS):
-            formats = self.sizes.formats(bits, self._margin)
+            formats = self.sizes.formats(bits, self._margin, self._held_width)
             player = self._player(formats, self._held)
             figures = self._judge(formats, player)
             if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
@@ -216,7 +221,8 @@ class _Search:
 
     def _judge(self, formats: Formats, player: CompiledIntegers) -> dict[str, Any]:
         self._worst = Counts()
-        found: dict[str, Any] = {"bits": formats.width, **dict.fromkeys(KINDS, 0)}
+        found: dict[str, Any] = {"bits": formats.width, "held_bits": formats.held_width or formats.width}
+        found |= dict.fromkeys(KINDS, 0)
         for one in self._held:
             counts = one.play(player)
             self._worst.join(counts)

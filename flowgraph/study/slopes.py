@@ -32,11 +32,11 @@ from flowgraph.engines.playback import play
 from flowgraph.engines.registry import find_engine
 from flowgraph.engines.subject import LoadedPipeline
 from flowgraph.language.graph import Graph, join_states
-from flowgraph.pipeline.digests import structure
+from flowgraph.pipeline.digests import settings_of, structure
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline, type_of_leaves
 from flowgraph.pipeline.sensitivity import CHANGE, sensitivity
-from flowgraph.study.lifting import CONSTANTS, lifted, real_constants
+from flowgraph.study.lifting import CONSTANTS, lifted
 from flowgraph.types import flatten, leaves_of, unflatten
 
 __all__ = ["Slopes", "surprise_and_slope"]
@@ -148,7 +148,7 @@ def _starts(graph: Graph) -> Starts:
         for (name, t), leaf in zip(leaves_of(node.type), flatten(node.initial, node.type), strict=True):
             if t.dtype == "real":
                 found[node.path, name] = np.asarray(leaf, dtype=float)
-    constants = real_constants(lower(graph).constants)
+    constants = settings_of(lower(graph))
     return found | {(f"{CONSTANTS}{n}", "value"): np.asarray(a, dtype=float) for n, a in constants.items()}
 
 

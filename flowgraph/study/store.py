@@ -133,7 +133,7 @@ class Store:
         if trajectory is not None:
             put_inside(self.trajectory_file(key), trajectory)
             content["trajectory"] = hashlib.sha256(trajectory).hexdigest()
-        put_inside(self.run_file(key), json.dumps(content, indent=1).encode())
+        put_inside(self.run_file(key), json.dumps(content).encode())
 
     def has_trajectory(self, key: str) -> bool:
         """Whether the whole trajectory of this very run is there."""

@@ -18,7 +18,7 @@ import copy
 import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -79,8 +79,13 @@ class Trials:
 
     def __init__(
         self, graph: str, recordings: Sequence[Recording], settings: Mapping[str, Value],
-        measure: str, metric: str | None, engine: str,
+        measure: str, metric: str | None, engine: str, sought: Sequence[str] = (),
     ) -> None:  # fmt: skip
+        """Args:
+        sought: settings of the flights that are searched for, which a filter need not estimate as well:
+            `info["sought"]` of the flights tells it.
+        """
+        self._sought = tuple(sought)
         self.graph, self.recordings, self.settings = graph, recordings, settings
         self.measure, self.metric, self.engine = measure, metric, engine
         self._flights: list[Flight] = []
@@ -90,7 +95,7 @@ class Trials:
         self._steps: OrderedDict[Any, Any] = OrderedDict()
         for one in recordings:
             _, flight = prepared(graph, one.data, one.seed, settings)
-            self._flights.append(flight)
+            self._flights.append(self._told(flight))
 
     def twice(self) -> tuple[Recording, Recording] | None:
         """Two recordings that hold the same, as a file does whatever the seed or the spelling of its path."""
@@ -123,11 +128,15 @@ class Trials:
             return self._flights[place]
         which = (place, tuple(text(v) for v in own.values()))
         if which not in self._moved:
-            self._moved[which] = loaded(one.data, one.seed, {**self.settings, **own})
+            self._moved[which] = self._told(loaded(one.data, one.seed, {**self.settings, **own}))
             while len(self._moved) > _MOVED_KEPT:
                 self._moved.popitem(last=False)
         self._moved.move_to_end(which)
         return self._moved[which]
+
+    def _told(self, flight: Flight) -> Flight:
+        """The flight, with what is sought."""
+        return replace(flight, info={**flight.info, "sought": self._sought}) if self._sought else flight
 
     def _case(self, place: int, point: Mapping[str, Parameter]) -> Case:
         one = self.recordings[place]

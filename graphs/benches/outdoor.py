@@ -28,6 +28,7 @@ from flowgraph.blocks.inertial.moving import align_moving
 from flowgraph.blocks.kalman.smoothing import rauch_tung_striebel
 from flowgraph.blocks.outdoor.errors import at_antenna
 from flowgraph.blocks.signals import GRAVITY
+from flowgraph.errors import DataError
 from flowgraph.graphs.benches import recordings
 from flowgraph.graphs.gnss_ins import gnss_ins
 
@@ -43,9 +44,10 @@ _WIDEST, _STEP, _LOOK = 1.2, 0.2, 6.0  # s: offsets that are tried, and how long
 
 
 class Judged(NamedTuple):
-    """Positions (n, 3) at times of the truth, their deviations or None, and the mean NIS or None."""
+    """Positions (n, 3) at times of the truth, their deviations or None, and the mean NIS or None. Of a batch
+    that does not settle there are none."""
 
-    position: np.ndarray
+    position: np.ndarray | None
     deviation: np.ndarray | None = None
     nis: float | None = None
 
@@ -82,6 +84,8 @@ def outdoor(
                     wall = perf_counter() - begin
                     head = {"flight": folder.name, "aid": aid, "imu": unit.strip(), "method": method}
                     rows.append({**head, **found, "wall_s": wall})
+                    if found["position_rmse_m"] is None:
+                        notes.append(f"{folder.name}, {aid}, imu {unit}: the {method} does not settle")
                     begin = perf_counter()
     return Report([*rows, *_means(rows, chosen)], notes=tuple(notes))
 
@@ -147,6 +151,9 @@ def _rows(
     fixes = case.inputs["gnss"]
     judged = judging(flight.truth, rtk, fixes, span)
     for method, found in _found(case, fixes, judged.time, engine).items():
+        if found.position is None:
+            yield method, dict.fromkeys(("position_rmse_m", "position_3sigma", "nis_mean"))
+            continue
         error = found.position - judged["position"]
         covered = None
         if found.deviation is not None:
@@ -169,7 +176,10 @@ def _found(case: Case, fixes: Series, time: np.ndarray, engine: str) -> dict[str
     errors, steps = case.score.errors, case.score.steps  # type: ignore[attr-defined]
     prior, posterior, cross, space, named = steps(result)
     smoothed = rauch_tung_striebel(prior, posterior, cross, space=space)
-    batch = case.score.recording(smoothed, None)  # type: ignore[attr-defined]
+    try:
+        batch = named(case.score.recording(smoothed, None))  # type: ignore[attr-defined]
+    except DataError:
+        batch = None
     place = lambda series: at_antenna(
         series, antenna=errors.keywords["antenna"], estimated=errors.keywords["estimated"]
     )
@@ -180,7 +190,7 @@ def _found(case: Case, fixes: Series, time: np.ndarray, engine: str) -> dict[str
     return {
         "filter": _between(place(result["belief"]), time, nis),
         "smoothed": _between(place(named(smoothed)), time),
-        "batch": _between(place(named(batch)), time),
+        "batch": Judged(None) if batch is None else _between(place(batch), time),
         "linear": Judged(np.stack([np.interp(at, t, column) for column in p.T], axis=-1)),
         "spline": Judged(CubicSpline(t, p)(at)),
     }
@@ -201,8 +211,9 @@ def _means(rows: list[dict[str, Any]], aids: list[str]) -> Iterator[dict[str, An
             mine = [r for r in rows if r["aid"] == aid and r["method"] == method]
             if not mine:
                 continue
+            mine = [r for r in mine if r["position_rmse_m"] is not None]
             mean = {
-                key: float(np.mean([r[key] for r in mine])) if mine[0][key] is not None else None
+                key: float(np.mean([r[key] for r in mine])) if mine and mine[0][key] is not None else None
                 for key in ("position_rmse_m", "position_3sigma", "nis_mean", "wall_s")
             }
             yield {"flight": f"mean of {len(mine)}", "aid": aid, "imu": "all", "method": method, **mean}

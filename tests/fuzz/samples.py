@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import savemat
 
 from flowgraph import Pipeline, lower, simulate
 from flowgraph.blocks.datasets.course import simulated_content
@@ -20,6 +21,7 @@ from flowgraph.engines.state import load_registers, load_state, save_state
 from flowgraph.study.spec import Study
 from flowgraph.study.store import Store, pack_trajectory, read_table, read_trajectory
 from tests.blocks.datasets import test_datasets, test_euroc, test_studentdata
+from tests.blocks.datasets import test_navigation_files as files
 from tests.blocks.datasets.bags import Pen
 
 
@@ -109,6 +111,14 @@ def made(folder: Path) -> list[Sample]:
     )
     add("bag1", lambda f: _bag(f / "a.bag", 1), _flight("rosbag:{}/a.bag"), "a.bag")
     add("bag2", lambda f: _bag(f / "a", 2), _flight("rosbag:{}/a"), "a/a.db3", "a/metadata.yaml")
+    add("ardupilot", lambda f: files.log(f / "a.bin", files.flown()), _flight("ardupilot:{}/a.bin"), "a.bin")
+    add(
+        "gins",
+        lambda f: files.folder(f / "car"),
+        _flight("gins:{}/car"),
+        *(f"car/{name}" for name in ("ADIS16465.txt", "GNSS_RTK.txt", "truth.nav")),
+    )
+    add("navego", lambda f: savemat(f / "a.mat", files.structs()), _flight("navego:{}/a.mat"), "a.mat")
     add(
         "tags",
         lambda f: course_map().save(f / "tags.json"),

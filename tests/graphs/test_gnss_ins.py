@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -14,12 +15,13 @@ import pytest
 
 from flowgraph import Flight, Series, load_flight, simulate
 from flowgraph.blocks.flights.drive import SENSORS
-from flowgraph.blocks.geometry.rotations import rotate
+from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate, to_matrix, to_rotation_vector
 from flowgraph.blocks.inertial.outdoors import Antenna
 from flowgraph.blocks.outdoor.errors import at_antenna, directed_errors
 from flowgraph.blocks.scoring.outdoors import declination
 from flowgraph.blocks.signals import GeodeticPosition, Position
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
+from flowgraph.graphs.benches.drives import drives
 from flowgraph.graphs.benches.outdoor import outdoor
 from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.inertial.test_outdoors import moved
@@ -126,6 +128,50 @@ def test_engines_agree_with_all_sensors_and_all_parameters():
     is_lowered_and_drawn(case, "predict", "fuse_gnss", "fuse_magnetometer", "fuse_barometer", "fuse_rest")
 
 
+def angle_between(p: np.ndarray, q: np.ndarray) -> float:
+    """The angle of the turn between two attitudes, rad."""
+    return float(2.0 * np.arccos(np.clip(abs(np.sum(p * q)), 0.0, 1.0)))
+
+
+def test_a_unit_of_navigation_grade_finds_north_by_the_turn_of_the_earth():
+    """At rest for 3 s: its heading is off by what is said, to which the white noise of the gyroscope and its
+    bias add up; over many seeds the errors are as large as their deviation."""
+    shares = []
+    for seed in range(12):
+        flight = drive(4.0, "gps", seed=seed, unit="navigation", imu__rate="50")
+        assert flight.truth is not None
+        case = gnss_ins.case(flight, start="unknown_yaw", estimate="none")
+        (said,) = [n for n in case.notes if "gyro compassing" in n]
+        assert said.startswith("info: the heading at the start is that of gyro compassing")
+        start = case.graph.settings["start"]
+        covariance = start.covariance[6:9, 6:9]
+        R = to_matrix(start.attitude, xp=np)
+        heading = np.sqrt((R @ covariance @ R.T)[2, 2])
+        assert np.degrees(heading) < 1.0
+        turn = to_rotation_vector(
+            multiply(flight.truth["attitude"][0], conjugate(start.attitude, xp=np), xp=np), xp=np
+        )
+        shares.append(turn[2] / heading)
+        assert angle_between(start.attitude, flight.truth["attitude"][0]) < np.radians(3.0)
+    assert 0.5 < np.sqrt(np.mean(np.square(shares))) < 1.6
+
+
+@pytest.mark.parametrize("unit", ["consumer", "tactical"])
+def test_a_unit_whose_bias_hides_the_turn_of_the_earth_is_no_compass(unit):
+    flight = drive(4.0, "gps", unit=unit, imu__rate="50")
+    case = gnss_ins.case(flight, start="unknown_yaw", estimate="none")
+    (said,) = [n for n in case.notes if "gyro compassing" in n]
+    assert said.startswith("refused: ")
+    assert case.graph.settings["start"].covariance[6:9, 6:9].max() > 0.1
+
+
+def test_a_unit_that_is_said_to_be_better_than_it_is_is_no_compass():
+    """The consumer's bias, said to be the navigator's: what it reads cannot be the Earth's turn."""
+    flight = drive(4.0, "gps", unit="consumer", imu__rate="50")
+    case = gnss_ins.case(flight, start="unknown_yaw", estimate="none", gyro_bias=1e-7)
+    assert any(n.startswith("refused: gyro compassing") for n in case.notes)
+
+
 def test_standing_still_is_used_where_it_is_asked_for():
     """The drive begins with 3 s of rest, without fixes."""
     flight = drive(3.0, "barometer")
@@ -197,6 +243,20 @@ def test_a_drive_is_followed_as_well_as_is_said():
     assert 5.0 < mean("nees_mean") < 14.0
     assert 0.7 < mean("gnss_nis_mean") < 1.3
     assert 0.7 < mean("gnss_velocity_nis_mean") < 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the bench runs in C, and there is no compiler")
+def test_drives_are_as_good_as_their_bound_to_what_so_many_flights_tell():
+    """Their starts are drawn as wrong as is said; a filter with a wrong noise or equation is beyond it."""
+    row, *published, ticks = drives(flights=30, units="tactical", duration=30.0).rows
+    for what in ("position", "velocity", "attitude"):
+        ratio, deviation = row[f"{what}_over_bound"], row[f"{what}_over_bound_deviation"]
+        assert 0.01 < deviation < 0.12, what
+        assert abs(ratio - 1.0) < 3.0 * deviation + 0.02, what
+    assert np.hypot(row["east_rmse_m"], row["north_rmse_m"]) < row["position_rmse_m"]
+    assert [r["heading_rmse_deg"] for r in published] == [8.9, 0.81]
+    assert 0.1 < ticks["ticks_ratio"] < 5.0  # a machine that does other work tells no more
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from typer.testing import CliRunner
 from flowgraph import Flight, Series, load_flight
 from flowgraph.blocks.signals import Position
 from flowgraph.cli import app
-from flowgraph.study.calibrate import calibrate
-from flowgraph.study.guess import guess_offset
+from flowgraph.graphs.gnss_ins import gnss_ins
+from flowgraph.study.calibrate import _apart, calibrate
+from flowgraph.study.guess import Guess, _by_vectors, guess_offset
 from flowgraph.study.tune import Fit, Recording
 from tests.calibration import off, recorded
+from tests.recordings import recordings
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"})
 
@@ -45,6 +48,62 @@ def test_from_positions_alone_accelerations_tell_the_offset_and_a_number_tells_n
     assert found.offset == pytest.approx(0.1, abs=0.008)
     alone = Flight("b", {"imu": flight.streams["imu"], "depth": Series(vicon.time, vicon["position"][:, 2])})
     assert guess_offset(alone, "depth", -0.3, 0.3) is None
+
+
+def driven(seconds: float, *, seed: int = 1) -> Flight:
+    """A car around corners, whose receiver stamps that much too early."""
+    made = {"duration": "25", "gps.rate": "10", "imu.rate": "50"}
+    flight = load_flight("sim:drive", seed=seed, settings=made)
+    truth = flight.truth
+    assert truth is not None
+    rows = np.arange(0, len(truth), 5)
+    place = truth["position"][rows] + 0.003 * np.random.default_rng(seed).normal(size=(len(rows), 3))
+    rtk = Series(truth.time[rows] - round(seconds * 1e9), Position(position=place), name="rtk")
+    info = {"imu_noise": flight.info["imu_noise"]}
+    return Flight("driven", {"imu": flight.streams["imu"], "rtk": rtk}, info=info)
+
+
+@pytest.mark.parametrize(("seconds", "seed"), [(0.24, 1), (-0.31, 2)])
+def test_the_vectors_of_two_streams_tell_the_offset_whichever_is_moved(seconds, seed):
+    flight = driven(seconds, seed=seed)
+    (found,) = _by_vectors(flight, "rtk", -0.5, 0.5)
+    assert found.correlation > 0.9
+    assert found.offset == pytest.approx(seconds, abs=0.02)
+    (back,) = _by_vectors(flight, "imu", -0.5, 0.5)
+    assert back.offset == pytest.approx(-seconds, abs=0.02)
+
+
+@pytest.mark.parametrize(("flown", "seconds"), [("path_2", 0.12), ("path_11", 0.47), ("path_23", -0.61)])
+def test_where_sizes_do_not_agree_vectors_do(flown, seconds):
+    """A quadrotor: its force is hardly more than gravity. The offsets are those of a correlation by the
+    attitudes of the unit's own filter, which is not read here."""
+    folder = recordings("outdoor_quadrotor") / flown
+    flight = load_flight(f"outdoor_quadrotor:{folder}", settings={"bad_time": "drop"})
+    found = guess_offset(flight, "rtk", -1.0, 1.0)
+    assert found is not None
+    assert found.by == "accelerations of rtk and imu, as vectors"
+    assert found.offset == pytest.approx(seconds, abs=0.02)
+
+
+def test_what_is_sought_is_not_estimated_by_the_filter_as_well():
+    flight = driven(0.0)
+    flight = replace(flight, info={**flight.info, "position_noise": 0.02})
+    within = gnss_ins.case(flight).graph.settings["estimated"]
+    sought = replace(flight, info={**flight.info, "sought": ("rtk.time_offset",)})
+    assert "time_offset" in within
+    assert set(within) - set(gnss_ins.case(sought).graph.settings["estimated"]) == {"time_offset"}
+
+
+def test_recordings_of_another_clock_are_named():
+    told = [
+        Guess(0.12, 0.95, "x"),
+        Guess(0.13, 0.95, "x"),
+        Guess(0.24, 0.95, "x"),
+        Guess(0.9, 0.1, "x"),
+        None,
+    ]
+    (said,) = _apart("rtk.time_offset", [Recording(f"csv:{k}") for k in range(5)], told, 0.12)
+    assert "csv:2 says 0.24 s" in said
 
 
 def test_what_cannot_be_calibrated_is_refused():

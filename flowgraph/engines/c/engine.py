@@ -14,6 +14,7 @@ from flowgraph.data.tape import Tape
 from flowgraph.engines.c.batch import threaded
 from flowgraph.engines.c.compile import compiler
 from flowgraph.engines.c.fixed import CompiledIntegers
+from flowgraph.engines.c.fixed_replay import write_fixed
 from flowgraph.engines.c.harness import write_c, write_events
 from flowgraph.engines.c.library import Compiled, compiled
 from flowgraph.engines.c.step import SingleTicks
@@ -27,7 +28,6 @@ from flowgraph.engines.contract import (
     real_leaves,
 )
 from flowgraph.engines.fixed.engine import need_formats
-from flowgraph.engines.fixed.files import write_fixed
 from flowgraph.engines.options import KINDS, Meter, RunOptions
 from flowgraph.engines.stretches import joined
 from flowgraph.pipeline.optimise import COMPILED

@@ -37,6 +37,7 @@ class Expressions:
     def __init__(self, real: str, turn: Callable[..., str] = lambda *_: "") -> None:
         self.real, self.turn = real, turn
         self.helpers: set[str] = set()
+        self.called: set[str] = set()
         self.functions: dict[Any, tuple[str, str]] = {}
 
     def ctype(self, dtype: str) -> str:
@@ -67,6 +68,9 @@ class Expressions:
         return self.functions[key][0]
 
     def libm(self, name: str) -> str:
+        """A function of math.h; those that we have ourselves are noted."""
+        if name in IN_LANES:
+            self.called.add(name)
         return name if self.real == "double" else f"{name}f"
 
     def write(self, node: Node, args: Sequence[str]) -> str:

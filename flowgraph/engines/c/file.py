@@ -21,7 +21,7 @@ from flowgraph.engines.c.entry import entry_text, reaction_name
 from flowgraph.engines.c.expand import Expander
 from flowgraph.engines.c.expressions import Expressions
 from flowgraph.engines.c.header import header
-from flowgraph.engines.c.helpers import helper_text
+from flowgraph.engines.c.helpers import helper_text, own_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
 from flowgraph.engines.c.preamble import MACROS, REFUSED
@@ -100,6 +100,7 @@ class File:
             REFUSED,
             MACROS,
             helper_text(self.expressions.helpers, self.real),
+            own_text(self.expressions.called, self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),
             *(text for _, text in self.expressions.functions.values()),
             reset,

@@ -43,7 +43,7 @@ class CompiledIntegers(Player):
         self.counts = Counts()
         by_place = sorted((p, n) for n, p in self.source.place.items())
         self._places, self._values = np.array([p for p, _ in by_place]), [n for _, n in by_place]
-        self._play = load({"fixed.c": self.source.text}, FLAGS).fx_play
+        self._play = load({"fixed.c": f"{self.source.text}\n{self.source.play}"}, FLAGS).fx_play
         self._play.restype = ctypes.c_int64
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:

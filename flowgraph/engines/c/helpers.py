@@ -265,21 +265,38 @@ static inline int64_t fg_search_{kind}(const {type_} *a, int32_t n, {type_} x, i
     return found
 
 
-def helper_text(names: Iterable[str], real: str) -> str:
-    """The helpers with what they need, each once and in order."""
+def helper_text(names: Iterable[str], real: str, there: Iterable[str] = ()) -> str:
+    """The helpers with what they need, each once and in order; not those that are `there` already."""
     texts = _texts(real)
-    made: list[str] = []
-    seen: set[str] = set()
+    made: dict[str, str] = {}
 
-    def add(name: str) -> None:
-        if name in seen:
+    def add(name: str, into: dict[str, str]) -> None:
+        if name in made or name in into:
             return
-        seen.add(name)
         needs, text = texts[name]
         for n in needs:
-            add(n)
-        made.append(text)
+            add(n, into)
+        into[name] = text
 
+    for name in sorted(there):
+        add(name, made)
+    wanted: dict[str, str] = {}
     for name in sorted(names):
-        add(name)
-    return "\n".join(made)
+        add(name, wanted)
+    return "\n".join(wanted.values())
+
+
+def own_text(called: Iterable[str], there: Iterable[str], real: str) -> str | None:
+    """What puts our own functions in the place of those of math.h, for who defines FLOWGRAPH_OWN_MATH.
+
+    Libraries differ in the last bit of a sine; this text does not.
+    """
+    names = sorted(called)
+    if not names:
+        return None
+    f = "" if real == "double" else "f"
+    text = helper_text([f"fg_{n}" for n in names], real, there)
+    lines = [f"#define {n}{f} fg_{n}" for n in names]
+    return "\n".join(
+        ["#ifdef FLOWGRAPH_OWN_MATH /* the same numbers with every library */", text, *lines, "#endif", ""]
+    )

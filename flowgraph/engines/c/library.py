@@ -91,9 +91,7 @@ class Outputs:
             that can be, a bit each.
     """
 
-    def __init__(
-        self, pipeline: Pipeline, real: Any, presence: Mapping[int | None, tuple[int, int]]
-    ) -> None:
+    def __init__(self, pipeline: Pipeline, real: Any, presence: Mapping[int | None, tuple[int, int]]) -> None:
         self.pipeline, self.real, self._presence = pipeline, np.dtype(real), presence
 
     def presence_of(self, key: int) -> tuple[int, int]:

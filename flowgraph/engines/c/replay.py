@@ -72,7 +72,6 @@ def main_text(pipeline: Pipeline, source: Source) -> str:
         f'#include "{m}.h"',
         "",
         "#include <errno.h>",
-        "#include <inttypes.h>",
         "#include <stdio.h>",
         "#include <stdlib.h>",
         "#include <string.h>",
@@ -144,7 +143,7 @@ def _tick(pipeline: Pipeline, source: Source) -> Iterator[str]:
         zip(names.outputs, csv_names(pipeline.outputs), pipeline.outputs, names.output_leaves, strict=True)
     ):
         yield f"    if (made >> {k} & 1u) {{"
-        yield f'        printf("%" PRId64 ",%s", now, {string(cell)});'
+        yield f'        printf("%lld,%s", (long long)now, {string(cell)});'
         for leaf, field in zip(port.leaves, leaves, strict=True):
             yield from (f"        {t}" for t in _print(leaf, f"out_{name}.{field}"))
         yield from ('        printf("\\n");', "    }")
@@ -161,8 +160,8 @@ def _each(leaf: Leaf, place: str, text: str) -> list[str]:
 def _print(leaf: Leaf, place: str) -> list[str]:
     if leaf.dtype == "real":
         return _each(leaf, place, "printed(@);")
-    form, kind = ("PRIu64", "uint64_t") if leaf.dtype[0] == "u" else ("PRId64", "int64_t")
-    return _each(leaf, place, f'printf(",%" {form}, ({kind})@);')
+    form, kind = ("llu", "unsigned long long") if leaf.dtype[0] == "u" else ("lld", "long long")
+    return _each(leaf, place, f'printf(",%{form}", ({kind})@);')
 
 
 def _read(leaf: Leaf, place: str) -> list[str]:
@@ -188,8 +187,8 @@ static int ended(int status)
         return 1;
     }
     if (status == 0 && broken != 0) {
-        fprintf(stderr, "an output is not finite, first at t = %" PRId64 " ns; in %" PRId64 " ticks\n",
-                firstbroken, broken);
+        fprintf(stderr, "an output is not finite, first at t = %lld ns; in %lld ticks\n",
+                (long long)firstbroken, (long long)broken);
         return 4;
     }
     return status;
@@ -262,7 +261,8 @@ _OVERFLOWED = r"""
 static void overflowed(const char *what)
 {
     ended(3);
-    fprintf(stderr, "%s, line %ld: at t = %" PRId64 " ns, %s\n", filename, lastrow, now, what);
+    fprintf(stderr, "%s, line %ld: at t = %lld ns, %s\n", filename, lastrow, (long long)now,
+            what);
     exit(3);
 }
 """

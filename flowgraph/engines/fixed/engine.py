@@ -56,6 +56,11 @@ class Bound:
     known: dict[int, Any]
     fractions: dict[int, np.ndarray]
     writes: tuple[Run | None, ...]
+    widths: dict[int, int]
+
+    def most(self, value: int) -> int:
+        """The largest word of a value."""
+        return int(2 ** (self.widths[value] - 1) - 1)
 
 
 class Integers:
@@ -88,11 +93,12 @@ class Integers:
         """Reals as words of an input's or register's format; `x` may have axes before `shape`."""
         real = np.asarray(x, dtype=np.float64)
         fraction = self.fraction(value, shape)
-        words = whole_numbers(real, fraction, self.formats.width)
+        width = self.formats.width_of(value)
+        words = whole_numbers(real, fraction, width)
         with np.errstate(invalid="ignore", over="ignore"):
             off = (
                 np.abs(np.ldexp(real, np.where(fraction == FREE, 0, fraction).astype(int)))
-                > float(self.most) + 0.5
+                > float(2 ** (width - 1) - 1) + 0.5
             )
         if off.any():
             self.counts.add("saturations", value, np.count_nonzero(off))
@@ -138,7 +144,7 @@ class Integers:
         program = bound.program
         cut: dict[int, Any] = {}
         self.cells = [
-            np.asarray(env[n]) if end is None else self._fitted(c.read, end(env[n]), cut)
+            np.asarray(env[n]) if end is None else self._fitted(c.read, end(env[n]), cut, bound)
             for c, n, end in zip(self._cells, program.writes, bound.writes, strict=True)
         ]
         for value, off in cut.items():
@@ -176,7 +182,7 @@ class Integers:
             if not step.real:
                 env[step.out] = made
                 continue
-            env[step.out] = made = self._fitted(step.out, made, cut)
+            env[step.out] = made = self._fitted(step.out, made, cut, bound)
             lose = LOSE.get(step.op)
             if lose is None:
                 continue
@@ -192,12 +198,13 @@ class Integers:
                     self.counts.add(kind, value, off & taken.get(value, False))
         return bound, env
 
-    def _fitted(self, value: int, words: Any, cut: dict[int, Any]) -> Any:
-        off = (np.abs(words) > self.most) & (words != NOT_A_NUMBER)
+    def _fitted(self, value: int, words: Any, cut: dict[int, Any], bound: Bound) -> Any:
+        most = bound.most(value)
+        off = (np.abs(words) > most) & (words != NOT_A_NUMBER)
         if not off.any():
             return words
         cut[value] = off
-        return np.where(off, np.clip(words, -self.most, self.most), words)
+        return np.where(off, np.clip(words, -most, most), words)
 
     def bind(self, key: int) -> Bound:
         """The program of a pattern of present inputs, with its shifts worked out."""
@@ -210,8 +217,10 @@ class Integers:
         specs, width = program.specs, self.formats.width
         fractions: dict[int, np.ndarray] = {}
         known: dict[int, Any] = {}
+        widths: dict[int, int] = {}
         for n, array in program.constants.items():
             if array.dtype.kind == "f":
+                widths[n] = width
                 fractions[n] = fraction_of_constant(array, width)
                 known[n] = whole_numbers(array, fractions[n], width)
             else:
@@ -223,10 +232,12 @@ class Integers:
                         leaf.shape, np.int64 if leaf.dtype == "real" else DTYPES[leaf.dtype]
                     )
                 if leaf.dtype == "real":
+                    widths[leaf.value] = self.formats.width_of(leaf.value)
                     absent = np.full(leaf.shape, FREE)
                     fractions[leaf.value] = self.fraction(leaf.value, leaf.shape) if key >> k & 1 else absent
         for c in self._cells:
             if c.dtype == "real":
+                widths[c.read] = self.formats.width_of(c.read)
                 fractions[c.read] = self.fraction(c.read, c.shape)
         steps = []
         doubtful = may_be_nan(program.instructions, self.formats.absent)
@@ -237,7 +248,10 @@ class Integers:
             if real:
                 out = moved(i, given) if i.op in MOVES else self.fraction(i.out, i.spec.shape)
                 fractions[i.out] = np.broadcast_to(out, i.spec.shape)
-            run = bind(Site(i, given, out, specs, width))
+            taken = [widths[a] for a in i.args if a in widths]
+            if real:
+                widths[i.out] = max(taken) if i.op in MOVES else self.formats.width_of(i.out)
+            run = bind(Site(i, given, out, specs, max(taken, default=width)))
             if any(a in doubtful for a in i.args):
                 run = passing_nan(i, run)
             steps.append(_Step(run, i.args, i.out, real, i.op))
@@ -245,7 +259,7 @@ class Integers:
             _moving(fractions[n], fractions[c.read], specs[n]) if c.dtype == "real" else None
             for c, n in zip(self._cells, program.writes, strict=True)
         )
-        return Bound(program, tuple(steps), known, fractions, writes)
+        return Bound(program, tuple(steps), known, fractions, writes, widths)
 
 
 def _moving(have: np.ndarray, want: np.ndarray, spec: Spec) -> Run:

@@ -8,17 +8,14 @@ the outputs, and calls `fx_end`. A real x goes in as the whole number nearest to
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
-from flowgraph.data.files import put
 from flowgraph.engines.fixed.engine import Integers, need_formats
 from flowgraph.engines.fixed.shifts import slim
 from flowgraph.engines.fixed.source import Source
-from flowgraph.errors import LoweringError, writes
-from flowgraph.pipeline.formats import FREE
+from flowgraph.errors import LoweringError
+from flowgraph.pipeline.formats import FREE, Formats
 from flowgraph.pipeline.pipeline import Pipeline
 
 _MOST_INPUTS = 8
@@ -46,23 +43,17 @@ def patterns_with_formats(pipeline: Pipeline) -> tuple[list[int], list[int]]:
     return known, unknown
 
 
-def write_fixed(pipeline: Pipeline, folder: Path) -> Mapping[str, Path]:
-    """Write a pipeline with formats as C into a folder; returns the files by their names.
+def texts_of(pipeline: Pipeline) -> tuple[Source, dict[str, str]]:
+    """A pipeline with formats as C, and the texts of its header and source by file name.
 
     Raises:
-        DeclarationError: where it has no formats; OutputError: where the files cannot be written.
+        DeclarationError: where it has no formats.
     """
     known, unknown = patterns_with_formats(need_formats(pipeline))
     source = Source(pipeline, known)
     name = f"{pipeline.name}_fixed"
-    files = {f"{name}.h": _header(source, unknown), f"{name}.c": f"{source.text}\n{_start(source)}"}
-    found = {}
-    for file, text in files.items():
-        found[file] = folder / file
-        with writes(found[file]):
-            folder.mkdir(parents=True, exist_ok=True)
-            put(found[file], text)
-    return found
+    texts = {f"{name}.h": _header(source, unknown), f"{name}.c": f"{source.text}\n{_start(source)}"}
+    return source, texts
 
 
 def _start(source: Source) -> str:
@@ -95,7 +86,7 @@ def _header(source: Source, unknown: list[int]) -> str:
         f"#define {guard}",
         "#include <stdint.h>",
         "",
-        f"/* {pipeline.name} in fixed point of {player.formats.width} bits.",
+        f"/* {pipeline.name} in fixed point of {_bits(player.formats)} bits.",
         "   A real x is the whole number nearest to x 2^fraction.",
         "   Words lie in w, each value row by row from its place on; begin with a copy of fx_first. */",
         f"enum {{ FX_WORDS = {source.size}, FX_COUNTERS = {len(source.lost)} }};",
@@ -128,6 +119,11 @@ def _header(source: Source, unknown: list[int]) -> str:
     if unknown:
         lines.append(f"/* patterns without formats: {', '.join(map(str, unknown))} */")
     return "\n".join([*lines, "", "#endif", ""])
+
+
+def _bits(formats: Formats) -> str:
+    held = f", registers and what is added up in them {formats.held_width}" if formats.held else ""
+    return f"{formats.width}{held}"
 
 
 def _place(name: str, place: int, shape: tuple[int, ...], dtype: str, fraction: np.ndarray | None) -> str:

@@ -41,18 +41,18 @@ static inline int fx_bits(int64_t x) {
   return n + (x != 0);
 }
 
-static inline int64_t fx_fit(int64_t x, uint8_t *off, int place) { /* a word, or the largest, marked */
-  if (x == FX_NAN || (x <= FX_MOST && x >= -FX_MOST)) return x;
+static inline int64_t fx_fit(int64_t x, uint8_t *off, int place, int64_t most) { /* or the largest, marked */
+  if (x == FX_NAN || (x <= most && x >= -most)) return x;
   off[place] |= 1;
   off[FX_SIZE] = 1;
-  return x > 0 ? FX_MOST : -FX_MOST;
+  return x > 0 ? most : -most;
 }
 
 static inline int64_t fx_lost(int64_t x, int is_not_zero, int64_t *count) {
   if (x == 0 && is_not_zero) ++*count;
   return x;
 }
-#define FX_FIT(x, place) fx_fit(x, off, place)
+#define FX_FIT(x, place) fx_fit(x, off, place, FX_MOST)
 #define FX_MARK(place, why) (off[place] |= (why), off[FX_SIZE] = 1)
 
 static inline int64_t fx_quotient(int64_t a, int64_t b, int64_t up) {

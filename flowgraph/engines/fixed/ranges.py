@@ -137,14 +137,22 @@ class Sizes:
         size = np.maximum(self.largest[value], np.where(wider, self._fits[value] * factor, 0.0))
         self.largest[value] = size
 
-    def formats(self, width: int, margin: float = 2.0) -> Formats:
-        """Formats in which numbers fit that are `margin` times as large as any that was seen."""
+    def formats(self, width: int, margin: float = 2.0, held_width: int = 0) -> Formats:
+        """Formats in which numbers fit that are `margin` times as large as any that was seen.
+
+        Args:
+            width: bits of a word.
+            margin: as above.
+            held_width: bits of inputs, registers and what is added up in them; 0: those of `width`.
+        """
         fractions: dict[int, np.ndarray] = {}
+        held = _held(self.pipeline) if held_width > width else frozenset()
+        bits = {n: held_width for n in held}
         errors = _Errors(self.pipeline, width)
         for n, size in self.largest.items():
             if n in errors.given:
                 wide = margin * _beside_its_diagonal(size)
-                fractions[n] = fraction_for(wide, width)
+                fractions[n] = fraction_for(wide, bits.get(n, width))
                 errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
             found = self._size(i.out)
@@ -154,10 +162,32 @@ class Sizes:
             axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
             rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
             size = margin * _beside_its_diagonal(np.maximum(found, rounding))
-            fractions[i.out] = fraction_for(size, width)
+            fractions[i.out] = fraction_for(size, bits.get(i.out, width))
             errors.add(i, fractions[i.out], size, rounding)
-        self._fits = {n: np.ldexp(0.5, width - 1 - f.astype(int)) / margin for n, f in fractions.items()}
-        return Formats(width, fractions, margin, frozenset(self.absent), structure_of(self.pipeline))
+        self._fits = {
+            n: np.ldexp(0.5, bits.get(n, width) - 1 - f.astype(int)) / margin for n, f in fractions.items()
+        }
+        structure = structure_of(self.pipeline)
+        wide = held_width if held else 0
+        return Formats(width, fractions, margin, frozenset(self.absent), structure, held, wide)
+
+
+def _held(pipeline: Pipeline) -> frozenset[int]:
+    """Inputs and registers, and the values that come into registers by sums, selections and moves alone."""
+    specs = pipeline.specs
+    cells = [c for r in pipeline.registers for c in r.cells if c.dtype == "real"]
+    found = {c.read for c in cells} | {c.write for c in cells}
+    found |= {leaf.value for port in pipeline.inputs for leaf in port.leaves if leaf.dtype == "real"}
+    for i in reversed(pipeline.instructions):
+        if i.out in found and (i.op in MOVES or i.op in _CARRYING):
+            found.update(a for a in i.args if specs[a].dtype == "real")
+        elif i.out in found and i.op == "divide":
+            found.add(i.args[0])
+    return frozenset(found - set(pipeline.constants))
+
+
+_CARRYING = frozenset(["add", "subtract", "where", "maximum", "minimum"])
+"""What only adds or chooses; of a quotient, as by a norm, the numerator is carried as well."""
 
 
 def _beside_its_diagonal(size: np.ndarray) -> np.ndarray:

@@ -29,7 +29,8 @@ class Source:
         keys: the patterns of present inputs that come.
 
     Attributes:
-        text: of the file; `fx_play` in it runs ticks.
+        text: of the file.
+        play: of `fx_play`, which runs ticks, to be put behind it.
         place: where each value lies in the array of words; the new words of a register, whose number is then
             -1 - value, lie elsewhere until the end.
         lost: the number of each value's counter of lost words.
@@ -60,6 +61,7 @@ class Source:
             writer.at(n, np.shape(a))
         self.place, self.lost, self.size = writer.place, writer.lost, writer.size
         self.text = self._text(writer, bodies, player)
+        self.play = self._play()
         self.first = np.zeros(self.size, np.int64)
         for n, a in known.items():
             flat = np.asarray(a).astype(np.int64).ravel()
@@ -84,7 +86,6 @@ class Source:
                 *functions,
                 *_switch("fx_compute", compute),
                 *_switch("fx_end", end),
-                self._play(),
             ]
         )
 

@@ -27,6 +27,7 @@ class Text:
         self.indent = 1
         self.lost: dict[int, int] = {}
         self.bound: Bound
+        self.most: int | None = None
 
     # -- text ----------------------------------------------------------------------------------------
 
@@ -81,7 +82,9 @@ class Text:
 
     def fitted(self, place: str, text: str) -> str:
         """The statement that puts a result into its place, cut to a word where it does not fit."""
-        return f"{place} = FX_FIT({text}, {place[2:-1]});"
+        if self.most is None or self.most == int(self.player.most):
+            return f"{place} = FX_FIT({text}, {place[2:-1]});"
+        return f"{place} = fx_fit({text}, off, {place[2:-1]}, INT64_C({self.most}));"
 
     def counter(self, value: int) -> int:
         """The number of a value's counter of lost words."""

@@ -26,7 +26,7 @@ class Writer(Elements):
     def tick(self, key: int) -> tuple[list[str], str]:
         """The bodies of the functions that compute a tick, in order, and of the one that ends it."""
         self.bound = self.player.bind(key)
-        program, width = self.bound.program, self.player.formats.width
+        program, width, widths = self.bound.program, self.player.formats.width, self.bound.widths
         doubtful = absent.may_be_nan(program.instructions, self.player.formats.absent)
         bodies = []
         for first in range(0, len(program.instructions), _TOGETHER):
@@ -34,8 +34,10 @@ class Writer(Elements):
                 given = [self.bound.fractions.get(a) for a in i.args]
                 out = self.bound.fractions.get(i.out) if i.spec.dtype == "real" else None
                 self.put(f"/* v{i.out} = {i.op} {list(i.spec.shape)}  {i.line} */")
+                taken = max((widths[a] for a in i.args if a in widths), default=width)
+                self.most = self.bound.most(i.out) if i.out in widths else None
                 self.instruction(
-                    Site(i, given, out, program.specs, width), [a for a in i.args if a in doubtful]
+                    Site(i, given, out, program.specs, taken), [a for a in i.args if a in doubtful]
                 )
             bodies.append(self.taken())
         self.writes()
@@ -325,6 +327,7 @@ class Writer(Elements):
                 x = self.word(n, index)
                 text = f"({x} == FX_NAN ? FX_NAN : fx_shift({x}, {self.shift(by, index)}))" if real else x
                 to = f"w[{plus(kept, flat(c.shape, index))}]"
+                self.most = self.bound.most(c.read) if real else None
                 self.put(self.fitted(to, text) if real else f"{to} = {text};")
             size = max(math.prod(c.shape), 1)
             later.append(

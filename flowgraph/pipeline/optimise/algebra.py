@@ -94,9 +94,12 @@ def _power(draft: Draft, i: Instruction, args: tuple[int, ...]) -> int | None:
     exponent = _value(draft, args[1])
     if exponent == 1.0:
         return _fits(draft, args[0], i)
-    if exponent == 2.0 and draft.specs[args[0]] == i.spec:
-        return draft.emit("multiply", args[0], args[0], by=i)
-    return None
+    if exponent not in (2.0, 3.0, 4.0) or draft.specs[args[0]] != i.spec:
+        return None
+    square = draft.emit("multiply", args[0], args[0], by=i)
+    if exponent == 2.0:
+        return square
+    return draft.emit("multiply", square, square if exponent == 4.0 else args[0], by=i)
 
 
 def _square(draft: Draft, i: Instruction, args: tuple[int, ...]) -> int | None:

@@ -101,8 +101,11 @@ class Pen:
     def twist(self, v: Any) -> Any:
         return self.make("geometry_msgs/msg/Twist", self.vector(v), self.vector([0, 0, 0]))
 
-    def odometry(self, topic: str, t: int, p: Any, q: Any, v: Any, body: str = "base") -> None:
-        moved = self.make("geometry_msgs/msg/TwistWithCovariance", self.twist(v), np.zeros(36))
+    def odometry(
+        self, topic: str, t: int, p: Any, q: Any, v: Any, body: str = "base", covariance: Any = None
+    ) -> None:
+        told = np.zeros(36) if covariance is None else np.ravel(covariance).astype(float)
+        moved = self.make("geometry_msgs/msg/TwistWithCovariance", self.twist(v), told)
         self.write(topic, "nav_msgs/msg/Odometry", t, body, self.covered(p, q), moved)
 
     def transformed(self, t: int, p: Any, q: Any = (1, 0, 0, 0), body: str = "child") -> Any:

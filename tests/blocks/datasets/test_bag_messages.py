@@ -12,7 +12,9 @@ from flowgraph.blocks.datasets import rosbag
 from flowgraph.blocks.datasets.bag_messages import KINDS
 from flowgraph.data.registry import find_graph
 from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.datasets.bags import MS, Pen, refused
+from tests.blocks.datasets.test_satellites import inspected
 
 pytest.importorskip("rosbags", reason="needs the extra ros")
 
@@ -78,6 +80,31 @@ def test_points_and_velocities_are_read(tmp_path, version):
         np.testing.assert_allclose(flight.streams["velocity"]["velocity"][0], expected, atol=1e-12)
         if topic != "/odom":
             noted(flight, "assumed", "in the axes of the world", "'body'")
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_log_of_satellites_and_odometry_keeps_the_covariance_of_each_message(tmp_path, storage):
+    """The velocity of an Odometry is turned into its frame, and its covariance with it."""
+    told = np.zeros((6, 6))
+    told[:3, :3] = [[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.16]]
+    place = np.array([[1.0, 0.2, 0.0], [0.2, 2.0, 0.0], [0.0, 0.0, 4.0]])
+    left = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    with Pen(tmp_path / "b", storage=storage) as pen:
+        for k, t in enumerate(TIMES):
+            pen.imu("/imu", t, [0.1, 0.2, 0.3], [0, 0, 9.8])
+            pen.fix("/fix", t, 0, 47.4 + 1e-6 * k, 8.5, 430.0, place)
+            pen.odometry("/odom", t, [0, 0, 0], left, [2, 1, 0], covariance=told)
+    settings = {"topics": "imu:/imu,gps:/fix,gps_velocity:/odom"}
+    flight = rosbag.load(str(tmp_path / "b"), settings=settings)
+    gps, speed = flight.streams["gps"], flight.streams["gps_velocity"]
+    np.testing.assert_array_equal(gps["latitude"], np.radians(47.4 + 1e-6 * np.arange(len(TIMES))))
+    np.testing.assert_array_equal(gps["covariance"][0], place)
+    np.testing.assert_allclose(speed["velocity"][0], [-1, 2, 0], atol=1e-12)
+    turned = [[0.09, -0.01, 0.0], [-0.01, 0.04, 0.0], [0.0, 0.0, 0.16]]
+    np.testing.assert_allclose(speed["covariance"][0], turned, atol=1e-12)
+    told = inspected(f"rosbag:{tmp_path / 'b'}", "--set", f"topics={settings['topics']}")
+    assert {row["kind"] for row in told.values()} == {"Imu", "GnssFix", "GnssVelocity"}
+    assert {"gnss", "gnss_velocity"} < set(gnss_ins.case(flight).inputs)
 
 
 def test_motion_capture_has_its_name_before_estimates_and_trees(tmp_path):

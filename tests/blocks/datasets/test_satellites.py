@@ -27,9 +27,9 @@ def refused(spec: str, *parts: str, kind: type = DataError) -> None:
         assert part in str(caught.value)
 
 
-def inspected(spec: str) -> dict[str, Any]:
+def inspected(spec: str, *options: str) -> dict[str, Any]:
     """What `flowgraph inspect` says of it, by stream."""
-    done = CliRunner().invoke(app, ["inspect", spec, "--json"])
+    done = CliRunner().invoke(app, ["inspect", spec, *options, "--json"])
     assert done.exit_code == 0, done.stderr
     return {row["name"]: row for row in json.loads(done.stdout)["streams"]}
 

@@ -12,7 +12,15 @@ from flowgraph import Flight, Series, Stream, Tick, graph, latest, load_flight, 
 from flowgraph.blocks.flights.figure import figure
 from flowgraph.blocks.geometry.rotations import conjugate, geodesic_angle, multiply, to_rotation_vector
 from flowgraph.blocks.inertial.imu import ImuNoise
-from flowgraph.blocks.sensors import bias_at_start, drift, read_altimeter, read_attitude, read_position
+from flowgraph.blocks.sensors import (
+    bias_at_start,
+    drift,
+    read_altimeter,
+    read_attitude,
+    read_flow,
+    read_magnetometer,
+    read_position,
+)
 from flowgraph.blocks.signals import FigureShape, Vector
 from flowgraph.blocks.world import figure_motion, figure_shape, shaped, smooth_motion
 from tests.support import MS, all_engines, both_quick
@@ -110,6 +118,9 @@ def test_biases_and_noise_are_as_large_as_told() -> None:
     np.testing.assert_array_equal(truth_of(noisy)["gyro_bias"], truth_of(quiet)["gyro_bias"])
 
 
+FIELD = (0.2e-6, 20e-6, -40e-6)
+
+
 @graph
 def others(start: Stream[Tick], imu: Stream[Tick]):
     none = FigureShape(
@@ -123,6 +134,8 @@ def others(start: Stream[Tick], imu: Stream[Tick]):
         "range": read_altimeter(motion, noise=0.0, most_tilt=0.2),
         "position": read_position(motion, noise=0.0, lever=(0.0, 0.0, 1.0)),
         "attitude": read_attitude(motion, noise=0.05),
+        "field": read_magnetometer(motion, field=FIELD, hard_iron=(1e-6, 0.0, 0.0), noise=0.0),
+        "flow": read_flow(motion, noise=0.0, turn_noise=0.0),
         "bias": drift(first, at=imu, walk=0.0),
     }
 
@@ -141,6 +154,24 @@ def test_other_sensors_read_what_they_say() -> None:
     np.testing.assert_allclose(up[:, 2], np.cos(np.radians(tilt)), atol=1e-9)
     off = geodesic_angle(found["attitude"]["attitude"], motion["attitude"])
     assert np.sqrt(np.mean(off**2)) == pytest.approx(np.degrees(0.05 * math.sqrt(3.0)), rel=0.2)
+    q = motion["attitude"]
+    world = multiply(
+        multiply(q, np.c_[np.zeros(len(q)), found["field"]["field"] - [1e-6, 0, 0]], xp=np),
+        conjugate(q, xp=np),
+        xp=np,
+    )
+    np.testing.assert_allclose(world[:, 1:], np.broadcast_to(FIELD, (len(q), 3)), atol=1e-18)
+    flow = found["flow"]
+    np.testing.assert_array_equal(flow.time, motion.time[1:])
+    np.testing.assert_allclose(flow["interval"], 0.05, rtol=1e-12)
+    place, turned = motion["position"][0], q[0]
+    for k in range(len(flow)):  # displacements and turns compose to where the body is
+        moved = multiply(
+            multiply(turned, np.r_[0.0, flow["displacement"][k]], xp=np), conjugate(turned, xp=np), xp=np
+        )
+        place, turned = place + moved[1:], multiply(turned, flow["turn"][k], xp=np)
+    np.testing.assert_allclose(place, motion["position"][-1], atol=1e-9)
+    assert geodesic_angle(turned[None], q[-1:])[0] < 1e-6
     assert (found["bias"]["vector"] == found["bias"]["vector"][0]).all()
     assert found["bias"]["vector"][0].std() > 0.0
     assert motion.time[1] == 50 * MS

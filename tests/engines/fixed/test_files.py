@@ -1,0 +1,112 @@
+"""Fixed point as files of C that stand alone, and words that are wider where they are held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowgraph import (
+    DeclarationError,
+    Scalar,
+    Series,
+    Stream,
+    block,
+    delay,
+    graph,
+    lower,
+    periodic,
+    simulate,
+)
+from flowgraph.engines.c import write_events
+from flowgraph.engines.c.fixed_replay import write_fixed
+from flowgraph.pipeline.format_files import with_formats
+from flowgraph.pipeline.formats import Formats
+from tests.engines.c.support import STRICT, built, replays
+from tests.engines.fixed.test_fixed import formats_of, sizes_of
+from tests.graphs.library import library_case
+from tests.support import same
+
+
+def _numbers(result, name):
+    series = result[name]
+    rows = zip(
+        *(np.asarray(x, float).reshape(len(series.time), -1) for x in series.leaves.values()), strict=True
+    )
+    return [(int(t), np.concatenate(r)) for t, r in zip(series.time, rows, strict=True)]
+
+
+@pytest.mark.parametrize("held", [0, 30])
+def test_the_written_files_replay_what_the_interpreter_gives(held, tmp_path):
+    case = library_case("kalman", 0.5)
+    formats = sizes_of(case.graph, case.inputs).formats(24, 4.0, held) if held else formats_of("kalman", 24)
+    pipeline = with_formats(lower(case.graph, dtype="fixed"), formats)
+    files = write_fixed(pipeline, tmp_path)
+    assert sorted(files) == ["Makefile", "kalman_fixed.c", "kalman_fixed.h", "main.c"]
+    write_events(pipeline, case.inputs, tmp_path / "events.csv")
+    done = replays(built(tmp_path, *STRICT, module="kalman_fixed"), (tmp_path / "events.csv").read_bytes())
+    assert done.returncode == 0, done.stderr
+    result = simulate(case.graph, case.inputs, engine="fixed", formats=formats)
+    lines = [line.split(",") for line in done.stdout.splitlines()]
+    assert len(lines) > 20
+    for port in pipeline.outputs:
+        printed = [(int(t), np.array(x, float)) for t, name, *x in lines if name == port.name]
+        expected = _numbers(result, port.name)
+        assert [t for t, _ in printed] == [t for t, _ in expected]
+        for (_, ours), (_, theirs) in zip(printed, expected, strict=True):
+            assert (ours == theirs).all()
+
+
+def test_what_cannot_be_read_is_refused_by_the_written_program(tmp_path):
+    pipeline = with_formats(lower(library_case("kalman", 0.5).graph, dtype="fixed"), formats_of("kalman", 24))
+    write_fixed(pipeline, tmp_path)
+    program = built(tmp_path, *STRICT, module="kalman_fixed")
+    name = pipeline.inputs[0].name
+    for text, said in (
+        ("0,nothing,1\n", "no input is called nothing"),
+        (f"0,{name},1\n", "too few numbers"),
+        (f"x,{name},1\n", "this is no whole number: x"),
+        (f"0,{name},1y\n", "this is no number: 1y"),
+        (f"0,{name},nan\n", "not finite: nan"),
+    ):
+        done = replays(program, text)
+        assert done.returncode == 1
+        assert said in done.stderr
+
+
+@block
+def step(x: Scalar, rate: Scalar) -> Scalar:
+    """What adds small parts to a large one."""
+    return x + rate * 0.003
+
+
+@graph
+def gathered(rate: Stream[Scalar]):
+    """A sum of many small parts."""
+    sum_ = delay(0.0, name="sum")
+    after = step(sum_, rate)
+    sum_.feed(after)
+    return {"after": after}
+
+
+def test_wider_registers_are_nearer_and_equal_in_c():
+    built_graph = gathered.build(rate=periodic("10ms"))
+    time = np.arange(300) * 10_000_000
+    inputs = {"rate": Series(time, 1.0 + 0.5 * np.sin(0.01 * np.arange(300)))}
+    sizes = sizes_of(built_graph, inputs)
+    real = simulate(built_graph, inputs, engine="reference").after.value
+    apart = {}
+    for held in (0, 24):
+        formats = sizes.formats(14, 2.0, held)
+        ours = simulate(built_graph, inputs, engine="fixed", formats=formats)
+        same(ours, simulate(built_graph, inputs, engine="c", dtype="fixed", formats=formats))
+        apart[held] = np.abs(ours.after.value - real).max()
+        register = next(r for r in lower(built_graph).registers if r.path == "sum")
+        assert formats.width_of(register.cells[0].read) == (held or 14)
+        assert Formats.from_json(formats.to_json()).to_json() == formats.to_json()
+    assert apart[24] < 0.05 * apart[0]
+
+
+def test_held_words_are_no_narrower_than_the_others():
+    with pytest.raises(DeclarationError, match="no word has this width") as refused:
+        Formats(24, {}, held=frozenset([1]), held_width=20)
+    assert refused.value.expected == "24 to 32 bits"
