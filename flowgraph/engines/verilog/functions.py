@@ -61,7 +61,7 @@ class Functions(Nodes):
         return self.take(begun, shift=((fraction + 62) >> 1) - out)
 
     def _folded(self, made: np.ndarray) -> int:
-        most = (1 << (self.width - 1)) - 1
+        most = (1 << (self.now - 1)) - 1
         return self.constant(max(min(int(made), most), -most))
 
     def _polynomial(self, coefficients: list[int], u: int) -> int:
@@ -132,7 +132,7 @@ class Functions(Nodes):
             Term("MUL", digits, ln_2, 30),
         ]
         value = self.sum(terms, end=30 - out)
-        least = self.constant(1 - 2 ** (self.width - 1))
+        least = self.constant(1 - 2 ** (self.now - 1))
         return self.sum([Term("SEL", value, above), Term("SELN", least, above)])
 
     def angle(self, y: int, x: int, fraction_y: int, fraction_x: int, out: int) -> int:

@@ -58,6 +58,7 @@ class Image:
         cells = [c for r in pipeline.registers for c in r.cells]
         self.player = Integers(pipeline, [c.reset for c in cells], np.zeros(2, np.uint32))
         self.width = self.player.formats.width
+        self.wide = max(self.width, self.player.formats.held_width)
         plans = [Plan(Tick(self.player, key)) for key in keys]
         schedules = [schedule(p) for p in plans]
         self.places = self._held()
@@ -159,7 +160,7 @@ class Image:
         self.entries.append(Entry(key, start, len(slots), outputs, sum(s is not None for s in slots)))
 
     def _part(self, held: Held) -> int:
-        halves = 1 if held.real else self.places[held.value].shape[-1]
+        halves = 1 if held.width else self.places[held.value].shape[-1]
         return held.place * halves + int(held.high)
 
     def _microword(self, slot: Slot | None, at: Callable[[int], int], last: bool) -> int:

@@ -37,9 +37,9 @@ MUL a b; SEL a where b is not 0, SELN where it is; DYN a 2^-b; AND, OR, XOR of b
 NORM |a| at full length, NORM_EVEN with an even shift; TAKE what unit b has made; ISNAN whether a is none.
 """
 
-MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START")
-"""What becomes of a sum: cut to a word of a real number, kept, 32 bits of it, compared with 0, or given to a
-unit."""
+MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START", "WIDE")
+"""What becomes of a sum: cut to a word of a real number, kept, 32 bits of it, compared with 0, given to a
+unit, or cut to a wider word."""
 
 UNITS = ("divide", "root", "logarithm", "angle")
 
@@ -94,13 +94,13 @@ class Held:
         value: its number in the pipeline.
         place: of the element in the value.
         high: whether it is the upper half of a whole number of 64 bits.
-        real: whether it is a word of a real number.
+        width: bits of a word of a real number; 0 for what is none.
     """
 
     value: int
     place: int
     high: bool = False
-    real: bool = False
+    width: int = 0
 
 
 Node = Sum | Constant | Held
@@ -112,13 +112,16 @@ class Nodes:
 
     Args:
         width: bits of a word of a real number.
+        wide: bits of one that is held in a wider word.
 
     Attributes:
+        now: bits of the words that are made now: one of these two.
         line: for each word, where in the source it comes from.
         doubtful: numbers of words that may be none.
     """
 
     width: int
+    wide: int = 0
     nodes: list[Node] = field(default_factory=list)
     line: list[str] = field(default_factory=list)
     doubtful: set[int] = field(default_factory=set)
@@ -126,6 +129,8 @@ class Nodes:
 
     def __post_init__(self) -> None:
         self._known: dict[Node, int] = {}
+        self.wide = self.wide or self.width
+        self.now = self.width
         self.one = self.constant(1)
 
     def add(self, node: Node) -> int:
@@ -135,7 +140,7 @@ class Nodes:
             found = self._known[node] = len(self.nodes)
             self.nodes.append(node)
             self.line.append(self.here)
-            if isinstance(node, Sum) and node.mode in ("FIT", "RAW"):
+            if isinstance(node, Sum) and node.mode in ("FIT", "WIDE", "RAW"):
                 passing = any(
                     t.a in self.doubtful or (t.kind == "MUL" and t.b in self.doubtful) for t in node.terms
                 )
@@ -172,6 +177,7 @@ class Nodes:
             terms: with shifts of any size.
             end, mode, limit, floor: as in `Sum`.
         """
+        mode = self._fitting(mode)
         kept: list[Term] = []
         total = 0
         for t in terms:
@@ -203,9 +209,11 @@ class Nodes:
         self, begun: int, *, shift: int = 0, minus: bool = False, mode: str = "FIT", floor: bool = False
     ) -> int:
         """What a unit has made of what it was given."""
-        node = self.nodes[begun]
-        assert isinstance(node, Sum)
-        return self.add(Sum((Term("TAKE", begun, node.unit, shift, minus),), mode, 0, 0, floor, node.unit))
+        unit, mode = self.made(begun).unit, self._fitting(mode)
+        return self.add(Sum((Term("TAKE", begun, unit, shift, minus),), mode, 0, 0, floor, unit))
+
+    def _fitting(self, mode: str) -> str:
+        return "WIDE" if mode == "FIT" and self.now != self.width else mode
 
     def _plain(self, t: Term) -> Term:
         """The same term, a product where it is one, with the constant second."""
@@ -249,9 +257,9 @@ class Nodes:
 
     def _ended(self, total: int, end: int, mode: str, floor: bool) -> int:
         x = shifted(total, end, floor)
-        most = (1 << (self.width - 1)) - 1
+        most = (1 << (self.now - 1)) - 1
         match mode:
-            case "FIT":
+            case "FIT" | "WIDE":
                 return max(min(x, most), -most)
             case "U32":
                 return x & 0xFFFFFFFF
@@ -278,24 +286,24 @@ class Nodes:
         if (
             t.minus
             or t.kind != "MUL"
-            or mode not in ("FIT", "RAW")
-            or (mode == "FIT" and not self._fits(t.a))
+            or mode not in ("FIT", "WIDE", "RAW")
+            or (mode != "RAW" and not self._fits(t.a))
         ):
             return None
         factor = self.known(t.b)
         if factor is None or factor <= 0 or factor & (factor - 1):
             return None
         up = factor.bit_length() - 1
-        exact = t.shift <= up <= t.shift + 62 - self.width
+        exact = t.shift <= up <= t.shift + 62 - self.wide
         return t.a if exact and up - t.shift == end else None
 
     def _fits(self, n: int) -> bool:
         node = self.nodes[n]
         if isinstance(node, Held):
-            return node.real
+            return node.width != 0 and node.width <= self.now
         if isinstance(node, Constant):
-            return abs(node.word) < 1 << (self.width - 1)
-        return node.mode in ("FIT", "LT", "LE", "EQ", "NE")
+            return abs(node.word) < 1 << (self.now - 1)
+        return node.mode in ("FIT", "LT", "LE", "EQ", "NE") or (node.mode == "WIDE" and self.now == self.wide)
 
 
 def shifted(x: int, by: int, floor: bool = False, cut: bool = True) -> int:

@@ -58,7 +58,7 @@ def _top(image: Image) -> str:
         f"      default: from = {image.step_bits}'d{len(image.program) - 1};  // no program",
         "    endcase",
         "  fg_machine #(",
-        f"      .WIDTH({image.width}), .PLACE({image.place_bits}), .STEP({image.step_bits}),",
+        f"      .WIDTH({image.width}), .WIDE({image.wide}), .PLACE({image.place_bits}), .STEP({image.step_bits}),",
         f"      .WORDS({len(image.memory)}), .STEPS({len(image.program)}),",
         "      " + ", ".join(f".{_PARAMETER[u]}({int(u in image.units)})" for u in UNITS) + ",",
         f'      .MEMORY("{name}_memory.hex"), .PROGRAM("{name}_program.hex")',

@@ -39,7 +39,7 @@ class Tick(Whole):
     """
 
     def __init__(self, player: Integers, key: int) -> None:
-        super().__init__(player.formats.width)
+        super().__init__(player.formats.width, max(player.formats.width, player.formats.held_width))
         self.pipeline, self.key = player.pipeline, key
         self.formats = player.formats
         self.bound: Bound = player.bind(key)
@@ -59,7 +59,10 @@ class Tick(Whole):
                     got=f"{i.op} of what may be NaN",
                     fix="choose a number in its place first: xp.where(xp.isnan(z), 0.0, z)",
                 )
-            site = Site(i, given, out, program.specs, self.formats.width)
+            widths = self.bound.widths
+            taken = [widths[a] for a in i.args if a in widths]
+            site = Site(i, given, out, program.specs, max(taken, default=self.width))
+            self.now = widths.get(i.out, self.width)
             self.values[i.out] = made = self._made(site)
             if i.out not in doubtful:
                 self.doubtful.difference_update(made.ravel().tolist())
@@ -98,7 +101,8 @@ class Tick(Whole):
 
     def _held(self, value: int, spec: Spec) -> np.ndarray:
         size, real = math.prod(spec.shape), spec.dtype == "real"
-        low = [self.add(Held(value, k, False, real)) for k in range(size)]
+        width = self.bound.widths.get(value, self.width) if real else 0
+        low = [self.add(Held(value, k, False, width)) for k in range(size)]
         if real:
             if value in self.formats.absent:
                 self.doubtful.update(low)
@@ -227,6 +231,7 @@ class Tick(Whole):
             if c.dtype == "real":
                 by = shifts.between(self.bound.fractions[n], self.bound.fractions[c.read])
                 by = np.broadcast_to(by, c.shape)
+                self.now = self.bound.widths[c.read]
                 new = self._each(
                     c.shape, lambda x, b: self.sum([self.plain(x, b)]), np.broadcast_to(new, c.shape), by
                 )

@@ -191,7 +191,7 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
 
 def test_what_is_known_costs_nothing():
     nodes = Nodes(24)
-    a, b = (nodes.add(Held(0, k, False, True)) for k in range(2))
+    a, b = (nodes.add(Held(0, k, False, 24)) for k in range(2))
     zero, half = nodes.constant(0), nodes.constant(1 << 20)
     assert nodes.sum([Term("MUL", a, zero, 3), Term("MUL", b, half, 20)]) == b
     assert nodes.sum([Term("MUL", a, half, 0)], end=20) == a

@@ -9,6 +9,7 @@
 // earlier), and starts a run at a place of the program.
 module fg_machine #(
     parameter WIDTH = 24,  // bits of a word of a real number
+    parameter WIDE = 24,  // and of one that is held in a wider word
     parameter PLACE = 12,  // bits of an address of the memory
     parameter STEP = 12,  // bits of an address of the program
     parameter WORDS = 4096,
@@ -39,9 +40,10 @@ module fg_machine #(
   localparam [3:0] MUL = 1, SEL = 2, SELN = 3, DYN = 4, AND = 5, OR = 6, XOR = 7, BITS = 8, NORM = 9, NORM_EVEN = 10,
       TAKE = 11, ISNAN = 12;
   // What becomes of a sum.
-  localparam [3:0] FIT = 1, RAW = 2, U32 = 3, S32 = 4, LT = 5, LE = 6, EQ = 7, NE = 8, HOLD = 9, START = 10;
+  localparam [3:0] FIT = 1, RAW = 2, U32 = 3, S32 = 4, LT = 5, LE = 6, EQ = 7, NE = 8, HOLD = 9, START = 10, FIT_WIDE = 11;
   localparam DEPTH = 23;  // from the microword to the written word
   localparam signed [65:0] MOST = (66'sd1 <<< (WIDTH - 1)) - 66'sd1;
+  localparam signed [65:0] MOST_WIDE = (66'sd1 <<< (WIDE - 1)) - 66'sd1;
   localparam [35:0] NAN = 36'h8_0000_0000;
 
   // -- the program ------------------------------------------------------------------------------------------
@@ -273,7 +275,9 @@ module fg_machine #(
 
   // -- what becomes of it -------------------------------------------------------------------------------------
   wire [3:0] mode21 = line[`AT(21, MODE)+:4];
-  wire over = whole21 > MOST, under = whole21 < -MOST;
+  wire signed [65:0] most = mode21 == FIT_WIDE ? MOST_WIDE : MOST;
+  wire over = whole21 > most, under = whole21 < -most;
+  wire [35:0] least = 36'd0 - most[35:0];
   reg [35:0] result22;
   reg write22;
   reg cut22;
@@ -281,8 +285,8 @@ module fg_machine #(
     cut22 <= 1'b0;
     write22 <= mode21 != 4'd0 && mode21 != HOLD && mode21 != START;
     case (mode21)
-      FIT: begin
-        result22 <= no21 ? NAN : over ? MOST[35:0] : under ? -MOST[35:0] : whole21[35:0];
+      FIT, FIT_WIDE: begin
+        result22 <= no21 ? NAN : over ? most[35:0] : under ? least : whole21[35:0];
         cut22 <= !no21 && (over || under);
       end
       U32: result22 <= {4'd0, whole21[31:0]};
