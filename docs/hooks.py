@@ -23,6 +23,7 @@ from mkdocs.structure.files import File
 
 sys.path.insert(0, str(Path(__file__).parent))
 import library
+import reference
 import rooms
 import screens
 
@@ -46,7 +47,15 @@ def on_files(files: Any, config: Any) -> Any:
     pictures |= dict(screens.screens())
     for name, content in {**pictures, **dict(written_by_pages(Path(config["docs_dir"])))}.items():
         files.append(File.generated(config, f"generated/{name}", content=content))
+    for place, text in reference.pages():
+        files.append(File.generated(config, place, content=text))
     return files
+
+
+def on_post_build(config: Any) -> None:
+    """Hold the reference against what is public."""
+    for name in reference.missing(Path(config["site_dir"])):
+        log.warning("%s is public and has no entry in the reference", name)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

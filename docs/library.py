@@ -15,6 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gallery
+
 import flowgraph.blocks
 from flowgraph import Block, Signal, find_graph
 from flowgraph.data.registry import graph_names
@@ -53,6 +55,27 @@ def blocks() -> str:
             last = module
         text += [f"#### {name}", *block_lines(block), fenced(block.step)]
     return "\n\n".join(text)
+
+
+def block_list() -> str:
+    """A line a block, by room: what goes in, what comes out, and what it does."""
+    text = [
+        "# The blocks, a line each",
+        "Written from the code by `python docs/library.py`, and held against it by a test. "
+        "With ports, settings and equations: [Blocks](blocks.md#the-library).",
+    ]
+    rooms: dict[str, list[str]] = {}
+    for module, name, block in public(Block):
+        room = module.__name__.split(".")[2]
+        inputs = ", ".join(p.name + ("?" if p.optional else "") for p in block.ports)
+        outputs = ", ".join(str(p.type or "any") for p in block.outputs or ()) or "any"
+        what = (inspect.getdoc(block.step) or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
+        cells = (f"`{name}`", inputs, outputs.replace("|", "\\|"), what)
+        rooms.setdefault(room, []).append(f"| {' | '.join(cells)} |")
+    for room, rows in rooms.items():
+        first = paragraphs(importlib.import_module(f"flowgraph.blocks.{room}"))[0].replace("\n", " ")
+        text += [f"## {room}", first, "\n".join(["| block | in | out | |", "|---|---|---|---|", *rows])]
+    return "\n\n".join(text) + "\n"
 
 
 def block_lines(block: Block[Any]) -> Iterator[str]:
@@ -138,6 +161,12 @@ def filled(markdown: str, drawn: Collection[str] = ()) -> str:
     for mark, text in MARKS.items():
         if mark in markdown:
             markdown = markdown.replace(mark, text())
+    if "<!-- gallery -->" in markdown:
+        markdown = markdown.replace("<!-- gallery -->", gallery.gallery(drawn))
     if "<!-- graphs -->" in markdown:
         markdown = markdown.replace("<!-- graphs -->", graphs(markdown, drawn))
     return markdown
+
+
+if __name__ == "__main__":
+    Path(__file__).with_name("block_list.md").write_text(block_list(), encoding="utf-8")

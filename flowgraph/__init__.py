@@ -31,6 +31,7 @@ from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
 from flowgraph.language.stamps import stamp_of
 from flowgraph.language.stream import Held, Stream, apply
 from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
+from flowgraph.language.typed import Namespace, typed_block
 from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
 from flowgraph.moved import lead as _lead
 from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
@@ -103,7 +104,16 @@ _provide(
         "Graph.draw": "flowgraph.drawing.draw:draw",
         "Graph.text": "flowgraph.drawing.text:draw_text",
         "Graph.to_networkx": "flowgraph.drawing.text:to_networkx",
+        "Batch.cell": "flowgraph.drawing.notebook:batch_cell",
+        "Case.cell": "flowgraph.drawing.notebook:case_cell",
+        "Case.page": "flowgraph.drawing.notebook:case_page",
+        "Flight.cell": "flowgraph.drawing.notebook:flight_cell",
+        "Graph.cell": "flowgraph.drawing.notebook:graph_cell",
+        "Result.cell": "flowgraph.drawing.notebook:result_cell",
+        "Series.cell": "flowgraph.drawing.notebook:series_cell",
         "Result.plot": "flowgraph.drawing.plot:plot_result",
+        "Pipeline.cell": "flowgraph.drawing.notebook:pipeline_cell",
+        "Report.cell": "flowgraph.drawing.notebook:report_cell",
         "Pipeline.from_json": "flowgraph.pipeline.description:from_json",
         "Pipeline.to_json": "flowgraph.pipeline.description:to_json",
         "Pipeline.listing": "flowgraph.pipeline.listing:listing",
@@ -143,6 +153,7 @@ __all__ = [
     "LiveView",
     "LoweringError",
     "MissingDependencyError",
+    "Namespace",
     "OutputError",
     "Pipeline",
     "PipelineError",
@@ -209,6 +220,7 @@ __all__ = [
     "ticks",
     "timeouts",
     "timing_of",
+    "typed_block",
     "until",
     "unzip",
     "when",

@@ -175,6 +175,8 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
         units="say its unit with {stream}.{field}.unit={unit}, or convert the file to SI units",
     )
     file = the_file(argument, kind="csv", what="table")
+    if not mapped:
+        _refuse_unmapped(file, given)
     sheet = _sheet(file, given, mapped)
     made.notes.extend(sheet.notes)
     clock = _clock(sheet, given, mapped, made.notes)
@@ -291,15 +293,21 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
                 got=", ".join(f"{stream}.{f}" for f in found),
                 fix="name the columns of the others too" if len(ways) < 2 else "leave one of them out",
             )
-    if not mapped:
-        raise DeclarationError(
-            "no column is mapped to a stream",
-            path="csv",
-            expected="settings such as imu.gyro=wx,wy,wz and imu.specific_force=ax,ay,az",
-            got=", ".join(f"{k}={v}" for k, v in given.items()) or "no settings",
-            fix="say with --set which columns hold what; of " + ", ".join(STREAMS),
-        )
     return mapped
+
+
+def _refuse_unmapped(file: Path, given: Mapping[str, str]) -> None:
+    """Say what the columns of a file are called, where nobody has said what they hold."""
+    with open(file, encoding="utf-8-sig", errors="replace") as stream:
+        head = stream.readline(2000).strip()
+    said = ", ".join(f"{k}={v}" for k, v in given.items()) or "no settings"
+    raise DeclarationError(
+        "no column is mapped to a stream",
+        path=f"csv: {file}",
+        expected="settings such as imu.gyro=wx,wy,wz and imu.specific_force=ax,ay,az",
+        got=f"{said}; the first line of the file is {head[:300]!r}",
+        fix="say with --set which columns hold what; of " + ", ".join(STREAMS),
+    )
 
 
 def _clock(

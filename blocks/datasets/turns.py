@@ -27,10 +27,7 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
     return found
 
 
-_ENU, _FLU = (
-    Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
-    Rotation.from_matrix(np.diag([1, -1, -1])),
-)
+_ENU, _FLU = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
 """North, east, down to east, north, up; forward, left, up to forward, right, down."""
 
 
@@ -40,7 +37,9 @@ def from_ned_attitude(q: np.ndarray) -> np.ndarray:
     whole = np.isfinite(q).all(axis=1)
     found = np.full(q.shape, np.nan)
     if whole.any():
-        turned = _ENU * Rotation.from_quat(q[whole][:, [1, 2, 3, 0]]) * _FLU
+        Rotation = scipy.spatial.transform.Rotation
+        enu, flu = Rotation.from_matrix(_ENU), Rotation.from_matrix(_FLU)
+        turned = enu * Rotation.from_quat(q[whole][:, [1, 2, 3, 0]]) * flu
         found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return found
 

@@ -11,6 +11,7 @@ import numpy as np
 from flowgraph.data.series import Series
 from flowgraph.errors import UnknownNameError
 from flowgraph.types import ArrayType, StructType, dtype_name
+from flowgraph.verbs import verb
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,10 @@ class Runs:
         except UnknownNameError as error:
             raise AttributeError(str(error)) from None
 
+    def __dir__(self) -> list[str]:
+        """The fields are attributes too."""
+        return sorted({*super().__dir__(), *(name for name in self.leaves if name.isidentifier())})
+
     def run(self, index: int) -> Series:
         """One run's stream, as a single run gives it (of the fields that were kept)."""
         at = self.present[index]
@@ -55,7 +60,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Batch:
-    """The outcome of many runs: `batch["pose"].position` is (runs, n, 3).
+    """The outcome of many runs: `batch.pose.position`, or `batch["pose"]["position"]`, is (runs, n, 3).
 
     Args:
         graph, engine: names.
@@ -79,6 +84,27 @@ class Batch:
         if name not in self.series:
             raise UnknownNameError("output", name, self.series, path=self.graph)
         return self.series[name]
+
+    def __getattr__(self, name: str) -> Runs:
+        if name.startswith("_") or "series" not in self.__dict__:
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except UnknownNameError as error:
+            raise AttributeError(str(error)) from None
+
+    def __dir__(self) -> list[str]:
+        """The streams are attributes too."""
+        return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})
+
+    def _repr_html_(self) -> str:
+        return str(verb("Batch.cell")(self))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Batch of {self.graph} ({self.engine}): {len(self.seeds)} runs of {self.ticks} ticks, "
+            f"{', '.join(self.series)}>"
+        )
 
 
 def joined(name: str, parts: list[Series], leaves: list[str]) -> Runs:

@@ -31,18 +31,18 @@ def contents(flight: Flight) -> list[dict[str, Any]]:
         `last_ns`; `gaps`, how many steps are longer than four usual ones, and `longest_gap_s`, the longest
         of all steps.
     """
-    truth = [] if flight.truth is None else [flight.truth]
-    return [_row(series) for series in (*flight.streams.values(), *truth)]
+    truth = {} if flight.truth is None else {"truth": flight.truth}
+    return [_row(name, series) for name, series in (*flight.streams.items(), *truth.items())]
 
 
-def _row(series: Series) -> dict[str, Any]:
+def _row(name: str, series: Series) -> dict[str, Any]:
     steps = np.diff(series.time)
     usual = float(np.median(steps)) if len(steps) else None
     return {
-        "name": series.name,
+        "name": name,
         "kind": getattr(series.type, "name", str(series.type)),
         "fields": [
-            {"name": name, "unit": getattr(leaf, "unit", None)} for name, leaf in leaves_of(series.type)
+            {"name": field, "unit": getattr(leaf, "unit", None)} for field, leaf in leaves_of(series.type)
         ],
         "count": len(series),
         "rate_hz": 1e9 / usual if usual else None,

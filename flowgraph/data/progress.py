@@ -4,12 +4,15 @@
         simulate(built, inputs, progress=bar)
 
 A run tells any object with a method `update(ticks, time)` how far it is; this one draws a bar in a terminal.
-It is imported only where it is used, and with it `rich`.
+In a notebook it is a bar in the cell. It is imported only where it is used, and with it `rich`.
 """
 
 from __future__ import annotations
 
+import html
+import sys
 from collections.abc import Mapping
+from time import monotonic
 from types import TracebackType
 from typing import Any
 
@@ -24,7 +27,8 @@ from flowgraph.errors import DeclarationError
 class ProgressBar:
     """How far a run is, as a bar on standard error, with the time that remains; gone when the run ends.
 
-    Nothing is drawn where standard error is not a terminal, so a log stays clean.
+    In a notebook it stands in the cell, and stays when the run ends. Nothing is drawn where standard error is
+    neither a terminal nor a notebook's, so a log stays clean.
 
     Args:
         name: what stands before the bar.
@@ -50,6 +54,9 @@ class ProgressBar:
         self._console = console or Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         visible = self._console.is_terminal
+        self._name = name
+        self._cell = None if visible or console is not None else _cell_of_notebook()
+        self._shown = -np.inf  # when the cell was last drawn, in s
         self._progress = Progress(*columns, console=self._console, transient=True, disable=not visible)
         self._task = self._progress.add_task(name, total=self.total)
 
@@ -57,15 +64,56 @@ class ProgressBar:
         """`ticks` are done; `time`, of the last in ns, is not shown."""
         self.ticks = ticks
         self._progress.update(self._task, completed=ticks)
+        self._draw()
+
+    def _draw(self, last: bool = False) -> None:
+        """Draw the bar of a notebook, ten times a second at most."""
+        if self._cell is not None and (last or monotonic() - self._shown > 0.1):
+            self._shown = monotonic()
+            self._cell.update(_Bar(self._name, self.ticks, self.total))
 
     def __enter__(self) -> ProgressBar:
         self._progress.start()
+        if self._cell is not None:
+            self._cell.display(_Bar(self._name, self.ticks, self.total))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+        self._draw(last=True)
+
+
+class _Bar:
+    """What stands in a cell: a bar where the end is known, and the numbers."""
+
+    def __init__(self, name: str, ticks: int, total: int | None) -> None:
+        self._name, self._ticks, self._total = name, ticks, total
+
+    def _repr_html_(self) -> str:
+        bar = (
+            "" if self._total is None else f'<progress value="{self._ticks}" max="{self._total}"></progress> '
+        )
+        return f"{html.escape(self._name)} {bar}{self._count()}"
+
+    def __repr__(self) -> str:
+        return f"{self._name} {self._count()}"
+
+    def _count(self) -> str:
+        return f"{self._ticks}" + ("" if self._total is None else f"/{self._total}")
+
+
+def _cell_of_notebook() -> Any:
+    """Where a notebook's cell can be drawn anew; None outside of one."""
+    if "IPython" not in sys.modules:
+        return None
+    from IPython import get_ipython  # only there where a notebook runs
+    from IPython.display import DisplayHandle  # likewise
+
+    shell = get_ipython()
+    made: Any = DisplayHandle
+    return made() if shell is not None and hasattr(shell, "kernel") else None
 
 
 def tick_count(inputs: Flight | Mapping[str, Any]) -> int | None:

@@ -31,6 +31,7 @@ from flowgraph.data.suspect import suspect_readings
 from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
+from flowgraph.verbs import verb
 
 if typing.TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -70,6 +71,18 @@ class Case:
         """What the graph is fed, by source, where it is recorded."""
         inputs = self.inputs.streams if isinstance(self.inputs, Flight) else self.inputs
         return {n: s for n, s in inputs.items() if isinstance(s, Series) and n in self.graph.sources}
+
+    def page(self, result: Result, *, truth: Series | None = None) -> Any:
+        """The page of a run of this case, which shows itself in a notebook and has `save(FILE)`.
+
+        Args:
+            result: of `simulate(case.graph, case.inputs)`.
+            truth: to compare with; that of the flight where the inputs are one.
+        """
+        return verb("Case.page")(self, result, truth=truth)
+
+    def _repr_html_(self) -> str:
+        return str(verb("Case.cell")(self))
 
     def remarks(self, result: Result) -> tuple[str, ...]:
         """All notes on a run: the case's, the result's, those of the score, where a NIS is far from 1, and

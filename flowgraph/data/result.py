@@ -136,6 +136,9 @@ class Result:
             )
         return {**self.series, **(also or {})}
 
+    def _repr_html_(self) -> str:
+        return str(verb("Result.cell")(self))
+
     def __dir__(self) -> list[str]:
         """The outputs are attributes too."""
         return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})

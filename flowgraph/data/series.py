@@ -29,6 +29,7 @@ from flowgraph.types import (
     type_of,
     unflatten,
 )
+from flowgraph.verbs import verb
 
 
 class Series:
@@ -226,6 +227,14 @@ class Series:
         except UnknownNameError as error:
             raise AttributeError(str(error)) from None
 
+    def __dir__(self) -> list[str]:
+        """The fields are attributes too."""
+        fields = {name.partition(".")[0] for name in self.leaves}
+        return sorted({*super().__dir__(), *(name for name in fields if name.isidentifier())})
+
+    def _repr_html_(self) -> str:
+        return str(verb("Series.cell")(self))
+
     def __iter__(self) -> Iterator[Any]:
         """One value after the other, as a block sees them."""
         if (
@@ -406,6 +415,9 @@ class Flight:
     def __post_init__(self) -> None:
         object.__setattr__(self, "notes", said(self.notes))
 
+    def _repr_html_(self) -> str:
+        return str(verb("Flight.cell")(self))
+
     def need(self, graph: str, *names: str, fix: str = "choose another flight") -> dict[str, Series]:
         """The streams of these names, for a graph that cannot run without them.
 
@@ -424,7 +436,7 @@ class Flight:
                 path=self.name,
                 expected=f"streams {', '.join(names)}",
                 got=", ".join(self.streams) or "no stream",
-                fix=f"{fix}, or build {graph} with your own sources",
+                fix=f"{fix}, or a graph that fits: flowgraph inspect names them",
             )
         for name in names:
             if not len(self.streams[name]):

@@ -13,6 +13,7 @@ says so.
 from __future__ import annotations
 
 import functools
+import io
 import os
 import sys
 import textwrap
@@ -91,10 +92,22 @@ def _matplotlib() -> ModuleType:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches; to be called in a function that is a `picture`."""
+    """An empty figure of a size in inches; to be called in a function that is a `picture`.
+
+    It shows itself in a notebook, where a figure that pyplot has not made otherwise would not.
+    """
     from matplotlib.figure import Figure  # slow to import
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.__dict__["_repr_png_"] = functools.partial(png, figure)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as the content of a PNG file, as large as a cell of a notebook."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=90, format="png")
+    return content.getvalue()
 
 
 def save(figure: Figure, file: str | Path | None) -> Figure:

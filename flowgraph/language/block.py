@@ -142,6 +142,12 @@ class Block(Generic[R]):
         """Wire this block into the graph under construction: streams to ports, the rest to settings."""
         return verb("Block.__call__")(self, streams, settings)
 
+    def wired(self, *, at: object = None, name: str | None = None, draws: Any = None) -> Callable[..., Any]:
+        """This block with what a call says of its place in the graph: `predict.wired(at=seen)(track)` is
+        `predict(track, at=seen)`, in a form that type checkers follow; see `typed_block`."""
+        said = {"at": at, "name": name, "draws": draws}
+        return functools.partial(self, **{key: value for key, value in said.items() if value is not None})
+
     @property
     def stateful(self) -> bool:
         return self._init is not None

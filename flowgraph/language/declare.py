@@ -23,12 +23,14 @@ from flowgraph.language.graph import Graph, SourceNode, Wire
 from flowgraph.language.stream import Held, Stream
 from flowgraph.types import Type, annotation_type, bind, check_fits, without_none
 
+T = typing.TypeVar("T")
+
 if typing.TYPE_CHECKING:
     from flowgraph.data.registry import Case
     from flowgraph.data.series import Flight
 
 
-def delay(init: Any, *, name: str | None = None, type: Any = None) -> Held[Any]:
+def delay(init: T, *, name: str | None = None, type: Any = None) -> Held[T]:
     """A register read before this tick's write: last tick's value. Feed it with `.feed(stream)`.
 
     Args:

@@ -7,12 +7,11 @@ changes after it is built; all state lives in runs.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flowgraph.errors import CycleError, LoweringError, MissingDependencyError, UnknownNameError
+from flowgraph.errors import CycleError, LoweringError, UnknownNameError
 from flowgraph.language.block import Block
 from flowgraph.language.clock import Clock, Source, atoms
 from flowgraph.language.recording import StepTrace
@@ -186,9 +185,7 @@ class Graph:
         return verb("Graph.to_networkx")(self)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
-        bundle = {"text/plain": self.text()}
-        with contextlib.suppress(MissingDependencyError):  # without a layout engine there is still the text
-            bundle["image/svg+xml"] = self.draw()
+        bundle: dict[str, str] = verb("Graph.cell")(self)
         return bundle
 
     def __repr__(self) -> str:

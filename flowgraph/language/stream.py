@@ -22,7 +22,7 @@ from flowgraph.verbs import verb
 if TYPE_CHECKING:
     from flowgraph.language.builder import Builder
 
-T = TypeVar("T")
+T = TypeVar("T", covariant=True)
 
 
 class Stream(Generic[T]):

@@ -318,6 +318,9 @@ class Pipeline:
         """The pipeline as text for a person: registers, then stages with one instruction a line."""
         return str(verb("Pipeline.listing")(self))
 
+    def _repr_html_(self) -> str:
+        return str(verb("Pipeline.cell")(self.name, self.totals(), self.listing()))
+
     def __repr__(self) -> str:
         t = self.totals()
         size = f"{t['stages']} stages, {t['instructions']} instructions, {t['register_bytes']} B of registers"

@@ -99,10 +99,11 @@ def calibrate(
         known = [g for g in told if g is not None and g.sure]
         if known:
             guesses[f.name] = known[0]
-            found[f.name] = float(np.median([g.offset for g in known]))  # one of another clock moves it least
-            said = f"{f.name}: begun at {found[f.name]:.4g} s, by {known[0].by}"
+            begun = float(np.median([g.offset for g in known]))  # one of another clock moves it least
+            found[f.name] = begun
+            said = f"{f.name}: begun at {begun:.4g} s, by {known[0].by}"
             notes.append(note("info", f"{said}, whose correlation is {known[0].correlation:.3f} there"))
-            notes += _apart(f.name, recordings, told, found[f.name])
+            notes += _apart(f.name, recordings, told, begun)
         else:
             grid = np.linspace(f.low, f.high, _GRID)
             found[f.name] = float(grid[int(tried.along(f.name, grid, found).argmin())])

@@ -85,7 +85,8 @@ def mixed():
 def messages(file):
     """Of each topic: its schema, and (log time, publish time, message) in the order of the file."""
     reader = pytest.importorskip("mcap.reader", reason="needs the extra mcap")
-    found, schemas = {}, {}
+    found: dict = {}
+    schemas: dict = {}
     with open(file, "rb") as stream:
         for schema, channel, message in reader.make_reader(stream).iter_messages():
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
@@ -230,7 +231,8 @@ def test_the_csv_of_a_run_is_read_as_a_flight(flown, tmp_path):
 def chunks(file):
     """The columns of a recording by entity, and those that have no time."""
     reader = pytest.importorskip("rerun.chunk", reason="needs the extra rerun")
-    timed, static = {}, {}
+    timed: dict = {}
+    static: dict = {}
     for chunk in reader.RrdReader(str(file)).stream().to_chunks():
         batch = chunk.to_record_batch()
         into = static if chunk.is_static else timed

@@ -40,7 +40,9 @@ def library() -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs"))  # where its own neighbours are
+        spec.loader.exec_module(module)
     return module
 
 
@@ -55,6 +57,51 @@ def test_every_block_is_written_down_with_ports_and_equations(library: Any) -> N
         for port in block.ports:
             assert f"| in | {port.name}" in text
         assert (block.step.__doc__ or "").strip().partition("\n")[0] in text
+
+
+def test_the_list_of_blocks_is_that_of_the_code(library: Any) -> None:
+    """It is kept in the tree, to be read without a build."""
+    assert page("block_list") == library.block_list(), "python docs/library.py writes it anew"
+
+
+def test_every_public_name_has_an_entry_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    reference = importlib.import_module("reference")
+    pages = dict(reference.pages())
+    assert len(pages) == len(reference.packages()) + 1 > 25
+    for name in set(flowgraph.__all__):
+        assert f"::: flowgraph.{name}\n" in pages["api/flowgraph.md"]
+        assert f"[`{name}`](flowgraph.md#flowgraph.{name})" in pages["api/index.md"]
+    for package in reference.packages():
+        for name in reference.names(package):
+            if not str(getattr(getattr(package, name), "__module__", "")).startswith("flowgraph"):
+                continue  # the name of a type, which has no docstring
+            assert (getattr(package, name).__doc__ or "").strip(), (
+                f"{package.__name__}.{name} has no docstring"
+            )
+
+
+def test_a_name_without_an_entry_in_the_site_is_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    reference = importlib.import_module("reference")
+    monkeypatch.setattr(reference, "packages", lambda: [flowgraph])
+    there = "".join(f'<h2 id="flowgraph.{name}">' for name in flowgraph.__all__ if name != "simulate")
+    (tmp_path / "api" / "flowgraph").mkdir(parents=True)
+    (tmp_path / "api" / "flowgraph" / "index.html").write_text(there)
+    assert reference.missing(tmp_path) == ["flowgraph.simulate"]
+
+
+def test_the_gallery_measures_and_says_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    gallery = importlib.import_module("gallery")
+    monkeypatch.setattr(gallery, "graph_names", lambda: ["ins_eskf"])
+    text = gallery.gallery(["ins_eskf"])
+    assert "flowgraph run ins_eskf --data sim --set duration=6" in text
+    (millimetres,) = re.findall(r"position ([\d.]+) mm", text)
+    assert 5.0 < float(millimetres) < 30.0
+    assert "generated/ins_eskf.svg" in text
 
 
 def test_every_signal_is_written_down_with_units(library: Any) -> None:

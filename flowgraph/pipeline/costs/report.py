@@ -31,6 +31,7 @@ from flowgraph.pipeline.costs.timing import Interval, Machine, Slot, critical_pa
 from flowgraph.pipeline.optimise import DEFAULT, Plan, check_passes, optimise, plan
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
+from flowgraph.verbs import verb
 
 MOST_PATTERNS = 8
 """Patterns of present sources up to which each has a program of its own."""
@@ -165,6 +166,10 @@ class CostReport:
     def html(self) -> str:
         """The tables as a page of its own."""
         return as_html(self)
+
+    def _repr_html_(self) -> str:
+        first = self.sections[0]
+        return str(verb("Report.cell")(first.rows, (self.intro, first.note), self.html(), "all tables"))
 
 
 def cost_report(

@@ -35,7 +35,8 @@ def counted(made):
 
 
 def test_what_was_written_once_is_read_again():
-    pipeline, made = pipeline_of(), []
+    pipeline = pipeline_of()
+    made: list[int] = []
     first = kept_text(pipeline, "k", ("a", None), counted(made))
     assert kept_text(pipeline_of(), "k", ("a", None), counted(made)) == first
     assert len(made) == 1
@@ -43,7 +44,7 @@ def test_what_was_written_once_is_read_again():
 
 @pytest.mark.parametrize("other", ["asked", "graph", "stem"])
 def test_another_question_or_graph_is_written_anew(other):
-    made = []
+    made: list[int] = []
     kept_text(pipeline_of(), "k", ("a",), counted(made))
     pipeline = pipeline_of("0.2" if other == "graph" else "0.1")
     stem, asked = ("l" if other == "stem" else "k"), (("b",) if other == "asked" else ("a",))
@@ -53,7 +54,8 @@ def test_another_question_or_graph_is_written_anew(other):
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
 def test_a_damaged_text_is_written_anew(own_cache, damage):
-    pipeline, made = pipeline_of(), []
+    pipeline = pipeline_of()
+    made: list[int] = []
     first = kept_text(pipeline, "k", (), counted(made))
     (file,) = own_cache.glob("k-*.json")
     content = file.read_bytes()
@@ -69,7 +71,7 @@ def test_a_place_that_cannot_be_written_only_costs_time(tmp_path, monkeypatch):
     file = tmp_path / "file"
     file.write_text("")
     monkeypatch.setenv("FLOWGRAPH_CACHE", str(file))
-    made = []
+    made: list[int] = []
     kept_text(pipeline_of(), "k", (), counted(made))
     kept_text(pipeline_of(), "k", (), counted(made))
     assert len(made) == 2
