@@ -168,8 +168,8 @@ class Sizes:
             n: np.ldexp(0.5, bits.get(n, width) - 1 - f.astype(int)) / margin for n, f in fractions.items()
         }
         structure = structure_of(self.pipeline)
-        wide = held_width if held else 0
-        return Formats(width, fractions, margin, frozenset(self.absent), structure, held, wide)
+        most = held_width if held else 0
+        return Formats(width, fractions, margin, frozenset(self.absent), structure, held, most)
 
 
 def _held(pipeline: Pipeline) -> frozenset[int]:

@@ -332,7 +332,7 @@ def test_a_table_has_velocities_heights_and_wheels_in_units_of_its_own(tmp_path)
     assert flight.streams["barometer"]["height"][0] == 100 * 0.3048
     assert flight.streams["wheels"]["speed"][0] == 2.5
     np.testing.assert_allclose(flight.streams["magnetometer"]["field"][0], [2e-5, 0.0, -4e-5])
-    assert set(gnss_ins.case(flight).inputs) == {
+    assert set(gnss_ins.case(flight).recorded) == {
         "imu",
         "gnss_velocity",
         "barometer",
