@@ -31,7 +31,7 @@ demo: $(VENV)/.with-xla
 test: $(VENV)/.with-test
 	$(PYTEST) $(WORKERS) $(ARGS)
 
-test-slow: $(VENV)/.with-test
+test-slow: $(VENV)/.with-hardware+test
 	$(PYTEST) $(WORKERS) -m slow --durations=20 $(ARGS)
 
 lint: $(VENV)/.with-test

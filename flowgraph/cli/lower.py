@@ -46,14 +46,14 @@ def lower(
     settings_file: SettingsFile = None,
     seed: Seed = 0,
     target: Annotated[
-        str, typer.Option(metavar="TARGET", help="description, or c for C99 too.")
+        str, typer.Option(metavar="TARGET", help="description, and c for C99 or verilog too.")
     ] = "description",
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Of the filter in what is written; that of the graph.")
     ] = None,
     dtype: Annotated[str, typer.Option(help="What a real will be: float64, float32 or fixed.")] = "float64",
     events: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="For c: write the data as the csv that it replays.")
+        Path | None, typer.Option(metavar="FILE", help="Write the data as what was written replays.")
     ] = None,
     formats: Formats = None,
     report: Annotated[bool, typer.Option("--report", help="Write what it costs, as text and HTML.")] = False,
@@ -66,7 +66,7 @@ def lower(
     clock: Annotated[float, typer.Option(min=1.0, help="In Hz, for the report.")] = 100e6,
     as_json: AsJson = False,
 ) -> None:
-    """Lower a graph to a fixed-size pipeline description, or to C as well."""
+    """Lower a graph to a fixed-size pipeline description, and to C or Verilog as well."""
     writing_engines = writers()
     engine = writing_engines.get(target)
     kinds = NUMBERS if engine is None else engine.dtypes

@@ -115,11 +115,11 @@ def _formatted(pipeline: Pipeline, options: RunOptions) -> Pipeline:
     formats = options.formats
     if formats is None:
         return pipeline
-    if options.engine != "fixed" and options.dtype != "fixed":
+    if options.engine not in ("fixed", "verilog") and options.dtype != "fixed":
         raise DeclarationError(
             "number formats are for a run in fixed point",
             path="formats",
-            expected='engine="fixed", or engine="c" with dtype="fixed"',
+            expected='engine="fixed" or "verilog", or engine="c" with dtype="fixed"',
             got=f"engine={options.engine!r}, dtype={options.dtype!r}",
             fix="choose one of these, or leave formats out",
         )

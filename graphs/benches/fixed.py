@@ -23,7 +23,7 @@ from flowgraph.language.checks import need_count
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import MARGIN, RELATIVE, Flown, quantise
 
-__all__ = ["FLIGHTS", "fixed"]
+__all__ = ["FLIGHTS", "fixed", "flown"]
 
 _WORLD = {"sensors": "imu,gps,gps2,altimeter,magnetometer,optical_flow"}
 _FEW = {"particles": "60"}
@@ -85,7 +85,7 @@ def fixed(
     for name in names:
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {"graph": name}
         try:
-            some = [_flown(name, seed + k, duration) for k in range(flights + 1)]
+            some = [flown(name, seed + k, duration) for k in range(flights + 1)]
             found = quantise(
                 some[:-1], some[-1:], width=width, least=least, bounds={RELATIVE: bound}, margin=margin
             )
@@ -106,7 +106,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def _flown(name: str, seed: int, duration: float) -> Flown:
+def flown(name: str, seed: int, duration: float) -> Flown:
     spec, given = FLIGHTS.get(name, ("sim", {}))
     graph = find_graph(name)
     assert graph.prepare is not None

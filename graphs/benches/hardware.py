@@ -1,0 +1,124 @@
+"""Filters as hardware: cycles, equality with the interpreter, and what a routed FPGA takes.
+
+Each filter is quantised on simulated flights, written as Verilog, and played in Verilator beside the
+integer interpreter, register by register and output by output. With `routed` it is synthesised, placed and
+routed too.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowgraph import FlowgraphError, Report
+from flowgraph.data.files import put
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.subject import LoweredGraph
+from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.place import TARGET_HZ, route
+from flowgraph.engines.verilog.simulate import Simulated
+from flowgraph.engines.verilog.text import texts
+from flowgraph.graphs.benches.fixed import flown
+from flowgraph.recorder.random import seed_words
+from flowgraph.study.quantise import RELATIVE, quantise
+
+__all__ = ["hardware"]
+
+GRAPHS = "kalman,complementary,ekf,marg,ins_eskf"
+
+
+def hardware(
+    *,
+    graphs: str = GRAPHS,
+    width: int = 28,
+    bound: float = 0.01,
+    flights: int = 2,
+    duration: float = 3.0,
+    compared: float = 0.5,
+    routed: bool = False,
+    folder: str = "",
+    seed: int = 0,
+) -> Report:
+    """The filters as hardware: cycles a tick, words compared with the interpreter, and a routed FPGA.
+
+    Args:
+        graphs: names, between commas.
+        width: bits of a word.
+        bound: of the difference of the estimate to float64, relative to its size.
+        flights: simulated ones, that the formats are found on; one more judges.
+        duration: of a flight, s.
+        compared: seconds of it that are played in Verilator.
+        routed: whether to synthesise, place and route each.
+        folder: where the files of each go; a temporary one if left out.
+        seed: of the first flight.
+
+    Returns:
+        A row a graph: `graph`, `width`, `lanes`, `multipliers` (of 34 bits), `position_difference_rms_m`,
+        `attitude_difference_rms_deg`, `saturations`, `values_compared`, `values_differing`, `cycles` (of the
+        shortest tick) and `cycles_all_aids` (of the longest), `steps` of the program and `words` of memory,
+        `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not routed), `us_per_tick` (with all aids, at
+        that clock, or else at 100 MHz), and `reason`, why there is no machine.
+    """
+    rows = []
+    for name in (n.strip() for n in graphs.split(",") if n.strip()):
+        row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
+            "graph": name, "width": width, "lanes": 1, "multipliers": 1,
+        }  # fmt: skip
+        try:
+            some = [flown(name, seed + k, duration) for k in range(flights + 1)]
+            found = quantise(some[:-1], some[-1:], width=width, least=width, bounds={RELATIVE: bound})
+            row |= {k: v for k, v in found.figures.items() if k in row}
+            _played(row, replace(found.pipeline, formats=found.formats), some[-1], compared)
+            if routed:
+                _routed(row, replace(found.pipeline, formats=found.formats), some[-1], folder)
+            clock = row["fmax_hz"] or TARGET_HZ
+            row["us_per_tick"] = row["cycles_all_aids"] / clock * 1e6
+        except FlowgraphError as error:
+            row["reason"] = f"{error.path}: {error.message}; {error.got}"[:300]
+        rows.append(row)
+    note = f"formats from {flights} flights of {duration:g} s; {compared:g} s of another played in Verilator"
+    return Report(rows, {}, (note,))
+
+
+_COLUMNS = (
+    "graph", "width", "lanes", "multipliers", "position_difference_rms_m", "attitude_difference_rms_deg",
+    "saturations", "values_compared", "values_differing", "cycles", "cycles_all_aids", "steps", "words",
+    "lut", "ff", "dsp", "bram", "fmax_hz", "us_per_tick", "reason",
+)  # fmt: skip
+
+
+def _tape(flight: Any, seconds: float | None) -> tuple[Any, Any]:
+    subject = LoweredGraph(flight.graph)
+    start = subject.start(RunOptions(seed=flight.seed))
+    events = subject.tape(flight.inputs, start.last)
+    if seconds is None:
+        return events, start
+    return events.first(int(np.searchsorted(events.time, events.time[0] + int(seconds * 1e9)))), start
+
+
+def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
+    events, start = _tape(flight, seconds)
+    player = Simulated(pipeline, events.patterns, check=True)
+    player.play(events, start.cells, seed_words(flight.seed), None)
+    row |= {
+        "values_compared": player.compared,
+        "values_differing": player.differing,
+        "cycles": min(player.cycles),
+        "cycles_all_aids": max(player.cycles),
+        "steps": len(player.image.program),
+        "words": player.image.words,
+    }
+
+
+def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> None:
+    events, _ = _tape(flight, None)
+    with tempfile.TemporaryDirectory() as other:
+        at = Path(folder or other) / pipeline.name
+        at.mkdir(parents=True, exist_ok=True)
+        for name, text in texts(Image(pipeline, events.patterns)).items():
+            put(at / name, text)
+        row |= vars(route(at, pipeline.name))

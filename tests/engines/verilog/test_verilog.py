@@ -1,0 +1,256 @@
+"""Verilog: lints clean, and every register and output is the integer interpreter's, word for word."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import replace
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+
+from flowgraph import (
+    LoweringError,
+    MissingDependencyError,
+    Scalar,
+    Stream,
+    block,
+    graph,
+    latest,
+    real,
+    simulate,
+)
+from flowgraph.engines.fixed.engine import Integers
+from flowgraph.engines.options import RunOptions
+from flowgraph.engines.subject import LoweredGraph
+from flowgraph.engines.verilog import ENGINE as VERILOG
+from flowgraph.engines.verilog import simulate as simulation
+from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.nodes import Constant, Held, Nodes, Sum, Term, shifted
+from flowgraph.engines.verilog.schedule import LATENCY, UNIT_LATENCY, Plan, schedule
+from flowgraph.engines.verilog.simulate import Simulated
+from flowgraph.engines.verilog.text import texts
+from flowgraph.engines.verilog.tick import Tick
+from flowgraph.pipeline.format_files import with_formats
+from flowgraph.recorder.random import seed_words
+from tests.engines.fixed.test_fixed import formats_of, sizes_of
+from tests.graphs.library import library_case
+from tests.support import same_state
+
+MS = 1_000_000
+Three = Annotated[Any, real(3)]
+
+
+def need_verilator():
+    try:
+        simulation.verilator()
+    except MissingDependencyError as error:
+        pytest.skip(str(error.fix))
+
+
+@block
+def mixed(x: Three, y: Scalar, *, dt: float, xp) -> Three:
+    """Something of everything that the machine has."""
+    up = xp.where(x > 0.5, xp.sqrt(xp.abs(x)), -xp.exp(x))
+    turned = xp.sin(x) * xp.cos(up) + xp.atan2(up, x + 2.0) / (1.5 + y)
+    count = xp.astype(xp.floor(4.0 * x), xp.int32) - 3
+    some = xp.asarray(xp.any(x > 0.9), dtype=x.dtype) - xp.asarray(xp.all(x < 0.9), dtype=x.dtype)
+    most = xp.max(turned) - xp.min(x) + xp.log(xp.abs(y) + 0.25) + dt
+    kept = xp.minimum(x, y) @ xp.stack([x, up, turned])
+    ends = xp.ceil(3.0 * x) + xp.trunc(5.0 * up) - xp.round(2.0 * x) + xp.sign(x)
+    return (
+        kept * most
+        + xp.remainder(4.0 * x + y, 1.5)
+        + xp.copysign(up, x)
+        + some * xp.asarray(count, dtype=x.dtype)
+        - ends
+    )
+
+
+@graph
+def everything(x: Stream[Three], y: Stream[Scalar]):
+    """One block, and a held value: three patterns of present inputs."""
+    return {"z": mixed(x, latest(y, init=0.5)), "y": y}
+
+
+def flight(seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.0, 1.0, (60, 3))
+    x[7], x[11] = 0.0, [0.0, -0.5, 1.0]
+    return {
+        "x": (np.arange(60, dtype=np.int64) * MS, x),
+        "y": (np.arange(40, dtype=np.int64) * MS * 3 // 2, rng.uniform(-0.2, 0.9, 40)),
+    }
+
+
+@pytest.fixture(scope="module")
+def made():
+    built = everything.build()
+    formats = sizes_of(built, flight()).formats(26, 2.0)
+    subject = LoweredGraph(built)
+    return built, formats, with_formats(subject.pipeline, formats), subject.tape(flight())
+
+
+def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(made, tmp_path):
+    need_verilator()
+    built, formats, pipeline, tape = made
+    assert len(tape.patterns) == 3
+    player = Simulated(pipeline, tape.patterns, check=True)  # its build lints with -Wall first
+    cells = LoweredGraph(built).start(RunOptions()).cells
+    outcome = player.play(tape, cells, seed_words(0), None)
+    assert player.compared > 400
+    assert player.differing == 0
+    ours = simulate(built, flight(), engine="fixed", formats=formats)
+    for (times, leaves), series in zip(outcome.outputs, ours.series.values(), strict=True):
+        np.testing.assert_array_equal(times, series.time)
+        np.testing.assert_array_equal(leaves[0], series.value)
+    again = Simulated.__new__(
+        Simulated
+    )  # the same machine as an engine plays it, without the interpreter beside
+    vars(again).update(vars(player), check=False)
+    played = again.play(tape, cells, seed_words(0), None)
+    for a, b in zip(played.cells, outcome.cells, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert max(again.cycles) == max(player.cycles) > 100
+
+    # the script that is written for the bench compares by itself, and sees a single wrong word
+    file = tmp_path / "script"
+    assert VERILOG.write_events(pipeline, flight(), file) == len(tape.time)
+    lines = file.read_text().splitlines()
+    compared = sum(line.startswith("is") for line in lines)
+    assert compared == player.compared
+    assert _bench(player, file) == (0, compared, 0)
+    last = max(k for k, line in enumerate(lines) if line.startswith("is"))
+    lines[last] = f"{lines[last]}1"
+    file.write_text("\n".join(lines))
+    assert _bench(player, file) == (1, compared, 1)
+
+
+def _bench(player, file):
+    run = [str(player.built.program), str(file)]
+    done = subprocess.run(
+        run, cwd=player.built.program.parent.parent, capture_output=True, text=True, check=False
+    )
+    said = dict(line.split() for line in done.stderr.splitlines() if line.startswith("values_"))
+    return done.returncode, int(said["values_compared"]), int(said["values_differing"])
+
+
+@pytest.mark.slow
+def test_a_filter_with_readings_that_are_not_there_is_equal():
+    need_verilator()
+    case = library_case("kalman", 0.5)
+    formats = formats_of("kalman", 24)
+    ours = simulate(case.graph, case.inputs, engine="fixed", formats=formats)
+    theirs = simulate(case.graph, case.inputs, engine="verilog", formats=formats)
+    same_state(ours.state, theirs.state)
+    for name, series in ours.series.items():
+        np.testing.assert_array_equal(series.time, theirs[name].time)
+        for leaf, x in series.leaves.items():
+            np.testing.assert_array_equal(x, theirs[name].leaves[leaf])
+    assert theirs.stats["cycles"] < 3000
+
+
+def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(made):
+    _, _, pipeline, tape = made
+    player = Integers(
+        pipeline, [c.reset for r in pipeline.registers for c in r.cells], np.zeros(2, np.uint32)
+    )
+    plan = Plan(Tick(player, tape.patterns[-1]))
+    found = schedule(plan)
+    nodes = plan.tick.nodes
+    at = {s.writes: t for t, s in enumerate(found.slots) if s and s.writes is not None}
+    started: dict[int, tuple[Sum, int]] = {}
+    lies: dict[int, int] = {}
+    due: list[tuple[int, int]] = []
+    for t, slot in enumerate(found.slots):
+        for when, n in [d for d in due if d[0] <= t]:
+            lies[found.place.get(n, -1 - n)] = n
+            due.remove((when, n))
+        if slot is None:
+            continue
+        for r in (slot.term.a, *([] if slot.term.kind == "TAKE" else [slot.term.b])):
+            node = nodes[r]
+            if isinstance(node, Sum) and node.mode != "START":
+                assert t >= at[r] + LATENCY
+                assert lies[found.place.get(r, -1 - r)] == r
+        if slot.term.kind == "TAKE":
+            assert (
+                t
+                >= started[slot.node.unit][1]
+                + UNIT_LATENCY[("divide", "root", "logarithm", "angle")[slot.node.unit]]
+            )
+            assert started[slot.node.unit][0] == nodes[slot.term.a]
+        if slot.mode == "START":
+            started[slot.node.unit] = (slot.node, t)
+        if slot.writes is not None:
+            due.append((t + LATENCY, slot.writes))
+    assert len([s for s in found.slots if s]) == sum(len(plan.tick.made(n).terms) for n in plan.order)
+    assert found.words < len(plan.order)  # places are used again
+
+
+def test_what_is_known_costs_nothing():
+    nodes = Nodes(24)
+    a, b = (nodes.add(Held(0, k, False, 24)) for k in range(2))
+    zero, half = nodes.constant(0), nodes.constant(1 << 20)
+    assert nodes.sum([Term("MUL", a, zero, 3), Term("MUL", b, half, 20)]) == b
+    assert nodes.sum([Term("MUL", a, half, 0)], end=20) == a
+    first = nodes.sum([Term("MUL", a, b, 20), Term("MUL", b, half, 19)])
+    assert nodes.sum([Term("MUL", half, b, 19), Term("MUL", b, a, 20)]) == first
+    assert nodes.nodes[nodes.sum([Term("MUL", half, half, 19)])] == Constant(1 << 21)
+    assert nodes.sum([Term("SEL", a, nodes.one), Term("SELN", b, nodes.one)]) == a
+    assert nodes.sum([Term("MUL", half, half)]) == nodes.constant((1 << 23) - 1)  # cut to a word
+
+
+@pytest.mark.parametrize(
+    ("x", "by", "made"), [(5, 1, 3), (-5, 1, -2), (-6, 2, -1), (3, -62, 1 << 62), (1, 63, 0)]
+)
+def test_shifts_round_halves_upwards_and_keep_to_62_bits(x, by, made):
+    assert shifted(x, by) == made
+
+
+@block
+def sorted_(x: Three, *, xp) -> Three:
+    """An operation that the machine does not have."""
+    return xp.sort(x)
+
+
+@graph
+def sorting(x: Stream[Three]):
+    """One block."""
+    return {"y": sorted_(x)}
+
+
+def test_an_operation_that_is_not_there_is_named_with_its_line():
+    built = sorting.build()
+    inputs = {"x": flight()["x"]}
+    pipeline = with_formats(LoweredGraph(built).pipeline, sizes_of(built, inputs).formats(24, 2.0))
+    with pytest.raises(LoweringError, match="sort of real has no form in hardware yet") as caught:
+        Image(pipeline, [1])
+    assert str(caught.value.path).startswith("tests.engines.verilog.test_verilog:")
+
+
+def test_the_files_name_places_and_lines(made, tmp_path):
+    _, _, pipeline, tape = made
+    found = texts(Image(pipeline, tape.patterns))
+    assert "module everything (" in found["everything.v"]
+    assert "input 0 x.value: [" in found["everything.v"]
+    assert "tests.engines.verilog.test_verilog" in found["everything.lst"]
+    assert len(found["everything_program.hex"].split()) == len(found["everything.lst"].splitlines())
+
+
+def test_without_verilator_the_engine_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setattr(simulation, "find_spec", lambda name: None)
+    built = everything.build()
+    with pytest.raises(MissingDependencyError, match="needs Verilator") as caught:
+        simulate(built, flight(), engine="verilog", formats=sizes_of(built, flight()).formats(26, 2.0))
+    assert "hardware" in str(caught.value.fix)
+
+
+def test_numbers_that_may_not_be_there_are_refused_where_the_machine_has_no_word_for_them(made):
+    _, formats, pipeline, tape = made
+    x = next(p for p in pipeline.inputs if p.name == "x").leaves[0].value
+    doubtful = replace(pipeline, formats=replace(formats, absent=frozenset([x])))
+    with pytest.raises(LoweringError, match="may meet a reading that is not there"):
+        Image(doubtful, tape.patterns)
