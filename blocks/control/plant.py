@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, block
+from flowgraph.blocks.control.adaptive import DormandPrince
 from flowgraph.blocks.statespace import Motion
 from flowgraph.language.moore import Moore, moore
+from flowgraph.types import ArrayType
 
 __all__ = ["plant"]
 
@@ -31,14 +33,34 @@ def _(command: Any, *, model: Motion, start: Any) -> Array:
     return np.asarray(start, dtype=float)
 
 
-def plant(model: Motion, *, start: Any, command: Any, at: object, name: str = "plant") -> Moore:
+def _as_its_state(types: Any, settings: Any) -> ArrayType:
+    return ArrayType((settings["model"].space.size,), "real")
+
+
+@block(host=True, output=_as_its_state)
+def solved(state, command, *, model, start, dt):  # type: ignore[no-untyped-def]
+    """The state x after dt seconds under the command before; x where it fires first."""
+    new = model.after(state, command, float(dt))
+    return new, new
+
+
+@solved.init
+def _(command: Any, *, model: DormandPrince, start: Any) -> Array:
+    return np.asarray(start, dtype=float)
+
+
+def plant(
+    model: Motion | DormandPrince, *, start: Any, command: Any, at: object, name: str = "plant"
+) -> Moore:
     """A plant in a loop: read its state at `output`, and `feed` it what it is told.
 
     Args:
-        model: how it moves, without noise: `MotionModel`, `LinearModel`, or another of `statespace`.
+        model: how it moves, without noise: `MotionModel`, `LinearModel`, or another of `statespace`; or a
+            `DormandPrince`, which is solved on the host.
         start: the state (size) where it fires first.
         command: what it is told before it is told anything; says the type of its input too.
         at: when its state is read, a stream or clock.
         name: of the node.
     """
-    return moore(moved, init=command, at=at, name=name, model=model, start=np.asarray(start, dtype=float))
+    step = solved if isinstance(model, DormandPrince) else moved
+    return moore(step, init=command, at=at, name=name, model=model, start=np.asarray(start, dtype=float))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy  # its parts are loaded when they are used
 
+from flowgraph.blocks.geometry.rotations import multiply
 from flowgraph.errors import DataError
 
 __all__ = ["ORDERS", "from_angles", "from_matrices", "from_ned_attitude"]
@@ -27,21 +28,14 @@ def from_angles(angles: np.ndarray, order: str) -> np.ndarray:
     return found
 
 
-_ENU, _FLU = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+_ENU, _FLU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]), np.array([0.0, 1.0, 0.0, 0.0])
 """North, east, down to east, north, up; forward, left, up to forward, right, down."""
 
 
 def from_ned_attitude(q: np.ndarray) -> np.ndarray:
     """Quaternions (n, 4), w first, of forward, left, up in east, north, up, of those of forward, right, down
     in north, east, down; rows with a NaN are NaN."""
-    whole = np.isfinite(q).all(axis=1)
-    found = np.full(q.shape, np.nan)
-    if whole.any():
-        Rotation = scipy.spatial.transform.Rotation
-        enu, flu = Rotation.from_matrix(_ENU), Rotation.from_matrix(_FLU)
-        turned = enu * Rotation.from_quat(q[whole][:, [1, 2, 3, 0]]) * flu
-        found[whole] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
-    return found
+    return np.asarray(multiply(_ENU, multiply(q, _FLU, xp=np), xp=np))
 
 
 def from_matrices(values: np.ndarray, where: Callable[[int], str], *, by_rows: bool) -> np.ndarray:

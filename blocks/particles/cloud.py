@@ -47,8 +47,8 @@ __all__ = [
     "within_depth",
 ]
 
-DEPTH = 60.0
-"""How far a particle falls behind the best in one reading at most: exp(-60) is nothing in a sum."""
+DEPTH = 64.0
+"""How far a particle falls behind the best in one reading at most: exp(-64) is nothing in a sum."""
 
 _SQUARINGS = 5
 _ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
@@ -80,7 +80,7 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
 
         log p(z | q) = -|Log(q^-1 * z)|^2 / (2 noise^2) - 3 log(noise) - 3/2 log(2 pi)
 
-    An attitude with a NaN in it was not measured: all particles explain it alike. What is more than 60 below
+    An attitude with a NaN in it was not measured: all particles explain it alike. What is more than 64 below
     the best particle's is put there.
 
     Args:
@@ -98,7 +98,7 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
 def reweight(cloud: Cloud, position: LogLikelihood, attitude: LogLikelihood, *, xp: Any) -> Cloud:
     """Multiply the weights by the likelihoods of two independent measurements, and normalise.
 
-    log w' = log w + log p_1 + log p_2 - log(sum over all particles), the largest less 60 at least.
+    log w' = log w + log p_1 + log p_2 - log(sum over all particles), the largest less 64 at least.
     """
     log_weight = within_depth(cloud.log_weight + position.value + attitude.value, xp=xp)
     return cloud.replace(log_weight=log_weight - log_sum_exp(log_weight, xp=xp))
@@ -107,7 +107,7 @@ def reweight(cloud: Cloud, position: LogLikelihood, attitude: LogLikelihood, *, 
 def within_depth(x: Array, *, xp: Any) -> Array:
     """Logarithms of likelihoods or weights (n), those far below the largest put at `DEPTH` below it.
 
-    A weight of exp(-60) adds nothing to any sum. But where a few particles are 1e5 below, words of a fixed
+    A weight of exp(-64) adds nothing to any sum. But where a few particles are 1e5 below, words of a fixed
     number of bits that hold these hold the others to 0.001 alone.
     """
     least = xp.max(x) - DEPTH

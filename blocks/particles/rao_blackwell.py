@@ -108,7 +108,7 @@ def correct_motion(
 
     Returns:
         The cloud with corrected motion and its weights as they were, and the log-likelihoods for `reweight`,
-        those more than 60 below the best particle's put there.
+        those more than 64 below the best particle's put there.
     """
     kind = cloud.position.dtype
     V, C, P = cloud.velocity_covariance, cloud.cross_covariance, cloud.position_covariance

@@ -98,7 +98,7 @@ class Batch:
         return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})
 
     def _repr_html_(self) -> str:
-        return str(verb("Batch.cell")(self))
+        return str(verb("Batch._repr_html_")(self))
 
     def __repr__(self) -> str:
         return (

@@ -82,7 +82,7 @@ class Case:
         return verb("Case.page")(self, result, truth=truth)
 
     def _repr_html_(self) -> str:
-        return str(verb("Case.cell")(self))
+        return str(verb("Case._repr_html_")(self))
 
     def remarks(self, result: Result) -> tuple[str, ...]:
         """All notes on a run: the case's, the result's, those of the score, where a NIS is far from 1, and

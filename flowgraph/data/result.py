@@ -137,7 +137,7 @@ class Result:
         return {**self.series, **(also or {})}
 
     def _repr_html_(self) -> str:
-        return str(verb("Result.cell")(self))
+        return str(verb("Result._repr_html_")(self))
 
     def __dir__(self) -> list[str]:
         """The outputs are attributes too."""

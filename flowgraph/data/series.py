@@ -233,7 +233,7 @@ class Series:
         return sorted({*super().__dir__(), *(name for name in fields if name.isidentifier())})
 
     def _repr_html_(self) -> str:
-        return str(verb("Series.cell")(self))
+        return str(verb("Series._repr_html_")(self))
 
     def __iter__(self) -> Iterator[Any]:
         """One value after the other, as a block sees them."""
@@ -416,7 +416,7 @@ class Flight:
         object.__setattr__(self, "notes", said(self.notes))
 
     def _repr_html_(self) -> str:
-        return str(verb("Flight.cell")(self))
+        return str(verb("Flight._repr_html_")(self))
 
     def need(self, graph: str, *names: str, fix: str = "choose another flight") -> dict[str, Series]:
         """The streams of these names, for a graph that cannot run without them.

@@ -185,7 +185,7 @@ class Graph:
         return verb("Graph.to_networkx")(self)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
-        bundle: dict[str, str] = verb("Graph.cell")(self)
+        bundle: dict[str, str] = verb("Graph._repr_mimebundle_")(self)
         return bundle
 
     def __repr__(self) -> str:

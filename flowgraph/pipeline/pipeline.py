@@ -319,7 +319,9 @@ class Pipeline:
         return str(verb("Pipeline.listing")(self))
 
     def _repr_html_(self) -> str:
-        return str(verb("Pipeline.cell")(self.name, self.totals(), self.listing()))
+        from flowgraph.drawing.notebook import pipeline_cell  # only who shows it needs what draws
+
+        return pipeline_cell(self.name, self.totals(), self.listing())
 
     def __repr__(self) -> str:
         t = self.totals()

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flowgraph.data.series import Flight, Series
 
@@ -107,6 +106,8 @@ def _holds(series: Series, *names: str) -> bool:
 
 def _carried(series: Series) -> np.ndarray:
     """Forces (n, 3) in the axes of the first reading, by the gyroscope alone."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     step = np.diff(series.time, prepend=series.time[:1]) * 1e-9
     turn = Rotation.from_rotvec(series.leaves["gyro"] * step[:, None]).as_quat()
     span = 1

@@ -24,7 +24,6 @@ from flowgraph.study.shown import chosen as chosen_runs
 from flowgraph.study.shown import shown_again
 from flowgraph.study.statistics import compared, differing, metrics_of, quantiles
 from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
-from flowgraph.verbs import verb
 
 WORST = 10
 PAGE, FIGURES = "report.html", "figures"
@@ -40,8 +39,10 @@ class Reported:
     notes: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
+        from flowgraph.drawing.notebook import report_cell  # only who shows it needs what draws
+
         page = self.page.read_text(encoding="utf-8")
-        return str(verb("Report.cell")(self.summary, self.notes, page, "the page of the study"))
+        return report_cell(self.summary, self.notes, page, "the page of the study")
 
 
 def write_report(folder: str | Path, *, metric: str | None = None, runs: int | None = 0) -> Reported:

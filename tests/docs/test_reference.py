@@ -70,7 +70,8 @@ def test_every_public_name_has_an_entry_in_the_reference(monkeypatch: pytest.Mon
     pages = dict(reference.pages())
     assert len(pages) == len(reference.packages()) + 1 > 25
     for name in set(flowgraph.__all__):
-        assert f"::: flowgraph.{name}\n" in pages["api/flowgraph.md"]
+        entries = (f"::: flowgraph.{name}\n", f"## {name} {{ #flowgraph.{name} }}\n")
+        assert any(entry in pages["api/flowgraph.md"] for entry in entries), name
         assert f"[`{name}`](flowgraph.md#flowgraph.{name})" in pages["api/index.md"]
     for package in reference.packages():
         for name in reference.names(package):

@@ -31,7 +31,6 @@ from flowgraph.pipeline.costs.timing import Interval, Machine, Slot, critical_pa
 from flowgraph.pipeline.optimise import DEFAULT, Plan, check_passes, optimise, plan
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
-from flowgraph.verbs import verb
 
 MOST_PATTERNS = 8
 """Patterns of present sources up to which each has a program of its own."""
@@ -168,8 +167,10 @@ class CostReport:
         return as_html(self)
 
     def _repr_html_(self) -> str:
+        from flowgraph.drawing.notebook import report_cell  # only who shows it needs what draws
+
         first = self.sections[0]
-        return str(verb("Report.cell")(first.rows, (self.intro, first.note), self.html(), "all tables"))
+        return report_cell(first.rows, (self.intro, first.note), self.html(), "all tables")
 
 
 def cost_report(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 import scipy.signal
 
 from flowgraph import DeclarationError, Scalar, Stream, Tick, graph, simulate, ticks
 from flowgraph.blocks.control import (
+    DormandPrince,
     late,
     limited,
     pid,
@@ -20,9 +24,11 @@ from flowgraph.blocks.control import (
     state_feedback,
     transfer,
 )
+from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import FlightCommand
+from flowgraph.errors import RunError
 from tests.support import MS, all_engines, both_quick, scalars
 
 GAIN, INTEGRAL, DERIVATIVE, FILTER = 10.0, 6.0, 2.0, 0.05
@@ -181,3 +187,43 @@ def test_systems_that_are_none_are_refused() -> None:
 
     with pytest.raises(DeclarationError, match="no number of ticks"):
         wrong.build()
+
+
+SWING = StateSpace(euclidean(2))
+
+
+def pendulum(x: Any, u: Any, xp: Any) -> Any:
+    return xp.stack([x[..., 1], -9.81 * xp.sin(x[..., 0]) - 0.1 * x[..., 1] + u])
+
+
+@graph
+def swinging(clock: Stream[Tick], push: Stream[Scalar], *, model: Any):
+    body = plant(model, start=np.array([2.9, 0.0]), command=0.0, at=clock)
+    body.feed(push)
+    return {"output": body.output, "degrees": body.output.map(lambda x: x[0] * (180.0 / np.pi))}
+
+
+@pytest.mark.parametrize("engine", ["python", "reference", "c"])
+def test_a_plant_that_is_solved_to_a_tolerance(engine: str) -> None:
+    clock = ticks("250ms", until="4s")
+    given = {"clock": clock, "push": scalars([0], [1.5])}
+    built = swinging.build(model=DormandPrince(SWING, pendulum))
+    result = simulate(built, given, engine=engine)
+    found = result["output"]
+    np.testing.assert_allclose(result["degrees"].value, np.degrees(found.value[:, 0]), rtol=1e-12)
+    fine = scipy.integrate.solve_ivp(
+        lambda t, x: pendulum(x, 0.0 if t < 0.0 else 1.5, np), (0.0, 4.0), [2.9, 0.0],
+        method="DOP853", t_eval=clock.time * 1e-9, rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(found.value, fine.y.T[: len(found)], atol=1e-6)
+    rough = DormandPrince(SWING, pendulum, relative=1e-3, absolute=1e-3)
+    coarse = simulate(swinging.build(model=rough), given)["output"]
+    assert np.abs(coarse.value - found.value).max() > 1e-5, "the tolerance is taken"
+
+
+def test_a_solver_refuses_attitudes_and_what_it_cannot_solve() -> None:
+    with pytest.raises(DeclarationError, match="an attitude is not added to"):
+        DormandPrince(StateSpace(attitude=quaternion()), pendulum)
+    falls = DormandPrince(StateSpace(euclidean(1)), lambda x, xp: xp.stack([x[..., 0] ** 2]))
+    with pytest.raises(RunError, match="could not be solved"):
+        falls.after(np.array([1.0]), None, 2.0)
