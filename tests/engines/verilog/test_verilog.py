@@ -87,7 +87,7 @@ def flight(seed=0):
 @pytest.fixture(scope="module")
 def made():
     built = everything.build()
-    formats = sizes_of(built, flight()).formats(26, 2.0)
+    formats = sizes_of(built, flight()).formats(26, 2.0, 30)
     subject = LoweredGraph(built)
     return built, formats, with_formats(subject.pipeline, formats), subject.tape(flight())
 
