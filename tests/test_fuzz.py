@@ -13,7 +13,7 @@ pytest.importorskip("pyarrow", reason="needs the extra study")
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_damaged_files_end_in_what_they_hold_or_in_our_error(seed):
-    found = run(seed, 280, limit=False)
+    found = run(seed, 340, limit=False)
     assert found["failures"] == []
     assert min(found["kinds"].values()) >= 10
 

@@ -18,29 +18,20 @@ import numpy as np
 
 from flowgraph import Flight
 from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
+from flowgraph.blocks.datasets.csv_columns import SETTINGS, STREAMS, TURNS, said_by
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
 from flowgraph.blocks.datasets.places import from_ned
 from flowgraph.blocks.datasets.shape import (
-    MEASURED_NOISE,
-    NOISE_SETTINGS,
     Recording,
     chosen,
     imu_noise,
     known,
     measured_noise,
     policy,
-    stream_settings,
     the_file,
 )
-from flowgraph.blocks.datasets.tables import POLICIES
 from flowgraph.blocks.datasets.turns import ORDERS, from_angles, from_matrices
 from flowgraph.blocks.datasets.units import (
-    ANGLE,
-    FIELD,
-    FORCE,
-    LENGTH,
-    RATE,
-    SPEED,
     TIME,
     split_unit,
     unit_of,
@@ -61,31 +52,6 @@ from flowgraph.data.notes import note
 from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["SETTINGS", "STREAMS", "claims", "load"]
-
-_QUATERNION = {"wxyz": 1.0, "xyzw": 1.0}
-_ROWS = {"rows": 1.0, "columns": 1.0}
-_TURNS = {"attitude": (4, _QUATERNION), "angles": (3, ANGLE), "matrix": (9, _ROWS)}
-
-STREAMS: Mapping[str, Mapping[str, tuple[int, Mapping[str, float]]]] = {
-    "imu": {"gyro": (3, RATE), "specific_force": (3, FORCE)},
-    "vicon": {"position": (3, LENGTH), **_TURNS},
-    "leica": {"position": (3, LENGTH)},
-    "gps": {"latitude": (1, ANGLE), "longitude": (1, ANGLE), "height": (1, LENGTH)},
-    "gps_velocity": {"velocity": (3, SPEED)},
-    "magnetometer": {"field": (3, FIELD)},
-    "barometer": {"height": (1, LENGTH)},
-    "wheels": {"speed": (1, SPEED)},
-    "truth": {
-        "position": (3, LENGTH),
-        **_TURNS,
-        "velocity": (3, SPEED),
-        "gyro_bias": (3, RATE),
-        "accelerometer_bias": (3, FORCE),
-    },
-}
-"""The fields of each stream: how many columns, and the units (or orders of numbers) that they may have, the
-first where nothing is said. `attitude`, `angles` and `matrix` are three ways to write one field, of which one
-is given. All fields of a stream are needed; of the truth, an attitude alone, with a position, or all five."""
 
 _SIGNALS: Mapping[frozenset[str], Any] = {
     frozenset(STREAMS["imu"]): Imu,
@@ -108,41 +74,6 @@ _TRUTHS = [
 _TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
 """Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
 _INDEX = ("index", "row", "row.names")
-
-
-def _said_by(field: str) -> str:
-    """The setting of what the columns of a field are in."""
-    return "order" if field in ("attitude", "matrix") else "unit"
-
-
-SETTINGS: Mapping[str, str] = {
-    "time": "the column of the stamps; if left out, that of a name such as t, time or stamp, else the first",
-    "time.unit": "of the stamps: " + ", ".join(TIME),
-    "delimiter": "between columns: " + ", ".join(DELIMITERS) + "; found if left out",
-    "decimal": "the decimal mark: point, comma; found if left out",
-    "comment": "a mark that lines to pass over begin with, beside # % // ! ;",
-    **{
-        f"{stream}.{field}": f"{n} columns, comma-separated"
-        for stream, fields in STREAMS.items()
-        for field, (n, _) in fields.items()
-    },
-    **{
-        f"{stream}.{field}.{_said_by(field)}": ", ".join(units)
-        for stream, fields in STREAMS.items()
-        for field, (_, units) in fields.items()
-        if len(units) > 1
-    },
-    "gps_velocity.axes": "of its three columns: enu (left out: east, north, up) or ned",
-    **{
-        f"{stream}.angles.order": "of the turns, each about an axis of the turned body: " + ", ".join(ORDERS)
-        for stream in ("vicon", "truth")
-    },
-    **NOISE_SETTINGS,
-    **MEASURED_NOISE,
-    **stream_settings(*STREAMS),
-    "bad_time": "rows out of order: " + ", ".join(POLICIES),
-}
-"""The settings of `load` and what they mean."""
 
 
 def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
@@ -268,7 +199,7 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
                 continue
             columns = _listed(text)
             if len(columns) != n:
-                other = next((f for f in _TURNS if field in _TURNS and _TURNS[f][0] == len(columns)), field)
+                other = next((f for f in TURNS if field in TURNS and TURNS[f][0] == len(columns)), field)
                 raise DeclarationError(
                     f"{stream}.{field} has not so many columns",
                     path=f"csv.{stream}.{field}",
@@ -281,8 +212,8 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
                 )
             mapped.setdefault(stream, {})[field] = columns
     for stream, found in mapped.items():
-        ways = [f for f in found if f in _TURNS]
-        kinds = frozenset("attitude" if f in _TURNS else f for f in found)
+        ways = [f for f in found if f in TURNS]
+        kinds = frozenset("attitude" if f in TURNS else f for f in found)
         needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
         if len(ways) > 1 or kinds not in (_TRUTHS if stream == "truth" else [needed]):
             raise DeclarationError(
@@ -435,7 +366,7 @@ def _converted(
     """The name of the field, and its values in SI units: a quaternion scalar first; a lone column without its
     axis."""
     width, units = STREAMS[stream][field]
-    key = f"{stream}.{field}.{_said_by(field)}"
+    key = f"{stream}.{field}.{said_by(field)}"
     unit = chosen(given, key, list(units), "csv")
     if field == "attitude":
         return field, values[:, [3, 0, 1, 2]] if unit == "xyzw" else values

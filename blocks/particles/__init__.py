@@ -21,6 +21,7 @@ from flowgraph.blocks.particles.cloud import (
     reweight,
     start_cloud,
     weights,
+    within_depth,
 )
 from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, silverman, spread_of
 from flowgraph.blocks.particles.lost import (
@@ -47,6 +48,7 @@ from flowgraph.blocks.particles.resampling import (
 )
 
 __all__ = [
+    "within_depth",
     "within_reach",
     "pose_within_reach",
     "BELIEVED",

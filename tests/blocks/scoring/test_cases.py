@@ -106,7 +106,7 @@ def test_settings_are_checked_before_the_flight_is_looked_at():
         registered().case(Flight("empty", {}), gain=0.0)
     with pytest.raises(DataError, match=r"empty: this flight lacks what doubled needs[\s\S]*streams imu"):
         registered().case(Flight("empty", {}))
-    with pytest.raises(DataError, match="fly again, or build doubled"):
+    with pytest.raises(DataError, match="fly again, or a graph that fits: flowgraph inspect"):
         registered(fix="fly again").case(Flight("empty", {}))
 
 

@@ -29,13 +29,17 @@ def test_less_than_a_minute_is_refused():
 
 
 def test_verdicts_of_a_filter_that_weighs_nothing():
-    report = faults(graphs="gyro_integration", kinds="duplicates imu,stuck imu,dropout vicon 1 s")
+    report = faults(
+        graphs="gyro_integration", kinds="duplicates imu,stuck imu,dropout vicon 1 s,start heading"
+    )
     found = {row["fault"]: row for row in report.rows}
     assert found["duplicates imu"]["verdict"] == "said"
-    assert found["stuck imu 2 s"]["verdict"] == "undetectable"
+    assert found["stuck imu 2 s"]["verdict"] == "said"
+    assert "a sensor that is stuck" in found["stuck imu 2 s"]["why"]
     assert found["stuck imu 2 s"]["factor"] > 2.0
     assert found["dropout vicon 1 s"]["verdict"] == "recovered"  # it reads none
-    assert set(found) == {"duplicates imu", "stuck imu 2 s", "dropout vicon 1 s"}
+    assert found["start heading 90 deg off"]["verdict"] == "undetectable"
+    assert set(found) == {"duplicates imu", "stuck imu 2 s", "dropout vicon 1 s", "start heading 90 deg off"}
 
 
 @pytest.mark.slow
