@@ -29,8 +29,7 @@ __all__ = ["adjoint", "camera_motion_of", "camera_velocity", "find_delay", "velo
 def adjoint(mount: Mount) -> np.ndarray:
     """The matrix (6, 6) that makes (v_c, w_c) of the body's (R^T v, w).
 
-    [R_cb  -R_cb [r]x]
-    [0      R_cb     ]
+    Both blocks of its diagonal are R_cb, that above is -R_cb skew(r), that below 0.
     """
     R, r = mount.rotation, mount.camera_in_body
     return np.block([[R, -R @ np.asarray(skew(r, xp=np))], [np.zeros((3, 3)), R]])
