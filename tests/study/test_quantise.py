@@ -133,15 +133,15 @@ def test_the_command_writes_what_run_and_lower_read(tmp_path):
     assert json.loads((tmp_path / "c" / "pipeline.json").read_text())["formats"]["width"] == 26
 
 
-def test_lowering_to_fixed_point_needs_formats():
-    made = CliRunner().invoke(app, ["lower", "kalman", "--dtype", "fixed", "-o", "nowhere"])
+def test_lowering_to_fixed_point_needs_formats(tmp_path):
+    made = CliRunner().invoke(app, ["lower", "kalman", "--dtype", "fixed", "-o", str(tmp_path)])
     assert made.exit_code != 0
     assert "flowgraph quantise kalman" in made.output
 
 
-def test_a_bound_is_a_figure_and_a_number():
+def test_a_bound_is_a_figure_and_a_number(tmp_path):
     made = CliRunner().invoke(
-        app, ["quantise", "kalman", "--data", "sim", "--bound", "tight", "-o", "nowhere"]
+        app, ["quantise", "kalman", "--data", "sim", "--bound", "tight", "-o", str(tmp_path)]
     )
     assert made.exit_code != 0
     assert "FIGURE=MOST" in made.output

@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 
 LIMIT = 1 << 62
+LEAST = 1 - LIMIT
+"""The least that arithmetic makes: -2^62 itself is the word of a reading that is not there."""
 _ONE = np.int64(1)
 
 Ints = Any  # an int64 array, or a NumPy int64
 
 
 def shift(x: Ints, by: Ints) -> Ints:
-    """x 2^-by: to the right rounded half up, to the left up to +-2^62."""
+    """x 2^-by: to the right rounded half up, to the left from 1 - 2^62 to 2^62."""
     by = np.asarray(by, dtype=np.int64)
     right = np.clip(by, 0, 62)
     down = np.where(by > 62, 0, (x + ((_ONE << right) >> 1)) >> right)
@@ -30,7 +32,7 @@ def shift(x: Ints, by: Ints) -> Ints:
         return down
     left = np.clip(-by, 0, 62)
     most = np.int64(LIMIT) >> left
-    return np.where(by >= 0, down, np.clip(x, -most, most) << left)
+    return np.where(by >= 0, down, np.maximum(np.clip(x, -most, most) << left, LEAST))
 
 
 def bit_length(x: Ints) -> Ints:
@@ -44,12 +46,12 @@ def product(a: Ints, b: Ints, by: Ints) -> Ints:
 
 
 def quotient(a: Ints, b: Ints, up: Ints) -> Ints:
-    """(a / b) 2^up of two words; a quotient by zero is +-2^62, of zero by zero zero."""
+    """(a / b) 2^up of two words; a quotient by zero is +-(2^62 - 1), of zero by zero zero."""
     over, under = np.abs(a), np.abs(b)
     lift_a, lift_b = 62 - bit_length(over), 31 - bit_length(under)
     safe = np.where(under == 0, _ONE, under << np.maximum(lift_b, 0))
     q = shift((over << np.where(over == 0, 0, lift_a)) // safe, lift_a - lift_b - up)
-    q = np.where(under == 0, np.where(over == 0, 0, LIMIT), np.where(over == 0, 0, q))
+    q = np.where(under == 0, np.where(over == 0, 0, -LEAST), np.where(over == 0, 0, np.minimum(q, -LEAST)))
     return np.where((a < 0) ^ (b < 0), -q, q)
 
 
@@ -113,7 +115,7 @@ def exponential(x: Ints, fraction: Ints, out: Ints) -> Ints:
 
 
 def logarithm(x: Ints, fraction: Ints, out: Ints) -> Ints:
-    """ln(x) of words; of zero and less, -2^62."""
+    """ln(x) of words; of zero and less, 1 - 2^62."""
     size = np.maximum(x, 1)
     length = bit_length(size)
     m = shift(size, length - 31)  # 1 <= m < 2, 30 bits behind the point
@@ -124,7 +126,7 @@ def logarithm(x: Ints, fraction: Ints, out: Ints) -> Ints:
         y = y + np.where(big, _ONE << (30 - k), 0)
         m = m >> big
     value = (length - 1 - fraction) * LN_2 + ((y * LN_2 + (1 << 29)) >> 30)
-    return np.where(x <= 0, -LIMIT, shift(value, 30 - out))
+    return np.where(x <= 0, LEAST, shift(value, 30 - out))
 
 
 _STEPS = 40

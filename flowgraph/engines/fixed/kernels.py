@@ -11,6 +11,7 @@ from flowgraph.pipeline.formats import NOT_A_NUMBER
 _HEAD = """
 #define FX_LIMIT ((int64_t)1 << 62)
 #define FX_NAN (-FX_LIMIT)
+#define FX_LEAST (1 - FX_LIMIT)
 #define FX_QUARTER_TURNS INT64_C({turn})
 #define FX_QUARTER INT64_C({quarter})
 #define FX_LOG2_E INT64_C({log2_e})
@@ -32,7 +33,8 @@ static inline int64_t fx_shift(int64_t x, int64_t by) {
   if (by > 62) return 0;
   if (by > 0) return fx_down(x + (((int64_t)1 << by) >> 1), (int)by);
   if (by < -62) by = -62;
-  return fx_cut(x, FX_LIMIT >> -by) * ((int64_t)1 << -by);
+  x = fx_cut(x, FX_LIMIT >> -by) * ((int64_t)1 << -by);
+  return x < FX_LEAST ? FX_LEAST : x;
 }
 
 static inline int fx_bits(int64_t x) {
@@ -57,11 +59,12 @@ static inline int64_t fx_lost(int64_t x, int is_not_zero, int64_t *count) {
 
 static inline int64_t fx_quotient(int64_t a, int64_t b, int64_t up) {
   if (a == 0) return 0;
-  int64_t over = fx_abs(a), under = fx_abs(b), q = FX_LIMIT;
+  int64_t over = fx_abs(a), under = fx_abs(b), q = -FX_LEAST;
   if (b != 0) {
     int lift_a = 62 - fx_bits(over), lift_b = 31 - fx_bits(under);
     q = fx_shift((over << lift_a) / (under << lift_b), lift_a - lift_b - up);
   }
+  if (q > -FX_LEAST) q = -FX_LEAST;
   return (a < 0) != (b < 0) ? -q : q;
 }
 
@@ -109,7 +112,7 @@ static inline int64_t fx_exponential(int64_t x, int64_t fraction, int64_t out) {
 static inline int64_t fx_logarithm(int64_t x, int64_t fraction, int64_t out) {
   int length = fx_bits(x > 1 ? x : 1);
   int64_t m = fx_shift(x > 1 ? x : 1, length - 31), y = 0;
-  if (x <= 0) return -FX_LIMIT;
+  if (x <= 0) return FX_LEAST;
   for (int k = 1; k <= 30; ++k) {
     m = (m * m) >> 30;
     if (m >> 31) { y += (int64_t)1 << (30 - k); m >>= 1; }

@@ -131,6 +131,29 @@ def ratios(x: Stream[Scalar]):
     return {"y": ratio(x)}
 
 
+@block
+def inverse(x: Scalar, *, xp) -> Scalar:
+    return -1.0 / x
+
+
+@graph
+def inverses(x: Stream[Scalar]):
+    """One block."""
+    return {"y": inverse(x)}
+
+
+def test_less_than_nothing_over_zero_is_the_least_word_and_not_an_absent_reading():
+    built = inverses.build()
+    flight = {"x": (np.arange(3, dtype=np.int64) * MS, np.array([1.0, 0.5, 0.25]))}
+    formats = sizes_of(built, flight).formats(20, 2.0)
+    worse = {"x": (flight["x"][0], np.array([1.0, 0.0, 0.5]))}
+    ours = simulate(built, worse, engine="fixed", formats=formats)
+    same(ours, simulate(built, worse, engine="c", dtype="fixed", formats=formats))
+    assert np.isfinite(ours["y"]["value"]).all()
+    assert ours["y"]["value"][1] < -4.0
+    assert ours.stats["saturations"] >= 1
+
+
 def test_divisions_by_zero_are_counted_where_they_are_taken():
     built = ratios.build()
     flight = {"x": (np.arange(4, dtype=np.int64) * MS, np.array([1.0, 0.0, 0.5, 0.0]))}
