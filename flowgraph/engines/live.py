@@ -12,6 +12,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from threading import RLock, Thread
 from time import perf_counter, perf_counter_ns, sleep
 from types import TracebackType
@@ -152,6 +154,8 @@ class Live:
     def push(self, time: int, /, *, timeout: float | None = None, **values: Any) -> bool:
         """Hand over events that were true at `time` (int ns), by source name; from any thread.
 
+        Events of one push are one tick, whatever the lateness.
+
         Returns:
             Whether all were taken in; what was not is counted.
 
@@ -176,7 +180,18 @@ class Live:
 
         Returns:
             How many ticks were handed over later than the deadline (1 ms, if none was set) allows.
+
+        Raises:
+            DataError: for a speed that is not positive.
         """
+        if not speed > 0.0:
+            raise DataError(
+                "a recording is played forwards",
+                path=f"{self.graph.name}.play",
+                expected="a speed above 0",
+                got=f"speed={speed:g}",
+                fix="leave it out for the pace of the stamps",
+            )
         given = prepare(self.graph, inputs)
         ticks, feeds = merged(given)
         begun, first, behind = perf_counter(), None, 0
@@ -192,10 +207,8 @@ class Live:
 
     def _put(self, checked: list[tuple[str, int, Any]], arrived: int, timeout: float | None) -> bool:
         self._refuse_if_ended()
-        taken = True
-        for name, stamp, value in checked:
-            taken &= self._boxes.put(self._names.index(name), stamp, value, arrived, timeout)
-        return taken
+        events = [(self._names.index(name), stamp, value) for name, stamp, value in checked]
+        return self._boxes.put(events, arrived, timeout)
 
     def _refuse_if_ended(self) -> None:
         if self._error is not None:
@@ -214,9 +227,10 @@ class Live:
     def _run(self) -> None:
         try:
             while (events := self._boxes.take(self._patience if self._order.waiting else None)) is not None:
-                for event in events:
-                    if self._order.put(event):
-                        self._ticks(self._order.ready(), event.arrived)
+                for _, together in groupby(events, attrgetter("number")):
+                    held = [event for event in together if self._order.put(event)]
+                    if held:
+                        self._ticks(self._order.ready(), held[0].arrived)
                 if not events:  # nothing has come for as long as anything may be late
                     self._ticks(self._order.ready(everything=True), perf_counter_ns())
             self._ticks(self._order.ready(everything=True), perf_counter_ns())

@@ -16,7 +16,6 @@ import heapq
 from collections import deque
 from collections.abc import Sequence
 from threading import Condition
-from time import monotonic
 from typing import Any, NamedTuple
 
 from flowgraph.language.graph import NEVER
@@ -26,7 +25,10 @@ POLICIES = ("block", "drop_oldest", "refuse")
 
 
 class Event(NamedTuple):
-    """A value of a source: its stamp in ns, its place among the sources, and when it came in ns."""
+    """A value of a source: its stamp in ns, its place among the sources, and when it came in ns.
+
+    What was put together has one number.
+    """
 
     number: int
     stamp: int
@@ -56,31 +58,35 @@ class Mailboxes:
         self.dropped = [0] * sources
         self.refused = [0] * sources
 
-    def put(self, source: int, stamp: int, value: Any, arrived: int, timeout: float | None = None) -> bool:
-        """Put an event into the queue of its source; False where it was turned away, and counted.
+    def put(self, events: Sequence[tuple[int, int, Any]], arrived: int, timeout: float | None = None) -> bool:
+        """Put events (source, stamp, value) of different sources into their queues, and nothing between them.
 
-        A queue that blocks turns it away after `timeout` s, or at once for 0; one that is closed, always.
+        A queue that blocks turns its event away after `timeout` s, or at once for 0; one that is closed,
+        always. What is turned away is counted.
+
+        Returns:
+            Whether all were taken in.
         """
+        sources = [source for source, _, _ in events]
         with self._changed:
-            queue = self._queues[source]
             if self._full == "block":
-                until = None if timeout is None else monotonic() + timeout
-                while len(queue) >= self._size and not self._closed:
-                    left = None if until is None else until - monotonic()
-                    if left is not None and left <= 0:
-                        break
-                    self._changed.wait(left)
-            if self._closed or (len(queue) >= self._size and self._full != "drop_oldest"):
-                self.refused[source] += 1
-                return False
-            if len(queue) >= self._size:
-                queue.popleft()
-                self.dropped[source] += 1
+                self._changed.wait_for(lambda: self._closed or self.have_room(sources), timeout)
             self._numbers += 1
-            self.taken_in[source] += 1
-            queue.append(Event(self._numbers, stamp, source, value, arrived))
+            taken = [self._put(Event(self._numbers, t, k, value, arrived)) for k, t, value in events]
             self._changed.notify_all()
-            return True
+        return all(taken)
+
+    def _put(self, event: Event) -> bool:
+        source, queue = event.source, self._queues[event.source]
+        if self._closed or (len(queue) >= self._size and self._full != "drop_oldest"):
+            self.refused[source] += 1
+            return False
+        if len(queue) >= self._size:
+            queue.popleft()
+            self.dropped[source] += 1
+        self.taken_in[source] += 1
+        queue.append(event)
+        return True
 
     def have_room(self, sources: Sequence[int]) -> bool:
         """Whether none of these queues is full now."""

@@ -30,6 +30,7 @@ from flowgraph import (
     periodic,
     simulate,
     sink,
+    stamp_of,
 )
 from flowgraph.engines.mailbox import Event, Mailboxes, Order
 from tests.support import MS, scalars
@@ -138,24 +139,24 @@ def test_events_of_one_stamp_are_one_tick_and_no_more_are_held_than_said():
 def test_policies_of_a_full_queue():
     for full, kept, dropped, refused in (("refuse", [0, 1], 0, 1), ("drop_oldest", [1, 2], 1, 0)):
         boxes = Mailboxes(2, 2, full)
-        taken = [boxes.put(0, k, None, 0) for k in range(3)]
+        taken = [boxes.put([(0, k, None)], 0) for k in range(3)]
         assert taken == [True, True, not refused]
-        assert boxes.put(1, 9, None, 0)  # the other queue has room
+        assert boxes.put([(1, 9, None)], 0)  # the other queue has room
         assert (boxes.dropped, boxes.refused) == ([dropped, 0], [refused, 0])
         found = boxes.take(0.0)
         assert found is not None
         assert [e.stamp for e in found] == [*kept, 9]
     boxes = Mailboxes(1, 1, "block")
-    boxes.put(0, 0, None, 0)
-    assert not boxes.put(0, 1, None, 0, timeout=0.01)
+    boxes.put([(0, 0, None)], 0)
+    assert not boxes.put([(0, 1, None)], 0, timeout=0.01)
     assert boxes.refused == [1]
-    later = threading.Thread(target=lambda: boxes.put(0, 2, None, 0))
+    later = threading.Thread(target=lambda: boxes.put([(0, 2, None)], 0))
     later.start()
     assert len(boxes.take(1.0) or ()) == 1
     later.join(5.0)
     assert boxes.taken_in == [2]
     boxes.close()
-    assert not boxes.put(0, 3, None, 0)
+    assert not boxes.put([(0, 3, None)], 0)
     assert [e.stamp for e in boxes.take(None) or ()] == [2]
     assert boxes.take(None) is None
 
@@ -314,3 +315,58 @@ def test_a_recording_is_played_at_its_pace_and_gone_on_with(engine):
         more.push(50 * MS, b=1.0)
     assert more.counts["b.late"] == 1
     assert float(more.result().now["value"][0]) == float(whole.now["value"][-1]) + 1.0
+
+
+@graph
+def two(a: Stream[Scalar], b: Stream[Scalar]):
+    return {"a": a, "b": b}
+
+
+@pytest.mark.parametrize("engine", ["python", "c"])
+@pytest.mark.parametrize("lateness", [0, "1ms"])
+def test_events_of_one_push_are_one_tick(engine, lateness):
+    built = two.build(a=aperiodic(), b=aperiodic())
+    with Live(built, engine=engine, lateness=lateness) as live:
+        for k in range(1, 201):
+            live.push(k * MS, a=1.0 * k, b=2.0 * k)
+    assert not any(n for kind, n in live.counts.items() if "taken" not in kind), live.counts
+    result = live.result()
+    assert len(result["a"]) == len(result["b"]) == 200
+    np.testing.assert_array_equal(result["b"].value, 2.0 * result["a"].value)
+
+
+def test_a_stamp_that_is_pushed_with_its_value_is_its_stamp():
+    @graph
+    def stamped(a: Stream[Scalar]):
+        return {"s": stamp_of(a), "a": a}
+
+    with Live(stamped.build(a=aperiodic())) as live:
+        for k in range(1, 6):
+            live.push(k * 1000 * MS, a=1.0 * k, **{"a.stamp": k * 1000 * MS - 500 * MS})
+    assert live.result()["s"].value.tolist() == [k * 1000 * MS - 500 * MS for k in range(1, 6)]
+
+
+def test_pushes_from_threads_stay_whole():
+    built = two.build(a=aperiodic(), b=aperiodic())
+    with Live(built, lateness="10s", queue=64) as live:
+
+        def push(first):
+            for k in range(first, 400, 4):
+                live.push((k + 1) * MS, a=1.0 * k, b=1.0 * k)
+
+        threads = [threading.Thread(target=push, args=(k,)) for k in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    result = live.result()
+    assert len(result["a"]) == len(result["b"])
+    np.testing.assert_array_equal(result["a"].time, result["b"].time)
+
+
+def test_a_recording_is_played_forwards():
+    with (
+        Live(two.build(a=aperiodic(), b=aperiodic())) as live,
+        pytest.raises(DataError, match="played forwards"),
+    ):
+        live.play({"a": scalars([0], [1.0])}, speed=0.0)
