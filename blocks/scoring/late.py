@@ -7,6 +7,7 @@ many places as the stamps ask for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -63,9 +64,10 @@ def built_for(
     late = ", ".join(late_streams(inputs))
     if not late:
         return graph.build(**clocks_of(inputs), sizes=sizes, **settings), []
-    most = max(float((s.time - s.stamp).max(initial=0)) * 1e-9 for s in inputs.values())
+    latest = max(int((s.time - s.stamp).max(initial=0)) for s in inputs.values())
+    most = math.ceil(latest / 1e6) / 1e3  # rounded up: a history of as many s holds all of it
     if seconds is None:
-        said = f"late by up to {most:.3g} s and taken for fresh; rewind={most:.3g} applies it at its own time"
+        said = f"late by up to {most:g} s and taken for fresh; rewind={most:g} applies it at its own time"
         built = graph.build(**clocks_of(inputs), sizes=sizes, **settings)
         return built, [note("warning", f"{late}: {said}")]
     if smoothed:
@@ -76,7 +78,7 @@ def built_for(
             got=f"rewind={seconds:g}, with smooth or lag",
             fix="leave rewind out: for a smoother no measurement is late",
         )
-    said = f"late by up to {most:.3g} s, and applied at its own time where that is {seconds:g} s ago or less"
+    said = f"late by up to {most:g} s, and applied at its own time where that is {seconds:g} s ago or less"
     return rewound_graph(graph, inputs, seconds, sizes, settings), [note("info", f"{late}: {said}")]
 
 

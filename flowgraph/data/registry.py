@@ -23,7 +23,7 @@ from flowgraph.data.arrival import LATENCY, delayed_flight
 from flowgraph.data.consistency import far_nis, measured
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
-from flowgraph.data.notes import said
+from flowgraph.data.notes import note, said
 from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
 from flowgraph.data.series import Flight, Series
@@ -91,7 +91,20 @@ class Case:
         told = tell(result) if tell is not None else ()
         far = (far_nis(measured(name), s) for name, s in result.series.items() if "nis" in s.leaves)
         suspect = map(suspect_readings, self.recorded.values())
-        return said((*self.notes, *result.notes, *told, *chain.from_iterable((*far, *suspect))))
+        more = chain.from_iterable((*far, *suspect, _too_late(result)))
+        return said((*self.notes, *result.notes, *told, *more))
+
+
+def _too_late(result: Result) -> tuple[str, ...]:
+    """A note where late values were older than the history that they would have been applied in."""
+    refused = sum(n for kind, n in result.stats.items() if kind.endswith(".late_refused"))
+    fused = sum(n for kind, n in result.stats.items() if kind.endswith(".late_fused"))
+    made = ((refused, "refused", "left out"), (fused, "counted", "taken for as old as the history goes back"))
+    return tuple(
+        note(word, f"{n} late values were older than the history, and {what}: a larger rewind takes them in")
+        for n, word, what in made
+        if n
+    )
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from flowgraph.data.series import Series
 
 __all__ = ["suspect_readings"]
 
-STUCK, STUCK_S, OFTEN = 5, 0.2, 0.05
+STUCK, STUCK_S, OFTEN, STEP = 5, 0.2, 0.05, 0.2
 """How many times in a row, and for how many seconds, a reading is repeated by a sensor that is stuck; what
-part of the others may be repeated where that is not the usual way."""
+part of the others may be repeated where that is not the usual way; and by how much of a usual step it jumps
+into that and out of it, which one that is at rest does not."""
 
-BLOCK, ALONE, ASIDE = 32, 30.0, 0.2
+BLOCK, ALONE, ASIDE = 32, 40.0, 0.2
 """Over how many readings a usual difference is told; how many times that a spike is off from the mean of
 those beside it; and how far these are from each other at most, by how far it is off."""
 
@@ -27,8 +28,12 @@ RATE, SPAN, STEPS, CERTAIN = 0.004, 1.0, 20, 7.0
 """By how much of itself a rate has changed; over how many s, and steps at least, it is told; and how many
 deviations of a mean that must be, too."""
 
-_TOLD, _WIDE = ("covariance", "deviation", "interval"), 9
-"""What a reading tells of itself; of how many numbers a reading is, which a list is not."""
+LEAP, ALIKE, MOST = 1.3, 0.1, 0.9
+"""By which factor a rate has leapt, where this part of the blocks on each side is as near to their own."""
+
+_TOLD, _LEAST, _WIDE = ("covariance", "deviation", "interval"), 3, 9
+"""What a reading tells of itself; of how many numbers a reading is whose noise never repeats all of them,
+and which no list is. (A speed of 0 at rest, an angle that goes round, a limit are single numbers.)"""
 
 
 def suspect_readings(series: Series) -> tuple[str, ...]:
@@ -42,29 +47,39 @@ def suspect_readings(series: Series) -> tuple[str, ...]:
     values = {
         name: leaf.reshape(len(leaf), -1)
         for name, leaf in series.leaves.items()
-        if leaf.dtype.kind == "f" and not name.endswith(_TOLD) and leaf[:1].size <= _WIDE
+        if leaf.dtype.kind == "f" and not name.endswith(_TOLD) and _LEAST <= leaf[:1].size <= _WIDE
     }
-    if not values:
-        return ()
     t = (series.time - series.time[0]) * 1e-9
-    spiked = [said for name, leaf in values.items() for said in _spikes(series.name, name, leaf, t)]
-    return (*_stuck(series.name, np.hstack(list(values.values())), t), *spiked, *_rate(series.name, t))
+    said = [
+        sentence
+        for name, leaf in values.items()
+        for judged in (_stuck, _spikes)
+        for sentence in judged(series.name, name, leaf, t)
+    ]
+    return (*said, *(_leap(series.name, t) or _rate(series.name, t)))
 
 
-def _stuck(name: str, values: np.ndarray, t: np.ndarray) -> tuple[str, ...]:
+def _stuck(name: str, leaf: str, values: np.ndarray, t: np.ndarray) -> tuple[str, ...]:
     again = np.all(values[1:] == values[:-1], axis=-1) & (np.diff(t) > 0.0)
+    steps = np.linalg.norm(np.diff(values, axis=0), axis=-1)
+    moving = steps[np.isfinite(steps) & (steps > 0.0)]
     edges = np.diff(np.concatenate([[0], again, [0]]).astype(int))
     first, last = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
-    long = (last - first >= STUCK) & (t[last] - t[first] >= STUCK_S) if len(first) else np.zeros(0, bool)
+    if not len(first) or len(moving) < STUCK:
+        return ()
+    around = np.concatenate([[np.inf], steps, [np.inf]])  # the steps into a row and out of it
+    jumps = np.fmin(around[first], around[last + 1]) >= STEP * np.median(moving)
+    long = (last - first >= STUCK) & (t[last] - t[first] >= STUCK_S) & jumps
     others = len(again) - int((last - first)[long].sum())
-    if not long.any() or int((last - first)[~long].sum()) > OFTEN * others or others < STUCK:
+    if not long.any() or int((last - first)[~long].sum()) > OFTEN * others:
         return ()
     longest = int(np.argmax(np.where(long, t[last] - t[first], 0.0)))
     begins, lasts = t[first[longest]], t[last[longest]] - t[first[longest]]
     often = "" if long.sum() == 1 else f", {long.sum()} times in all"
+    when = f"from {begins:.3g} s after the first on{often}"
     return (
-        note("warning", f"{name}: the same reading for {lasts:.3g} s, from {begins:.3g} s after the first on"
-             f"{often}, though no two others are alike: a sensor that is stuck"),
+        note("warning", f"{name}: the same {leaf} for {lasts:.3g} s, {when}, which its other readings never"
+             " have: a sensor that is stuck"),
     )  # fmt: skip
 
 
@@ -85,8 +100,27 @@ def _spikes(name: str, leaf: str, values: np.ndarray, t: np.ndarray) -> tuple[st
     what = f"{name}: readings of {leaf} stand alone, {alone.sum()} of them"
     return (
         note("warning", f"{what}, from {t[row + 1]:.3g} s after the first on: off from those beside them by"
-             f" up to {far:.2g} usual differences: spikes"),
+             f" up to {far:.2g} usual differences: spikes or jolts"),
     )  # fmt: skip
+
+
+def _leap(name: str, t: np.ndarray) -> tuple[str, ...]:
+    steps = np.diff(t)
+    steps = steps[steps > 0.0]
+    if len(steps) < 6 * STEPS:
+        return ()
+    usual = np.log(np.median(steps[: len(steps) // STEPS * STEPS].reshape(-1, STEPS), axis=-1))
+    count = np.arange(1, len(usual))
+    sums = np.cumsum(usual)[:-1]
+    apart = np.abs((usual.sum() - sums) / (len(usual) - count) - sums / count)
+    k = 3 + int(np.argmax(apart[2:-2]))
+    before, after = usual[:k], usual[k:]
+    near = [np.mean(np.abs(x - np.median(x)) < ALIKE) >= MOST for x in (before, after)]
+    old, new = np.median(before), np.median(after)
+    if not all(near) or abs(new - old) < np.log(LEAP):
+        return ()
+    since = t[min(k * STEPS, len(t) - 1)]
+    return _another_rate(name, np.exp(-new), since, np.exp(-old))
 
 
 def _rate(name: str, t: np.ndarray) -> tuple[str, ...]:
@@ -109,7 +143,9 @@ def _rate(name: str, t: np.ndarray) -> tuple[str, ...]:
     if change <= RATE * usual or certain[k] <= CERTAIN * chance:
         return ()
     since = (k + 1) * each * usual
-    return (
-        note("warning", f"{name}: comes at {1.0 / after[k]:.4g} Hz from about {since:.2g} s after the first"
-             f" on, at {1.0 / before[k]:.4g} Hz before: a clock or a rate that changed"),
-    )  # fmt: skip
+    return _another_rate(name, 1.0 / after[k], since, 1.0 / before[k])
+
+
+def _another_rate(name: str, now: float, since: float, before: float) -> tuple[str, ...]:
+    said = f"{name}: comes at {now:.4g} Hz from about {since:.2g} s after the first on, at {before:.4g} Hz"
+    return (note("warning", f"{said} before: a clock or a rate that changed"),)

@@ -113,7 +113,10 @@ def calibrate(
         for f in offsets:
             value, deviations[f.name], inside = _vertex(f, width, found, tried)
             found[f.name] = value
-            if not inside and width == widths[-1]:
+            side = {f.low: "lower", f.high: "upper"}.get(value)
+            if side is not None and width == widths[-1]:
+                notes.append(note("warning", f"{f.name} ended at its {side} bound: widen it"))
+            elif not inside and width == widths[-1]:
                 notes.append(
                     note("warning", f"{f.name}: the {measure} has no peak near {value:.4g} s: it is a guess")
                 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Series
-from flowgraph.blocks.signals import Gyro, Position
+from flowgraph.blocks.signals import Gyro, Imu, Position
 from flowgraph.data.suspect import suspect_readings
 
 RNG = np.random.default_rng(3)
@@ -42,7 +42,28 @@ def test_a_stuck_sensor(seconds):
     series = gyro()
     stuck = changed(series, slice(300, 300 + round(100 * seconds)), series["rate"][299])
     (said,) = suspect_readings(stuck)
-    assert said.startswith(f"warning: gyro: the same reading for {seconds:g} s, from 2.99 s")
+    assert said.startswith(f"warning: gyro: the same rate for {seconds:g} s, from 2.99 s")
+
+
+def test_a_gyro_that_is_stuck_beside_an_accelerometer_that_is_not():
+    series, noise = gyro(), RNG.normal(size=(2000, 3))
+    rate = np.array(series["rate"])
+    rate[500:900] = 0.0
+    imu = Series(series.time, Imu(gyro=rate, specific_force=noise), name="imu")
+    (said,) = suspect_readings(imu)
+    assert said.startswith("warning: imu: the same gyro for 3.99 s, from 5 s")
+
+
+def test_what_rests_before_it_moves_is_not_stuck():
+    t = np.arange(2000) / 100.0
+    moved = np.round(0.5 * np.maximum(t - 8.0, 0.0)[:, None] ** 2 * np.array([1.0, 0.5, 0.2]), 4)
+    assert suspect_readings(Series((t * 1e9).astype(np.int64), Position(moved), name="mocap")) == ()
+
+
+def test_a_single_number_may_repeat_and_jump():
+    t = np.arange(2000) / 100.0
+    for values in (np.maximum(np.sin(t), 0.0), np.sign(np.sin(t)), np.angle(np.exp(3j * t))):
+        assert suspect_readings(Series((t * 1e9).astype(np.int64), values, name="x")) == ()
 
 
 def test_what_is_always_repeated_is_not_stuck():
@@ -99,6 +120,22 @@ def test_a_clock_that_begins_to_run_fast(rate, jitter):
     (said,) = suspect_readings(Series(time, Gyro(rate=series["rate"]), name="gyro"))
     assert said.startswith("warning: gyro: comes at ")
     assert "a clock or a rate that changed" in said
+
+
+@pytest.mark.parametrize("factor", [1.5, 2.0, 10.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_a_rate_that_leaps(factor, jitter):
+    steps = np.where(np.arange(1999) < 1200, 10.0, 10.0 * factor)
+    steps *= 1.0 + jitter * RNG.uniform(-0.5, 0.5, 1999)
+    time = np.round(np.concatenate([[0.0], np.cumsum(steps)]) * 1e6).astype(np.int64)
+    (said,) = suspect_readings(Series(time, Gyro(rate=RNG.normal(size=(2000, 3))), name="gyro"))
+    assert said.startswith(f"warning: gyro: comes at {str(100.0 / factor)[:2]}")
+    assert "Hz from about 12 s" in said
+
+
+def test_what_comes_now_and_then_has_no_rate():
+    time = np.cumsum(RNG.exponential(0.1, 2000) * 1e9).astype(np.int64)
+    assert suspect_readings(Series(time, Gyro(rate=RNG.normal(size=(2000, 3))), name="gyro")) == ()
 
 
 def test_a_pause_is_no_other_rate():

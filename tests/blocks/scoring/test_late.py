@@ -31,6 +31,22 @@ def test_a_late_capture_is_taken_for_fresh_and_said():
     assert not [n for n in plain.notes if "late" in n]
 
 
+def test_the_rewind_that_the_note_names_is_long_enough():
+    _, case, _ = ran("ins_eskf", "0.123456")
+    (said,) = [n for n in case.notes if "late by" in n]
+    assert "rewind=0.124" in said
+    _, again, result = ran("ins_eskf", "0.123456", rewind=0.124)
+    assert result.stats["rewind/late.late_refused"] == 0
+    assert not any("older than the history" in n for n in again.remarks(result))
+
+
+def test_what_is_older_than_the_history_is_a_note():
+    _, case, result = ran("ins_eskf", "0.12", rewind=0.05)
+    refused = result.stats["rewind/late.late_refused"]
+    assert refused > 0
+    assert any(n.startswith(f"refused: {refused} late values were older") for n in case.remarks(result))
+
+
 def test_rewound_it_is_nearly_as_good_as_on_time():
     fresh, _, _ = ran("ins_eskf", "0.12")
     found, case, result = ran("ins_eskf", "0.12", rewind=0.2)
