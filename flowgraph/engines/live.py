@@ -378,6 +378,9 @@ class Live:
             ]
             if said:
                 found.append(note("counted", f"{name}: {', '.join(said)}"))
+        if self._order.crowded:
+            early = f"{self._order.crowded} ticks were made before their lateness was over"
+            found.append(note("counted", f"{early}: too many events waited; a larger queue holds them"))
         if self._missed:
             found.append(
                 note("counted", f"{self._missed} of {self._times[1].count} ticks missed the deadline")

@@ -123,6 +123,7 @@ class Order:
 
     Attributes:
         late, twice: by source, how many events came too late, and how many of one stamp came again.
+        crowded: how many ticks were complete because too many events were held back.
     """
 
     def __init__(self, sources: int, lateness: int, most: int, after: int = NEVER) -> None:
@@ -132,6 +133,7 @@ class Order:
         self._newest, self._done, self._count = NEVER, after, 0
         self.late = [0] * sources
         self.twice = [0] * sources
+        self.crowded = 0
 
     def put(self, event: Event) -> bool:
         """Hold an event; False where it is too late or came before, and is counted."""
@@ -157,6 +159,7 @@ class Order:
             everything or self._stamps[0] <= self._newest - self._lateness or self._count > self._most
         ):
             stamp = heapq.heappop(self._stamps)
+            self.crowded += not everything and stamp > self._newest - self._lateness
             events = self._held.pop(stamp)
             self._count -= len(events)
             self._done = stamp

@@ -370,3 +370,13 @@ def test_a_recording_is_played_forwards():
         pytest.raises(DataError, match="played forwards"),
     ):
         live.play({"a": scalars([0], [1.0])}, speed=0.0)
+
+
+@pytest.mark.parametrize("queue", [2, 64])
+def test_a_queue_that_is_too_small_for_the_lateness_is_a_note(queue):
+    with Live(two.build(a=aperiodic(), b=aperiodic()), lateness="1s", queue=queue) as live:
+        for k in range(1, 41):
+            live.push(k * MS, a=1.0 * k)
+    crowded = [n for n in live.result().notes if "a larger queue holds them" in n]
+    assert len(crowded) == (queue == 2)
+    assert len(live.result()["a"]) == 40
