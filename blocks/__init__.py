@@ -22,15 +22,15 @@ from rooms before it in this list, never from one after it, and nothing goes in 
       orientation  attitudes by gyroscope, gravity, and magnetic field
       outdoor      six sensors of a vehicle outdoors
     Where data come from
+      datasets     recorded flights, a module a format
       world        bodies that move in known ways
       sensors      which read that world
       flights      both together: simulated flights
-      datasets     recorded flights, a module a format
     What it was worth
       scoring      a case of a flight and a filter, and its score
 
 A room's public names are importable from it, `from flowgraph.blocks.kalman import update_linear`; of
-`models`, `flights` and `datasets` the modules are public. A graph of one's own starts at `signals` and at the
+`models`, `datasets` and `flights` the modules are public. A graph of one's own starts at `signals` and at the
 room of its method; `flowgraph.graphs` shows what is made of them.
 """
 
@@ -51,9 +51,9 @@ __all__ = [
     "models",
     "orientation",
     "outdoor",
+    "datasets",
     "world",
     "sensors",
     "flights",
-    "datasets",
     "scoring",
 ]

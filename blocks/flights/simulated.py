@@ -14,6 +14,8 @@ import numpy as np
 import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
+from flowgraph.blocks.datasets.adjust import stream_settings
+from flowgraph.blocks.datasets.placed import PLACED, parted, placed_flight
 from flowgraph.blocks.flights import drive, figure, plane, worlds
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply
 from flowgraph.blocks.inertial.imu import ImuNoise
@@ -46,10 +48,11 @@ SETTINGS: Mapping[str, str | float] = {
     "unit": "of a drive: " + ", ".join(drive.GRADES),
     **worlds.SETTINGS,
     **plane.DEFAULTS,
+    **stream_settings("STREAM", only=PLACED),
     **DEFAULTS,
 }
 """All settings that `load` understands: `DEFAULTS` for the figure, `worlds.SETTINGS` for the worlds, whose
-values when left out are their own."""
+values when left out are their own; those of any stream are of a flight that was made, as of a recording."""
 
 
 def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
@@ -72,6 +75,11 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
         UnknownNameError: for another shape or an unknown setting.
         DeclarationError: for a setting that is not a number in its range.
     """
+    own, placed = parted(settings or {}, SETTINGS)
+    return placed_flight(_made(argument, seed, own), placed, "sim")
+
+
+def _made(argument: str, seed: int, settings: Mapping[str, str | float]) -> Flight:
     if argument in worlds.WORLDS:
         return worlds.load_world(argument, seed=seed, settings=settings)
     if argument == "plane":
@@ -81,7 +89,7 @@ def load(argument: str = "", *, seed: int = 0, settings: Mapping[str, str | floa
     if argument not in ("", "quadrotor", "figure"):
         kinds = ["quadrotor", "figure", "plane", "drive", *worlds.WORLDS]
         raise UnknownNameError("simulated flight", argument, kinds, path="sim")
-    s = _settings(settings or {})
+    s = _settings(settings)
     if argument == "figure":
         return figure.load_figure(seed=seed, settings=s)
     imu_period, vicon_period = round(1e9 / s["imu.rate"]), round(1e9 / s["vicon.rate"])
