@@ -163,6 +163,7 @@ def run(
                 err_console.print(f"note: {words}", markup=False)
             notes[words] = None
 
+    say(command.notes)
     spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
     recorder = recorder_of(case) if html is not None else None

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.notes import note
 from flowgraph.engines.checkpoint import read_checkpoint
 from flowgraph.engines.options import Checkpoint
 from flowgraph.errors import DeclarationError
@@ -14,7 +15,8 @@ from flowgraph.errors import DeclarationError
 
 @dataclass(frozen=True)
 class Command:
-    """What a run is asked to play."""
+    """What a run is asked to play; `folder` is where the first of its commands was given, and names of files
+    in the others are from there."""
 
     graph: str
     data: list[str]
@@ -23,6 +25,14 @@ class Command:
     dtype: str = "float64"
     seed: int = 0
     settings: list[str] | None = None
+    folder: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where files are named from, if that is another folder than this."""
+        if self.folder in ("", str(Path.cwd())):
+            return ()
+        return (note("info", f"the checkpoint was written in {self.folder}: its files are named from there"),)
 
 
 def resumed(resume: Path | None, **given: Any) -> Command:
@@ -43,6 +53,7 @@ def resumed(resume: Path | None, **given: Any) -> Command:
                 got=f"no {spelled}",
                 fix="name it; `flowgraph list` names the graphs and the kinds of data",
             )
+    found.setdefault("folder", str(Path.cwd()))
     return Command(**{name: value for name, value in found.items() if value is not None})
 
 

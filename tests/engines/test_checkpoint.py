@@ -295,6 +295,10 @@ def test_the_command_takes_from_the_checkpoint_what_is_left_out(tmp_path, monkey
                    "--checkpoint", str(file), "--every", "1")  # fmt: skip
     again = invoke("--resume", str(file), "--json")
     assert figures(again.stdout) == figures(first.stdout)
+    monkeypatch.chdir(tmp_path)
+    elsewhere = invoke("--resume", str(file))
+    assert "the checkpoint was written in" in elsewhere.stderr
+    assert "the checkpoint was written in" not in again.stderr
     for words, status, said in (
         (("--resume", str(file), "ekf"), 1, "this checkpoint is of another graph"),
         (("--resume", str(file), "--set", "duration=2"), 1, "this checkpoint is of another recording"),
