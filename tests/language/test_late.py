@@ -93,8 +93,7 @@ def test_each_tick_gives_the_oldest_time_that_is_known(a, b, wanted, before):
 def test_a_slow_stream_at_a_fast_clock_goes_over_lost_values_in_all_engines():
     times = np.array([t for t in range(0, 1000, 100) if t not in (300, 400)])
     inputs = {"a": scalars(times * MS, times**2), "b": scalars(np.arange(0, 1000, 10) * MS)}
-    periods = {"a": aperiodic(), "b": periodic("10ms")}
-    found = all_engines(lined.build(**periods), inputs).output
+    found = all_engines(lined.build(a=aperiodic(), b=periodic("10ms")), inputs).output
     wanted = np.arange(0, 10 * len(found), 10)
     assert (found["0"] // MS).tolist() == wanted.tolist()
     np.testing.assert_allclose(found["1"], np.interp(wanted, times, times**2), rtol=1e-13)

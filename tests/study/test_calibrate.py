@@ -182,7 +182,7 @@ def test_a_noise_is_found_as_by_tune():
 def test_bounds_the_wrong_way_round_are_told_by_their_option(verb, given, fix):
     option = {"calibrate": "--find", "tune": "--fit"}[verb]
     done = RUNNER.invoke(app, [verb, "ekf", "--data", "sim", option, given])
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     name = given.partition("=")[0]
     assert f"error: {option} {name}: these are no bounds to search between" in done.output
     assert f"write {option} {fix}\n" in done.output
