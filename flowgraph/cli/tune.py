@@ -217,6 +217,11 @@ def _report(found: Tuned) -> dict[str, Any]:
 
 
 def span(given: str, option: str = "--fit") -> tuple[str, float, float, float | None]:
+    """Name, bounds and start of `NAME=LOW:HIGH[:START]`.
+
+    Raises:
+        DeclarationError: naming the option, for another form or bounds that hold nothing.
+    """
     name, _, span = given.partition("=")
     try:
         numbers = [float(x) for x in span.split(":")]
@@ -230,4 +235,18 @@ def span(given: str, option: str = "--fit") -> tuple[str, float, float, float | 
             got=repr(given),
             fix=f"write {option} position_noise=0.001:0.1",
         ) from None
-    return name, numbers[0], numbers[1], numbers[2] if len(numbers) > 2 else None
+    low, high, *start = numbers
+    if not low < high or any(not low <= x <= high for x in start):
+        least, most = sorted((low, high))
+        begun = "" if any(not least <= x <= most for x in start) else "".join(f":{x:g}" for x in start)
+        mended = (
+            "NAME=LOW:HIGH" if math.isnan(low + high) or low == high else f"{name}={least:g}:{most:g}{begun}"
+        )
+        raise DeclarationError(
+            "these are no bounds to search between",
+            path=f"{option} {name}",
+            expected="LOW below HIGH, and START between them",
+            got=repr(given),
+            fix=f"write {option} {mended}",
+        )
+    return name, low, high, start[0] if start else None

@@ -52,7 +52,8 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
         name: of the new series; as before if left out.
 
     Raises:
-        DeclarationError: for a latency below 0, or a pair in the wrong order.
+        DeclarationError: for a latency below 0, a pair in the wrong order, an array of other than whole
+            numbers, or an arrival beyond what int64 nanoseconds hold.
     """
     called = name or series.name
     if isinstance(latency, tuple) and len(latency) == 2:
@@ -61,7 +62,16 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
         share = np.random.Generator(np.random.Philox(key)).uniform(size=len(series))
         by = low + np.rint(share * (high - low)).astype(np.int64)
     elif isinstance(latency, np.ndarray):
-        by, low, high = latency.astype(np.int64), int(latency.min(initial=0)), int(latency.max(initial=0))
+        if latency.dtype.kind not in "iu":
+            raise DeclarationError(
+                "latencies in an array are integer nanoseconds",
+                path=called,
+                expected="(n,) of a whole-number type",
+                got=f"dtype {latency.dtype}",
+                fix="round seconds once: np.rint(seconds * 1e9).astype(np.int64)",
+            )
+        low, high = int(latency.min(initial=0)), int(latency.max(initial=0))
+        by = latency.astype(np.int64)
     else:
         low = high = nanoseconds(latency, what="latency")
         by = np.full(len(series), low, np.int64)
@@ -73,6 +83,7 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
             got=repr(latency)[:80],
             fix='write delayed(series, "135ms")',
         )
+    _need_room(series, high + len(series), called)
     arrival = series.time + by
     order = np.argsort(arrival, kind="stable")
     moved, stamp = series[order], series.stamp[order]
@@ -81,6 +92,21 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
         count = np.arange(len(time))
         time = np.maximum.accumulate(time - count) + count
     return Series(time, moved.values, type=series.type, name=called, gaps=series.gaps, stamp=stamp)
+
+
+def _need_room(series: Series, by: int, path: str) -> None:
+    """Refuse to move the times of a series by so many ns where int64 does not hold them afterwards."""
+    times = (
+        [int(t) for t in (series.time.min(), series.time.max(), series.stamp.min())] if len(series) else []
+    )
+    if any(not NEVER < t + by < 2**63 for t in times):
+        raise DeclarationError(
+            "a time would be beyond what int64 nanoseconds hold",
+            path=path,
+            expected="times below 2^63 ns, 9.2e9 s, to either side of 0",
+            got=f"times from {min(times)} to {max(times)} ns, moved by {by} ns",
+            fix='check the units: a duration is written with its own, such as "135ms"',
+        )
 
 
 def delayed_flight(flight: Flight, settings: Mapping[str, Any], *, seed: int = 0) -> Flight:
@@ -166,38 +192,67 @@ def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
     return made
 
 
-def timeouts(series: Series, after: Any, *, until: int | None = None, name: str = "timeouts") -> Series:
+def timeouts(
+    series: Series, after: Any, *, start: int | None = None, until: int | None = None, name: str = "timeouts"
+) -> Series:
     """A source of the times at which a stream had not come for `after`: true, once in each silence.
+
+    A silence begins with each value, and with `start`: a stream that does not come within `after` of it, or
+    never, has a timeout there too.
 
     Args:
         series: the stream.
-        after: a duration such as "0.5s".
-        until: int64 ns, the last time at which it is looked; that of the last value, if left out.
+        after: a duration such as "0.5s", above 0.
+        start: int64 ns, from when the stream is awaited. Left out, from its first value; for a stream without
+            values from time 0, where recordings begin.
+        until: int64 ns, the last time at which it is looked. Left out, that of the last value: a stream
+            without values then has no timeout, as nobody says how long to wait.
+
+    Raises:
+        DeclarationError: for an `after` of 0 or less.
     """
     span = nanoseconds(after, what="after")
-    end = int(series.time[-1]) if until is None and len(series) else until
-    nexts = np.append(series.time[1:], np.int64(2**63 - 1))
-    due = series.time + span
-    silent = due[(due < nexts) & (due <= (NEVER if end is None else end))]
+    if span <= 0:
+        raise DeclarationError(
+            "a timeout comes after some time",
+            path=name,
+            expected="more than 0 ns",
+            got=repr(after),
+            fix='write timeouts(series, "0.5s")',
+        )
+    end = int(series.time[-1]) if until is None and len(series) else NEVER if until is None else int(until)
+    begin = 0 if start is None and not len(series) else start
+    awaited = series.time if begin is None else np.append(np.int64(begin), series.time[series.time > begin])
+    last = awaited <= end - span  # of what has its timeout by then; written so that no sum is beyond int64
+    due = awaited[last] + span
+    silent = due[due < np.append(awaited[1:], np.int64(2**63 - 1))[last]]
     return Series(silent, np.ones(len(silent), bool), name=name)
 
 
 def batched(series: Series, function: Callable[[Any], Any], *, name: str | None = None) -> Series:
     """What a function makes of a whole recording at once: a value for each of its values, at their times.
 
+    Each is true when what it was made of was: stamps are kept.
+
     Args:
         series: the recording.
         function: of all values, with the time axis in front, to as many.
     """
-    return Series(series.time, function(series.values), name=name or series.name, gaps=series.gaps)
+    stamp = series.stamp if series.is_late else None
+    made = function(series.values)
+    return Series(series.time, made, name=name or series.name, gaps=series.gaps, stamp=stamp)
 
 
 def replayed(series: Series, *, start: int, name: str | None = None) -> Series:
     """A recording as it is played again: its first value arrives at `start`, int64 ns, all else as far apart.
 
     What a run gave, or what `batched` made of it, so becomes a source of another run, or later of the same.
+
+    Raises:
+        DeclarationError: for a start from which a time is beyond what int64 nanoseconds hold.
     """
     by = int(start) - int(series.time[0]) if len(series) else 0
+    _need_room(series, by, name or series.name)
     stamp = series.stamp + by if series.is_late else None
     return Series(
         series.time + by,

@@ -248,6 +248,18 @@ def _prime_factors(n: int) -> Iterator[int]:
         yield n
 
 
+def root_of(clock: Clock) -> Clock:
+    """What a clock counts ticks of, in the end; itself, if it does not count."""
+    return root_of(clock.parent) if isinstance(clock, Counted) else clock
+
+
+def share_of_root(clock: Clock) -> Fraction:
+    """How many of the ticks of its root a clock has."""
+    if not isinstance(clock, Counted):
+        return Fraction(1)
+    return Fraction(len(clock.offsets), clock.period) * share_of_root(clock.parent)
+
+
 def clock_of(thing: object) -> Clock:
     """The clock of a stream, or the clock itself."""
     found = thing if isinstance(thing, Clock) else getattr(thing, "clock", None)

@@ -8,17 +8,20 @@ that look are sources (`ticks`, `timeouts`).
 
 from __future__ import annotations
 
+import math
 import typing
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from flowgraph.errors import DeclarationError, TypeMismatchError
 from flowgraph.language.block import Block, block, when
-from flowgraph.language.checks import need_reals, need_stream, need_streams, with_xp
-from flowgraph.language.clock import Clock, clock_of, nanoseconds
+from flowgraph.language.checks import need_count, need_reals, need_stream, need_streams, with_xp
+from flowgraph.language.clock import Clock, Source, clock_of, nanoseconds, root_of, share_of_root
 from flowgraph.language.graph import NEVER
+from flowgraph.language.queues import FULL, drop_first, empty_queue, push
 from flowgraph.language.stream import Stream
 from flowgraph.types import ArrayType, Type, flatten, leaves_of, tuple_type, unflatten, zeros
 
@@ -60,56 +63,71 @@ def _timed_type(types: list[Type], _: Any) -> Type:
     return tuple_type([ArrayType((), "int64", "ns"), types[0]])
 
 
-@block(name="resample_at", output=_timed_type, fault=("overflow", "two times were asked for between values"))
-def _between(state, x=None, asked=None, *, kind, turned, size, t, xp):  # type: ignore[no-untyped-def]
-    """Present when a value follows a time that was asked for. State: the last value, and what waits."""
-    waits, late = state["waits"], state["overflow"]
-    if x is None:
-        first = waits & (late == NEVER)
-        return {**state, "waits": np.True_, "asked": t, "overflow": xp.where(first, t, late)}, None
-    answered = waits & state["came"]
-    gap = xp.astype(xp.where(state["came"], t - state["at"], np.int64(1)), xp.float64)
-    share = xp.astype(xp.where(state["came"], state["asked"] - state["at"], np.int64(0)), xp.float64) / gap
-    value = _blend(state["last"], x, share, kind, turned, xp)
+@block(name="resample_at", output=_timed_type, fault=("overflow", "too many times wait for a value"))
+def _between(state, x=None, asked=None, *, kind, turned, size, full, t, xp):  # type: ignore[no-untyped-def]
+    """Present where a time in the queue has its value; takes the oldest. The known come first.
+
+    State: the last value and its time; a queue of (time that was asked for, value), of which the first
+    `known` have theirs. A full queue gives up its oldest, which is an overflow where `full` is "error".
+    """
+    queue, known, expired = state["queue"], state["known"], state["expired"]
+    if x is not None:
+        queue, known = _answered(state, x, kind, turned, t, xp), queue["count"]
+    if asked is not None:
+        came = state["came"] if x is None else xp.asarray(True)
+        queue = push(queue, [t, *flatten(state["last"] if x is None else x, kind)], came, xp)
+        known = known if x is None else known + np.int32(1)
+        expired = expired + xp.astype(~came, xp.int32)
+    ready = known > 0
+    taken = xp.astype(ready, xp.int32)
+    gone = xp.maximum(taken, queue["count"] - np.int32(size))
+    over = (gone > taken) & xp.asarray(full == "error") & (state["overflow"] == NEVER)
+    time, *leaves = (leaf[0, ...] for leaf in queue["items"])
     new = {
-        "last": x,
-        "at": t,
-        "came": np.True_,
-        "waits": np.False_ if asked is None else answered,
-        "asked": state["asked"] if asked is None else t,
-        "expired": state["expired"] + xp.astype(waits & ~state["came"], xp.int32),
-        "overflow": late,
+        "last": state["last"] if x is None else x,
+        "at": state["at"] if x is None else t,
+        "came": state["came"] if x is None else np.True_,
+        "queue": drop_first(queue, gone, xp),
+        "known": xp.maximum(known - gone, np.int32(0)),
+        "expired": expired + gone - taken,
+        "overflow": xp.where(over, t, state["overflow"]),
     }
-    if asked is None:
-        return new, when(answered, (state["asked"], value))
-    pairs = zip(flatten(value, kind), flatten(x, kind), strict=True)
-    chosen = unflatten(kind, iter([xp.where(answered, old, fresh) for old, fresh in pairs]))
-    return new, (xp.where(answered, state["asked"], t), chosen)
+    return new, when(ready, (time, unflatten(kind, iter(leaves))))
 
 
 @_between.init
-def _(x: Type, asked: Type, *, kind: Type, turned: Any, size: int) -> Any:
-    never, none = np.int64(NEVER), np.int64(0)
+def _(x: Type, asked: Type, *, kind: Type, turned: Any, size: int, full: str) -> Any:
+    none = np.int32(0)
     return {
         "last": zeros(kind),
-        "at": none,
+        "at": np.int64(0),
         "came": np.False_,
-        "waits": np.False_,
-        "asked": none,
-        "expired": np.int32(0),
-        "overflow": never,
+        "queue": empty_queue(tuple_type([ArrayType((), "int64"), kind]), size + 1),
+        "known": none,
+        "expired": none,
+        "overflow": np.int64(NEVER),
     }
 
 
-def _blend(a: Any, b: Any, share: Any, kind: Type, turned: tuple[bool, ...], xp: Any) -> Any:
-    """The value at `share` of the way from a to b: on a line, or for a quaternion along the arc."""
-    pairs = zip(flatten(a, kind), flatten(b, kind), turned, strict=True)
-    made = [_along_arc(p, q, share, xp) if arc else p + (q - p) * share for p, q, arc in pairs]
-    return unflatten(kind, iter(made))
+def _answered(state: Any, x: Any, kind: Type, turned: tuple[bool, ...], t: Any, xp: Any) -> dict[str, Any]:
+    """The queue, with what lies between the last value and `x` at each time in it that waited."""
+    queue = state["queue"]
+    times, *values = queue["items"]
+    place = xp.arange(times.shape[0], dtype=xp.int32)
+    waits = (place >= state["known"]) & (place < queue["count"])
+    gap = xp.astype(xp.where(state["came"], t - state["at"], np.int64(1)), xp.float64)
+    share = xp.astype(xp.where(waits, times - state["at"], np.int64(0)), xp.float64) / gap
+    made = [times]
+    for old, p, q, arc in zip(values, flatten(state["last"], kind), flatten(x, kind), turned, strict=True):
+        along = (len(times),) + (1,) * (old.ndim - 1)
+        part = xp.reshape(xp.astype(share, old.dtype), along)
+        found = _along_arc(p, q, part, xp) if arc else p + (q - p) * part
+        made.append(xp.where(xp.reshape(waits, along), found, old))
+    return {"items": tuple(made), "count": queue["count"]}
 
 
 def _along_arc(p: Any, q: Any, share: Any, xp: Any) -> Any:
-    """K. Shoemake, "Animating rotation with quaternion curves", 1985, by the shorter way."""
+    """(n, 4) at (n, 1) shares: K. Shoemake, "Animating rotation with quaternion curves", 1985."""
     dot = xp.sum(p * q)
     q = xp.where(dot < 0.0, -q, q)
     angle = xp.acos(xp.minimum(xp.abs(dot), xp.asarray(1.0)))
@@ -119,7 +137,7 @@ def _along_arc(p: Any, q: Any, share: Any, xp: Any) -> Any:
     first = xp.where(near, 1.0 - share, xp.sin((1.0 - share) * angle) / whole)
     second = xp.where(near, share, xp.sin(share * angle) / whole)
     mixed = first * p + second * q
-    norm = xp.sqrt(xp.sum(mixed * mixed))
+    norm = xp.sqrt(xp.sum(mixed * mixed, axis=1, keepdims=True))
     return mixed / xp.where(norm > 0.0, norm, 1.0)
 
 
@@ -145,23 +163,31 @@ def _ticks_of(at: object) -> Stream[Any]:
 
 
 def resample_at(
-    stream: Stream[Any], at: object, *, how: str = "linear", name: str | None = None
-) -> Stream[Any]:
+    stream: Stream[Any], at: object, *, how: str = "linear", size: int | None = None, full: str = "error",
+    name: str | None = None,
+) -> Stream[Any]:  # fmt: skip
     """The values of a stream at the ticks of a clock, each with its time: pairs (int64 ns, value).
 
-    Between two values, one is known when the second comes: the pair is present in that tick, which is later
-    than the time in it. At a time at which the stream itself has a value, that is taken, at once. Remembers
-    the last value and one time that waits; a second time between two values is an error that names the time.
-    A time before the first value is passed over, and counted in `run.stats` (`expired`).
+    Between two values, one is known when the second comes; at a time at which the stream itself has a value,
+    at once. A tick of either gives one pair, the oldest that is known: of ten times between two values the
+    first comes with the second value, and each other with a tick after it. So a pair is present in a tick
+    that may be later than the time in it, and pairs are never out of order. Remembers the last value, and up
+    to `size` times. A time before the first value is passed over, and counted in `run.stats` (`expired`).
 
     Args:
         stream: of real arrays, or signals or tuples of them; of any type where `how` is "hold".
         at: a stream or clock whose ticks are the times.
         how: "linear"; "slerp", where quaternions (leaves of four numbers called `attitude`, or a stream of
             nothing else) go along the arc; or "hold", the last value, which is known at once.
+        size: how many times may wait. Left out, as many as come in four periods of the stream (by its
+            `max_rate` where it is aperiodic), which is three lost values; at least 64, or 8 where both are
+            periodic, and at most 1024. Nothing waits for "hold".
+        full: what one more does: "error", or "drop_oldest", where the oldest is passed over and counted. A
+            live run raises the error once and goes on, with the oldest dropped from then on.
 
     Raises:
-        DeclarationError: for another `how`. TypeMismatchError: for "slerp" without a quaternion.
+        DeclarationError: for another `how` or `full`, or a size below 1. TypeMismatchError: for "slerp"
+            without a quaternion. FifoOverflowError: by a run, where more than `size` times wait.
     """
     operation = name or "resample_at"
     need_stream(operation, stream)
@@ -173,7 +199,17 @@ def resample_at(
             got=repr(how),
             fix='write how="linear"',
         )
+    if full not in FULL:
+        raise DeclarationError(
+            "this is not what a full queue can do",
+            path=operation,
+            expected=" or ".join(map(repr, FULL)),
+            got=repr(full),
+            fix='write full="drop_oldest" where the stream may fall silent',
+        )
     asked = _ticks_of(at)
+    room = _usual_size(stream.clock, asked.clock) if size is None else size
+    need_count(operation, "size", room, least=1)
     if how == "hold":
         return typing.cast("Stream[Any]", _held_at(stream, asked, kind=stream.type, name=name))
     need_reals(operation, stream)
@@ -190,8 +226,26 @@ def resample_at(
             got=str(stream.type),
             fix='write how="linear"',
         )
-    made = _between(stream, asked, kind=stream.type, turned=turned, size=1, name=name)
+    made = _between(stream, asked, kind=stream.type, turned=turned, size=room, full=full, name=name)
     return typing.cast("Stream[Any]", made)
+
+
+def _usual_size(stream: Clock, asked: Clock) -> int:
+    """How many times come in four steps of the stream, as far as the clocks tell."""
+    step, each = _step(stream), _step(asked)
+    count = 0 if step is None or each is None else math.ceil(4 * step / each)
+    roots = [root_of(stream), root_of(asked)]
+    steady = all(isinstance(root, Source) and root.timing.period for root in roots)
+    return min(max(8 if steady else 64, count), 1024)
+
+
+def _step(clock: Clock) -> Fraction | None:
+    """Nanoseconds between two ticks, in the mean or at the highest rate; None if unknown."""
+    root = root_of(clock)
+    if not isinstance(root, Source) or not (root.timing.period or root.timing.max_rate):
+        return None
+    step = root.timing.period or 1e9 / typing.cast(float, root.timing.max_rate)
+    return Fraction(step) / share_of_root(clock)
 
 
 # -- silence ---------------------------------------------------------------------------------------------

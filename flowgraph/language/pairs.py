@@ -11,7 +11,6 @@ from __future__ import annotations
 import builtins
 import math
 import typing
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from flowgraph.language.checks import need_streams
 from flowgraph.language.clock import Clock, Counted, Source, nanoseconds
 from flowgraph.language.graph import NEVER
 from flowgraph.language.joins import latest
-from flowgraph.language.queues import drop_first, empty_queue, push
+from flowgraph.language.queues import FULL, drop_first, empty_queue, push
 from flowgraph.language.stream import Stream
 from flowgraph.types import ArrayType, Type, flatten, tuple_type, unflatten
 
@@ -39,19 +38,6 @@ def _ranks(clock: Clock, root: Clock, ticks: int) -> list[int]:
         ]
     inner = _ranks(clock.parent, root, ticks)
     return [tick for number, tick in enumerate(inner) if number % clock.period in clock.offsets]
-
-
-def _rate(clock: Clock) -> Fraction:
-    """How many of the ticks of its root a clock has."""
-    return (
-        Fraction(len(clock.offsets), clock.period) * _rate(clock.parent)
-        if isinstance(clock, Counted)
-        else Fraction(1)
-    )
-
-
-def _root(clock: Clock) -> Clock:
-    return _root(clock.parent) if isinstance(clock, Counted) else clock
 
 
 def _over(root: Clock, clock: Clock) -> Clock:
@@ -71,11 +57,11 @@ def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
     Raises:
         ClockError: where the rates differ, are only nominally equal, or cannot be known.
     """
-    root = _root(a)
-    if root != _root(b) and clocks.equal(root, _root(b)):
+    root = clocks.root_of(a)
+    if root != clocks.root_of(b) and clocks.equal(root, clocks.root_of(b)):
         b = _over(root, b)  # one clock by two names
-    if root != _root(b):
-        sources = [c for c in (root, _root(b)) if isinstance(c, Source)]
+    if root != clocks.root_of(b):
+        sources = [c for c in (root, clocks.root_of(b)) if isinstance(c, Source)]
         rates = {f"{c.timing.period}" for c in sources if c.timing.period is not None}
         same = len(sources) == 2 and len(rates) == 1 and all(c.timing.period for c in sources)
         raise ClockError(
@@ -89,7 +75,7 @@ def _zip_plan(a: Clock, b: Clock, label: str) -> tuple[int, Clock]:
             + ("" if same else ", or hold one with latest(b, init=...)"),
         )
     span = math.lcm(_span(a), _span(b))
-    of_a, of_b = (_rate(clock) * 2 * span for clock in (a, b))
+    of_a, of_b = (clocks.share_of_root(clock) * 2 * span for clock in (a, b))
     if of_a != of_b:
         raise ClockError(
             "the rates are unequal, so a queue would grow without bound",
@@ -250,8 +236,6 @@ def _(a: Type, b: Type, *, tolerance: int, size: int, full: str, types: Any) -> 
 
 _EMPTY_SLOT_AGE = 2**62  # ns: older than any tolerance, so an empty slot is never near
 _LONGEST_QUEUE = 2**24
-FULL = ("error", "drop_oldest")
-"""What a value does that finds the queue of a match full."""
 
 
 def _distances(queue: dict[str, Any], t: Any, xp: Any) -> tuple[Any, Any]:

@@ -11,6 +11,9 @@ import numpy as np
 
 from flowgraph.types import Type, flatten, zeros
 
+FULL = ("error", "drop_oldest")
+"""What a value does that finds a queue full."""
+
 
 def empty_queue(type_: Type, size: int) -> dict[str, Any]:
     """An empty queue with room for `size` values of a type."""

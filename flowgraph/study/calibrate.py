@@ -85,7 +85,7 @@ def calibrate(
     fits = [replace(f, scale="linear") if placed(f.name) else f for f in fits]
     if measure not in MEASURES:
         raise UnknownNameError("measure", measure, MEASURES, path="calibrate")
-    check_fits(graph, fits, recordings, (), settings)
+    check_fits(graph, fits, recordings, (), settings, verb="calibrate")
     problem = Trials(graph, recordings, settings, measure, metric, engine, [f.name for f in fits])
     offsets = [f for f in fits if f.name.rpartition(".")[2] == OFFSET]
     others = [f for f in fits if f not in offsets]

@@ -16,6 +16,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -199,10 +200,10 @@ def start_of_fit(graph: str, fit: Fit) -> Parameter:
     return 0.5 * (fit.low + fit.high) if fit.scale == "linear" else math.sqrt(fit.low * fit.high)
 
 
-def _wrong(place: str, expected: str, got: object) -> DeclarationError:
+def _wrong(place: str, expected: str, got: object, *, verb: str = "tune") -> DeclarationError:
     return DeclarationError(
-        "this cannot be tuned",
-        path=f"tune, {place}",
+        f"this cannot be {verb.removesuffix('e')}ed",
+        path=f"{verb}, {place}",
         expected=expected,
         got=repr(got),
         fix=f"mend {place}",
@@ -224,17 +225,21 @@ def _check(
 
 def check_fits(
     graph: str, fits: Sequence[Fit], recordings: Sequence[Recording], held_out: Sequence[Recording],
-    settings: Mapping[str, Value],
+    settings: Mapping[str, Value], *, verb: str = "tune",
 ) -> None:  # fmt: skip
     """Refuse what cannot be sought: bounds that are none, what is no parameter of a filter or of its sensors.
+
+    Args:
+        verb: what the caller does with them, for messages: "tune" or "calibrate".
 
     Raises:
         DeclarationError, UnknownNameError: naming the parameter.
     """
+    wrong = partial(_wrong, verb=verb)
     if not fits:
-        raise _wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
+        raise wrong("fit", "one parameter or more, such as position_noise=0.001:0.1", "none")
     if not recordings:
-        raise _wrong("data", "one recording or more", "none")
+        raise wrong("data", "one recording or more", "none")
     prepare = find_graph(graph).prepare
     for fit in fits:
         numbers = [fit.low, fit.low if fit.start is None or np.ndim(fit.start) else fit.start, fit.high]
@@ -243,14 +248,21 @@ def check_fits(
             least < fit.low < fit.high and fit.low <= numbers[1] <= fit.high
         ):
             expected = "0 < low" if fit.scale == "log" else "low"
-            raise _wrong(f"fit {fit.name}", f"{expected} <= start <= high, low < high", fit)
+            begun = "" if fit.start is None else f", start {fit.start}"
+            raise DeclarationError(
+                "these are no bounds to search between",
+                path=fit.name,
+                expected=f"{expected} <= start <= high, low < high",
+                got=f"low {fit.low}, high {fit.high}{begun}",
+                fix=_bounds_mended(fit),
+            )
         matrix = start_of_fit(graph, fit)
         if np.ndim(matrix) == 2 and not _is_covariance(matrix):
-            raise _wrong(f"fit {fit.name}", "a start that is a covariance", matrix)
+            raise wrong(f"fit {fit.name}", "a start that is a covariance", matrix)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
-            raise _wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
+            raise wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
         if fit.name in getattr(prepare, "scoring", ()):
-            raise _wrong(
+            raise wrong(
                 f"fit {fit.name}", "a setting of the filter; this one changes how a run is scored", fit.name
             )
         if placed(fit.name):
@@ -259,9 +271,18 @@ def check_fits(
                     raise UnknownNameError("setting", fit.name, flight_settings(r.data), path=r.data)
             continue
         if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
-            raise _wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
+            raise wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
         if prepare is not None:
             parsed_settings(prepare, {fit.name: text(start_of_fit(graph, fit))}, also=(), path=graph)
+
+
+def _bounds_mended(fit: Fit) -> str:
+    numbers = all(isinstance(x, int | float) and math.isfinite(x) for x in (fit.low, fit.high))
+    if numbers and fit.low > fit.high and (fit.scale == "linear" or fit.high > 0.0):
+        return f"swap the bounds: low {fit.high}, high {fit.low}"
+    if numbers and fit.scale == "log" and fit.low <= 0.0:
+        return "give bounds above 0: what is searched by its logarithm is positive"
+    return "give two finite numbers, the lower one first, and a start between them or none"
 
 
 def _is_covariance(value: Parameter) -> bool:

@@ -193,6 +193,61 @@ def test_timeouts_are_ticks_of_their_own():
     assert len(timeouts(s[:0], "5ms")) == 0
 
 
+def test_a_stream_that_never_comes_has_its_timeout():
+    s = Series(np.array([10, 50]) * MS, np.zeros(2))
+    assert (timeouts(s[:0], "15ms", until=100 * MS).time // MS).tolist() == [15]
+    assert (timeouts(s[:0], "15ms", start=-40 * MS, until=100 * MS).time // MS).tolist() == [-25]
+    assert len(timeouts(s[:0], "15ms", until=14 * MS)) == 0
+    assert (timeouts(s, "15ms", start=-10 * MS).time // MS).tolist() == [5, 25]
+    assert (timeouts(s, "15ms", start=0).time // MS).tolist() == [25]
+    assert (timeouts(s, "15ms", start=20 * MS, until=70 * MS).time // MS).tolist() == [35, 65]
+    assert len(timeouts(s, 2**63 - 1, until=2**63 - 1)) == 0  # no sum is beyond int64
+    assert timeouts(s, "1ms", until=-5).time.tolist() == []
+
+
+@pytest.mark.parametrize("after", [0, -5, "0s"])
+def test_a_timeout_after_no_time_is_refused(after):
+    with pytest.raises(DeclarationError, match="a timeout comes after some time"):
+        timeouts(FIX, after)
+
+
+@pytest.mark.parametrize("given", [[0.1] * 8, [0] * 7 + [0.5], [float("nan")] * 8, [True] * 8])
+def test_latencies_in_an_array_are_whole_nanoseconds(given):
+    with pytest.raises(DeclarationError, match="latencies in an array are integer nanoseconds"):
+        delayed(FIX, np.array(given))
+
+
+def test_an_array_of_any_whole_numbers_delays():
+    late = delayed(FIX, np.full(8, 5 * MS, np.uint32))
+    assert (late.time - late.stamp == 5 * MS).all()
+    assert (delayed(FIX[:0], "5ms").time == FIX[:0].time).all()
+    with pytest.raises(DeclarationError, match="beyond what int64 nanoseconds hold"):
+        delayed(FIX, np.full(8, 2**63, np.uint64))
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        lambda: delayed(Series([9 * 10**18], [1.0]), "1000000000s"),
+        lambda: delayed(Series([2**63 - 7], [1.0]), ("0ns", "100ns")),
+        lambda: replayed(FIX, start=2**63 - 5),
+        lambda: replayed(delayed(FIX, "5ms"), start=-(2**63) + 5),
+    ],
+)
+def test_no_time_wraps_around(moved):
+    with pytest.raises(DeclarationError, match="a time would be beyond what int64 nanoseconds hold"):
+        moved()
+
+
+def test_what_is_made_of_late_values_is_late():
+    late = delayed(FIX, ("0ms", "100ms"), seed=3)
+    doubled = batched(late, lambda v: 2 * v)
+    assert (doubled.time == late.time).all()
+    assert (doubled.stamp == late.stamp).all()
+    assert (simulate(aged.build(), {"imu": IMU, "fix": doubled})["age"].value == late.time - late.stamp).all()
+    assert not batched(FIX, lambda v: 2 * v).is_late
+
+
 def test_a_recording_is_worked_on_whole_and_played_again():
     smooth = batched(FIX, lambda v: v - v.mean())
     assert smooth.value.sum() == 0.0

@@ -145,7 +145,7 @@ BUILD: dict[str, Callable[..., Any]] = {
     "high_pass": lambda n, a: high_pass(a, **_share(n)),
     "delta_time": lambda n, a: delta_time(a).map(lambda v: 1.0 * v),  # seconds fit no other unit
     "integrate": lambda n, a: integrate(a, rule=n["rule"]),
-    "resample": lambda n, a, b: resample_at(a, b, how=n["how"]).map(
+    "resample": lambda n, a, b: resample_at(a, b, how=n["how"], size=n["size"], full=n["full"]).map(
         lambda p, *, xp: p[1] + 1e-6 * xp.astype(p[0], xp.float64)
     ),
     "absent": lambda n, a, at: absent_for(a, 6 * MS, at=at).map(lambda v, *, xp: xp.astype(v, xp.float64)),

@@ -282,23 +282,25 @@ class Meaning:
                 else:
                     made.append((t, last(a, t, None) + t))
             return made
-        waits = None
+        waits: list[int] = []
         for t in times(a, b):
-            here, asked, before = at(a, t), at(b, t), [e for e in a if e[0] < t]
-            if not here:
-                if waits is not None and (self.full is None or t < self.full):
+            if at(b, t):
+                if last(a, t, None) is None:
+                    self.counts["expired"] += 1
+                else:
+                    waits.append(t)
+            if waits and any(waits[0] <= u <= t for u, _ in a):
+                asked = waits.pop(0)
+                u, v = [e for e in a if e[0] <= asked][-1]
+                if u < asked:
+                    w, x = next(e for e in a if e[0] > asked)
+                    v = v + (x - v) * ((asked - u) / (w - u))
+                made.append((t, v + asked))
+            if len(waits) > n["size"]:
+                waits.pop(0)
+                self.counts["expired"] += 1
+                if n["full"] == "error" and (self.full is None or t < self.full):
                     self.full = t
-                waits = t
-            elif waits is not None and before:
-                u, v = before[-1]
-                share = (waits - u) / (t - u)
-                made.append((t, v + (here[0] - v) * share + waits))
-                waits = t if asked else None
-            else:
-                self.counts["expired"] += waits is not None
-                waits = None
-                if asked:
-                    made.append((t, here[0] + t))
         return made
 
     def do_stamp(self, n, a):

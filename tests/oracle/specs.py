@@ -198,7 +198,12 @@ KINDS: dict[str, Callable[[Draw, str], None]] = {
     "high_pass": _one("high_pass", tau=_tau),
     "delta_time": _one("delta_time"),
     "integrate": _one("integrate", rule=lambda d: d.random.choice(("rectangle", "trapezoid"))),
-    "resample": _two("resample", how=lambda d: d.random.choice(("linear", "hold"))),
+    "resample": _two(
+        "resample",
+        how=lambda d: d.random.choice(("linear", "hold")),
+        size=lambda d: d.random.randint(1, 6),
+        full=lambda d: d.random.choice(("error", "drop_oldest", "drop_oldest")),
+    ),
     "absent": _window,
     "label": _one("label"),
     "stamp": _stamp,

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from flowgraph import Flight, Series, load_flight
 from flowgraph.blocks.signals import Position
 from flowgraph.cli import app
+from flowgraph.errors import DeclarationError
 from flowgraph.graphs.gnss_ins import gnss_ins
 from flowgraph.study.calibrate import _apart, calibrate
 from flowgraph.study.guess import Guess, _by_vectors, guess_offset
@@ -164,3 +165,34 @@ def test_a_noise_is_found_as_by_tune():
     )  # fmt: skip
     assert set(found.parameters) == {"gyro_factor"}
     assert found.evaluations >= 1
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "tune"])
+@pytest.mark.parametrize(
+    ("given", "fix"),
+    [
+        ("vicon.lever=0.2:-0.2", "vicon.lever=-0.2:0.2"),
+        ("X=0.2:-0.2", "X=-0.2:0.2"),
+        ("gyro_factor=2:0.5:1", "gyro_factor=0.5:2:1"),
+        ("gyro_factor=0.5:2:7", "gyro_factor=0.5:2"),
+        ("gyro_factor=1:1", "NAME=LOW:HIGH"),
+        ("gyro_factor=nan:1", "NAME=LOW:HIGH"),
+    ],
+)
+def test_bounds_the_wrong_way_round_are_told_by_their_option(verb, given, fix):
+    option = {"calibrate": "--find", "tune": "--fit"}[verb]
+    done = RUNNER.invoke(app, [verb, "ekf", "--data", "sim", option, given])
+    assert done.exit_code == 2
+    name = given.partition("=")[0]
+    assert f"error: {option} {name}: these are no bounds to search between" in done.output
+    assert f"write {option} {fix}\n" in done.output
+    assert f"'{given}'" in done.output
+    assert "Fit(" not in done.output
+
+
+def test_what_calibrate_refuses_is_said_in_its_name():
+    with pytest.raises(DeclarationError, match="calibrate, fit gyro_factor: this cannot be calibrated"):
+        calibrate("ekf", [Fit("gyro_factor", 0.5, 2.0)] * 2, [Recording("sim")])
+    with pytest.raises(DeclarationError, match=r"vicon.lever: these are no bounds") as refused:
+        calibrate("ekf", [Fit("vicon.lever", 0.2, -0.2)], [Recording("sim")])
+    assert refused.value.fix == "swap the bounds: low -0.2, high 0.2"

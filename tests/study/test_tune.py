@@ -154,8 +154,11 @@ BAD = [
     ({"fits": []}, "fit"),
     ({"recordings": []}, "data"),
     ({"held_out": [Recording("sim")]}, "held out"),
-    ({"fits": [Fit("position_noise", 0.1, 0.01)]}, "low"),
-    ({"fits": [Fit("position_noise", 0.0, 0.01)]}, "low"),
+    ({"fits": [Fit("position_noise", 0.1, 0.01)]}, "swap the bounds: low 0.01, high 0.1"),
+    ({"fits": [Fit("position_noise", 0.0, 0.01)]}, "give bounds above 0"),
+    ({"fits": [Fit("position_noise", 0.2, -0.2)]}, "low 0.2, high -0.2"),
+    ({"fits": [Fit("position_noise", float("nan"), 1.0)]}, "give two finite numbers"),
+    ({"fits": [Fit("position_noise", "a", 1.0)]}, "give two finite numbers"),  # type: ignore[arg-type]
     ({"fits": [Fit("position_noise", 0.01, 0.1, 0.2)]}, "start"),
     ({"fits": [Fit("position_noise", 0.01, 0.1)] * 2}, "once"),
     ({"fits": [Fit("duration", 1.0, 2.0)]}, "flight"),
