@@ -6,6 +6,8 @@ are made by units beside, which are given numbers brought to full length.
 
 from __future__ import annotations
 
+import abc
+
 import numpy as np
 
 from flowgraph.engines.fixed import integers as z
@@ -13,7 +15,7 @@ from flowgraph.engines.verilog.nodes import Nodes, Term
 from flowgraph.errors import LoweringError
 
 
-class Functions(Nodes):
+class Functions(Nodes, abc.ABC):
     """Nodes that know functions of one element."""
 
     @property
@@ -149,8 +151,10 @@ class Functions(Nodes):
         on_axis = self.sum([Term("SEL", half, behind)])
         return self.sum([Term("SEL", on_axis, flat), Term("SELN", value, flat)])
 
+    @abc.abstractmethod
     def compared(self, op: str, a: int, b: int, p: int, q: int) -> int:
-        raise NotImplementedError
+        """Whether a `op` b, where their fractions differ by p and q."""
 
+    @abc.abstractmethod
     def chosen(self, c: int, a: int, b: int, p: int = 0, q: int = 0, mode: str = "FIT") -> int:
-        raise NotImplementedError
+        """a where c is true, else b, shifted by p and q."""
