@@ -1,4 +1,4 @@
-"""`calibrate`: time offsets, levers and mounts of sensors, found by the likelihood of a filter."""
+"""`calibrate`: time offsets, levers and mounts of sensors, found by what a filter makes of them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,13 @@ def calibrate(
         ),
     ],
     seed: Annotated[int, typer.Option(min=0, help="Of simulated flights.")] = 0,
-    by: Annotated[str, typer.Option(help="likelihood of the innovations, or error")] = "likelihood",
+    by: Annotated[
+        str | None,
+        typer.Option(
+            help="likelihood of the innovations, or error; if left out, the error for the clock of a"
+            " recording with a truth of its own, else the likelihood"
+        ),
+    ] = None,
     metric: Annotated[str | None, typer.Option(help="The error; the score's first if left out.")] = None,
     engine: Annotated[str, typer.Option(help="That plays the filter.")] = "c",
     most: Annotated[int, typer.Option(min=1, help="Points to try in a search, about.")] = 200,

@@ -1,4 +1,8 @@
-"""Calibration: when a sensor was read, where it sits and how it is turned, by the likelihood of a filter.
+"""Calibration: when a sensor was read, where it sits and how it is turned, by what a filter makes of it.
+
+Levers, mounts and noises are found by the likelihood of the innovations. So is an offset, unless there is a
+truth that it does not move: the clock that matters is then that of the truth, by which the filter is judged,
+and where the likelihood says another, that of the inertial unit, it is said.
 
 A time offset moves events past each other, so a likelihood has steps in it, as fine as the periods of the
 sensors. It is therefore begun where two streams see the same motion (`guess`), or at the best of a grid, and
@@ -17,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.notes import note
-from flowgraph.errors import UnknownNameError
+from flowgraph.errors import DataError, UnknownNameError
+from flowgraph.pipeline.digests import digest
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter
 from flowgraph.study.guess import Guess, guess_offset
 from flowgraph.study.search import Search
@@ -32,6 +37,7 @@ _POINTS, _WIDTHS = 13, (0.03, 0.02)
 """Of a parabola, and how far it reaches to both sides, s: first and then."""
 
 _GRID = 11
+_ONE_CLOCK = 0.003  # s, within which two measures tell of one
 _APART = 0.05  # s, between clocks that are not the same
 
 
@@ -60,7 +66,7 @@ def calibrate(
     fits: Sequence[Fit],
     recordings: Sequence[Recording],
     *,
-    measure: str = "likelihood",
+    measure: str | None = None,
     metric: str | None = None,
     settings: Mapping[str, Value] | None = None,
     engine: str = "reference",
@@ -74,7 +80,8 @@ def calibrate(
         fits: what to find; STREAM.time_offset (s), STREAM.lever (m), STREAM.mount (rotation vector, degrees)
             between bounds, each component; or a noise.
         recordings: to fit to.
-        measure: "likelihood", or "error" against the truth, whose clock an offset is then of.
+        measure: "likelihood", or "error" against the truth, whose clock an offset is then of. None: the
+            error for offsets where every recording has a truth that they do not move, else the likelihood.
         metric, settings, engine, most, watch: as of `tune`.
 
     Raises:
@@ -83,14 +90,16 @@ def calibrate(
     """
     settings = dict(settings or {})
     fits = [replace(f, scale="linear") if placed(f.name) else f for f in fits]
-    if measure not in MEASURES:
+    if measure is not None and measure not in MEASURES:
         raise UnknownNameError("measure", measure, MEASURES, path="calibrate")
     check_fits(graph, fits, recordings, (), settings, verb="calibrate")
-    problem = Trials(graph, recordings, settings, measure, metric, engine, [f.name for f in fits])
+    names = [f.name for f in fits]
+    problem = Trials(graph, recordings, settings, measure or "likelihood", metric, engine, names)
     offsets = [f for f in fits if f.name.rpartition(".")[2] == OFFSET]
     others = [f for f in fits if f not in offsets]
     found: dict[str, Parameter] = {f.name: start_of_fit(graph, f) for f in fits}
-    tried = _Tried(problem, watch)
+    of_truth = measure is None and bool(offsets) and _truth_stays(problem, offsets)
+    tried = _Tried(problem.by("error") if of_truth else problem, watch)
     notes: list[str] = []
     guesses: dict[str, Guess] = {}
     for f in offsets:
@@ -118,7 +127,7 @@ def calibrate(
                 notes.append(note("warning", f"{f.name} ended at its {side} bound: widen it"))
             elif not inside and width == widths[-1]:
                 notes.append(
-                    note("warning", f"{f.name}: the {measure} has no peak near {value:.4g} s: it is a guess")
+                    note("warning", f"{f.name}: the {tried.measure} says no place near {value:.4g} s: it is a guess")
                 )
         if others:
             fixed = {f.name: found[f.name] for f in offsets}
@@ -134,7 +143,37 @@ def calibrate(
             if width == widths[-1]:
                 ends = ended.at_bound.items()
                 notes += [note("warning", f"{n} ended at its {side} bound: widen it") for n, side in ends]
-    return Calibrated(graph, found, deviations, tried.count, guesses, tuple(dict.fromkeys(notes)))
+    count = tried.count
+    if of_truth:
+        likely = _Tried(problem, watch)
+        notes += [w for f in offsets for w in _other_clock(f, found, deviations[f.name], likely)]
+        count += likely.count
+    return Calibrated(graph, found, deviations, count, guesses, tuple(dict.fromkeys(notes)))
+
+
+def _truth_stays(problem: Trials, offsets: Sequence[Fit]) -> bool:
+    """Whether every recording has a truth that the offsets do not move."""
+    moved = problem.at({f.name: f.low for f in offsets}).flights
+    return all(
+        here.truth is not None and there.truth is not None and digest(here.truth) == digest(there.truth)
+        for here, there in zip(problem.flights, moved, strict=True)
+    )
+
+
+def _other_clock(
+    f: Fit, found: Mapping[str, Parameter], deviation: float | None, likely: _Tried
+) -> list[str]:
+    """A note where the likelihood says another offset than the truth."""
+    here = float(found[f.name])
+    try:
+        there, spread, inside = _vertex(f, _WIDTHS[-1], found, likely)
+    except DataError:
+        return []  # without innovations there is nothing to say
+    sure = math.hypot(deviation or 0.0, spread or 0.0)
+    if not inside or abs(there - here) <= max(3.0 * sure, _ONE_CLOCK):
+        return []
+    said = f"{f.name}: the truth says {here:.4f} s, the likelihood {there:.4f} s"
+    return [note("info", f"{said}: the clock of the truth is not the inertial unit's")]
 
 
 def _apart(
@@ -154,6 +193,7 @@ class _Tried:
     def __init__(self, problem: Trials, watch: Any) -> None:
         self.problem, self.count, self._watch = problem, 0, watch
         self._places = range(len(problem.recordings))
+        self.measure = problem.measure
 
     def along(self, name: str, values: np.ndarray, rest: Mapping[str, Parameter]) -> np.ndarray:
         """The mean measure (n,) at values of one parameter, the others as they are."""
@@ -190,6 +230,6 @@ def _vertex(
     vertex = -p[1] / (2.0 * p[0])
     J = np.array([p[1] / (2.0 * p[0] ** 2), -1.0 / (2.0 * p[0])])
     rough = float(J @ spread[:2, :2] @ J)
-    if tried.problem.measure == "likelihood":  # of an error the curve tells no probability
+    if tried.measure == "likelihood":  # of an error the curve tells no probability
         rough += 1.0 / (2.0 * p[0] * max(tried.counted({**found, f.name: middle + vertex}), 1.0))
     return float(middle + vertex), math.sqrt(rough), True

@@ -120,6 +120,12 @@ class Trials:
         other._moved = OrderedDict()
         return other
 
+    def by(self, measure: str) -> Trials:
+        """The same by another measure."""
+        other = copy.copy(self)
+        other.measure = measure
+        return other
+
     def _flight(self, place: int, point: Mapping[str, Parameter]) -> Flight:
         """The flight of a recording, with those of its own settings that a point names."""
         one = self.recordings[place]
