@@ -47,11 +47,11 @@ docs: $(VENV)/.with-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file $(firstword $(wildcard mkdocs.yml docs/mkdocs.yml) mkdocs.yml) \
 		--site-dir $(CURDIR)/out/site
 
-# The site of this version beside those of earlier ones, on the local branch `site`: publish that.
+# The site of this version beside those of earlier ones, on the local branch `gh-pages`: publish that.
 site: $(VENV)/.with-docs
-	PATH="$(CURDIR)/$(BIN):$$PATH" NO_MKDOCS_2_WARNING=1 mike deploy --branch site --update-aliases \
+	PATH="$(CURDIR)/$(BIN):$$PATH" NO_MKDOCS_2_WARNING=1 mike deploy --update-aliases \
 		$$($(BIN)/python -c 'from importlib.metadata import version; print(version("flowgraph-filters"))') latest
-	$(BIN)/mike set-default --branch site latest
+	$(BIN)/mike set-default latest
 
 # In a copy, so that what npm installs is no part of the package.
 front: out/front/.with-node
