@@ -137,7 +137,7 @@ class UnknownNameError(FlowgraphError):
             path=path,
             expected="one of " + ", ".join(names) if names else f"no {kind} exists here",
             got=repr(said),
-            fix=f"did you mean {near[0]!r}?" if near else f"use one of the {kind} names above",
+            fix=f"did you mean {near[0]!r}?" if near else "use one of the names above",
         )
         self.valid = names
 
