@@ -66,7 +66,7 @@ class Series:
         stamps = _array(time, name)
         if stamps.dtype.kind in "mM":
             stamps = _from_dates(stamps, name)
-        if stamps.dtype.kind not in "iu":
+        if stamps.size and stamps.dtype.kind not in "iu":
             raise DataError(
                 "times must be integer nanoseconds",
                 path=name,
