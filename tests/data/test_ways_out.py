@@ -140,6 +140,7 @@ def test_a_stream_without_values_is_a_topic_without_messages(shape, tmp_path):
     )
     with open(tmp_path / "a", "rb") as stream:
         found = [channel.topic for _, channel, _ in reader.make_reader(stream).iter_messages()]
+        stream.seek(0)
         topics = {c.topic for c in reader.make_reader(stream).get_summary().channels.values()}
     assert found == ["/one"]
     assert topics == {"/none", "/one"}
