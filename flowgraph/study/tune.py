@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.registry import find_graph, flight_settings
-from flowgraph.data.settings import parsed_settings, text
+from flowgraph.data.settings import keyword_types, parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter
@@ -281,7 +281,11 @@ def check_fits(
                     raise UnknownNameError("setting", fit.name, flight_settings(r.data), path=r.data)
             continue
         if of_flight:
-            raise wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
+            own = ", ".join(keyword_types(prepare)) if prepare is not None else "of the graph"
+            raise wrong(
+                f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name,
+                fix=f"choose one of {own}",
+            )  # fmt: skip
         if prepare is not None:
             parsed_settings(prepare, {fit.name: text(start_of_fit(graph, fit))}, also=(), path=graph)
 
