@@ -61,7 +61,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         position_noise, velocity_noise: m and m/s, standard deviations of fixes that bring no covariance; the
             flight's own if left out.
         estimate: what is estimated beside pose, velocity and biases, of lever, gyro_scale,
-            accelerometer_scale, time_offset and height_offset, joined by +, or none. If left out, the lever
+            accelerometer_scale, time_offset and height_offset, joined by +, or none. With auto the lever
             and the time offset where fixes are good to half a metre and nobody says the lever; and the level
             of a barometer.
         compass_noise: rad, of the heading by a magnetometer.
@@ -77,7 +77,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
 
     position_noise: Positive | None = None
     velocity_noise: Positive | None = None
-    estimate: str | None = None
+    estimate: str = "auto"
     compass_noise: Positive = 0.1
     declination: float | None = None
     date: str | None = None
@@ -199,7 +199,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         Raises:
             UnknownNameError: for what cannot be.
         """
-        if self.estimate is not None:
+        if self.estimate != "auto":
             names = [n.strip() for n in self.estimate.split("+") if n.strip() not in ("", "none")]
             for name in names:
                 if name not in PARAMETERS:
