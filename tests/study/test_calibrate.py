@@ -97,7 +97,7 @@ def test_what_is_sought_is_not_estimated_by_the_filter_as_well():
     assert set(within) - set(gnss_ins.case(sought).graph.settings["estimated"]) == {"time_offset"}
 
 
-def test_recordings_of_another_clock_are_named():
+def test_recordings_of_another_clock_are_named_and_left_out():
     told = [
         Guess(0.12, 0.95, "x"),
         Guess(0.13, 0.95, "x"),
@@ -105,8 +105,14 @@ def test_recordings_of_another_clock_are_named():
         Guess(0.9, 0.1, "x"),
         None,
     ]
-    (said,) = _apart("rtk.time_offset", [Recording(f"csv:{k}") for k in range(5)], told, 0.12)
+    names = [Recording(f"csv:{k}") for k in range(5)]
+    (said,), left = _apart("rtk.time_offset", names, told, 0.12)
     assert "csv:2 says 0.24 s" in said
+    assert said.endswith("it is left out")
+    assert left == {2}
+    notes, left = _apart("rtk.time_offset", names[:2], [told[0], told[2]], 0.18)
+    assert len(notes) == 2
+    assert not left, "of two nobody knows which"
 
 
 def test_what_cannot_be_calibrated_is_refused():
