@@ -208,8 +208,9 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         found = []
         if "gnss" in inputs and not lever and _good(inputs["gnss"]):
             if f"{name}.time_offset" in on.flight.info.get("sought", ()):
-                found.append("lever")
-                on.note("assumed", "nobody says where the antenna sits: it is estimated")
+                # a lever along the way is a delay: which of the two it is, straight flights do not tell
+                said = "it is taken for the unit's place, while its clock is sought"
+                on.note("assumed", f"nobody says where the antenna sits: {said}")
             else:
                 found += ["lever", "time_offset"]
                 said = "nobody says where the antenna sits and how late it is: both are estimated"

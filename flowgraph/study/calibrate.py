@@ -21,12 +21,14 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.notes import note
+from flowgraph.data.series import Flight
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.pipeline.digests import digest
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter
 from flowgraph.study.guess import Guess, guess_offset
 from flowgraph.study.search import Search
 from flowgraph.study.spec import Value
+from flowgraph.study.tasks import loaded
 from flowgraph.study.trials import Recording, Trials
 from flowgraph.study.tune import MEASURES, check_fits, placed, start_of_fit
 
@@ -103,9 +105,10 @@ def calibrate(
     notes: list[str] = []
     guesses: dict[str, Guess] = {}
     left: set[int] = set()
+    whole = _unthinned(problem, settings) if offsets else []
     for f in offsets:
         stream = f.name.rpartition(".")[0]
-        told = [guess_offset(flight, stream, f.low, f.high) for flight in problem.flights]
+        told = [guess_offset(flight, stream, f.low, f.high) for flight in whole]
         known = [g for g in told if g is not None and g.sure]
         if known:
             guesses[f.name] = known[0]
@@ -158,6 +161,14 @@ def calibrate(
         notes += [w for f in offsets for w in _other_clock(f, found, deviations[f.name], likely)]
         count += likely.count
     return Calibrated(graph, found, deviations, count, guesses, tuple(dict.fromkeys(notes)))
+
+
+def _unthinned(problem: Trials, settings: Mapping[str, Value]) -> list[Flight]:
+    """The flights with all their rows: what streams tell of one motion needs more than an aid may be."""
+    kept = {name: value for name, value in settings.items() if name.rpartition(".")[2] != "every"}
+    if len(kept) == len(settings):
+        return problem.flights
+    return [loaded(one.data, one.seed, kept) for one in problem.recordings]
 
 
 def _truth_stays(problem: Trials, offsets: Sequence[Fit]) -> bool:
