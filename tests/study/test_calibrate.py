@@ -14,7 +14,7 @@ from flowgraph.blocks.signals import Position
 from flowgraph.cli import app
 from flowgraph.errors import DeclarationError
 from flowgraph.graphs.gnss_ins import gnss_ins
-from flowgraph.study.calibrate import _apart, _truth_stays, calibrate
+from flowgraph.study.calibrate import _apart, _truth_stays, _unthinned, calibrate
 from flowgraph.study.guess import Guess, _by_vectors, guess_offset
 from flowgraph.study.tasks import prepared
 from flowgraph.study.trials import Trials
@@ -104,8 +104,8 @@ def test_a_thinned_aid_is_begun_with_by_all_its_rows():
 @pytest.mark.slow
 @pytest.mark.parametrize(("flown", "seconds"), [((17, 21), -0.34), ((23,), -0.61)])
 def test_the_likelihood_of_a_session_finds_its_clock(flown, seconds):
-    """With the antenna taken for the unit's place and a fix a second, between which the unit must foretell the
-    way."""
+    """The antenna is taken for the place of the unit, which must foretell the way from one fix of a second to
+    the next."""
     folder = recordings("outdoor_quadrotor")
     found = calibrate(
         "gnss_ins", [Fit("rtk.time_offset", -1.0, 1.0)],
