@@ -127,7 +127,8 @@ def as_table(estimate: Series, origin: Origin | None = None) -> str:
     """Every tick as a row of csv: geodetic, north-east-down about the origin, and Earth-centred; without an
     origin north-east-down alone."""
     enu = estimate["position"]
-    numbers, head = np.stack([enu[:, 1], enu[:, 0], -enu[:, 2]], axis=-1), (_HEAD[0], *_HEAD[4:7])
+    numbers = np.stack([enu[:, 1], enu[:, 0], -enu[:, 2]], axis=-1)
+    head: tuple[str, ...] = (_HEAD[0], *_HEAD[4:7])
     if origin is not None:
         geodetic, head = from_enu(enu, origin), _HEAD
         degrees = np.concatenate([np.degrees(geodetic[:, :2]), geodetic[:, 2:]], axis=1)
