@@ -45,7 +45,6 @@ from flowgraph.cli.terminal import (
     reports_errors,
     runs_table,
     table,
-    without_font_warnings,
     writing,
 )
 from flowgraph.data.export.text import write_tum
@@ -100,7 +99,7 @@ def show(
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width, inputs=inputs))))
         return
-    with writing(output), without_font_warnings():
+    with writing(output):
         if output.suffix.lower() == ".html":
             diagram_page(built, output, fold=fold, costs=costs_by_path(built), inputs=inputs)
         else:
@@ -295,7 +294,7 @@ def _write_report(
 def _draw(file: Path, draw: Callable[[Path], object]) -> str | None:
     """Make a picture, or return a note that says why there is none: it must not take the results with it."""
     try:
-        with writing(file), without_font_warnings():
+        with writing(file):
             draw(file)
     except Exception as error:
         why = str(error) if isinstance(error, FlowgraphError) else f"{type(error).__name__}: {error}"

@@ -19,6 +19,7 @@ from typing import Any
 from flowgraph.data.arrival import lateness_words
 from flowgraph.data.files import put
 from flowgraph.data.series import Flight
+from flowgraph.drawing.fonts import without_font_warnings
 from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.text import (
     Link,
@@ -126,7 +127,8 @@ def _render(source: str, kind: str) -> bytes:
             got=f"{failed}, and no pygraphviz",
             fix="pip install pygraphviz, or install Graphviz; graph.text() needs neither",
         ) from None
-    return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
+    with without_font_warnings():
+        return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
 
 
 def _whole_png(made: bytes) -> bytes:

@@ -257,7 +257,7 @@ def test_a_clock_is_that_of_the_truth_where_there_is_one_of_its_own():
         m: calibrate("ekf", fits, [Recording("sim")], engine="c", settings=settings, measure=m)
         for m in (None, "error", "likelihood")
     }
-    clocks = {m: f.parameters["vicon.time_offset"] for m, f in found.items()}
+    clocks = {m: float(f.parameters["vicon.time_offset"]) for m, f in found.items()}
     assert clocks[None] == clocks["error"]
     assert clocks["likelihood"] == pytest.approx(0.02, abs=0.006)
     assert abs(clocks["error"]) < 0.012
@@ -269,6 +269,7 @@ def test_a_truth_that_an_offset_moves_or_that_is_none_judges_no_clock(truth, sta
 
     def flight(data, seed, settings):
         made = load_flight("sim", settings={n: str(v) for n, v in SHORT.items()})
+        assert made.truth is not None
         late = round(float(settings.get("vicon.time_offset", 0.0)) * 1e9)
         known = made.truth if truth == "sim" else Series(made.truth.time + late, made.truth.values)
         return replace(made, truth=None if truth == "none" else known)
