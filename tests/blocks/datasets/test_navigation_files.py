@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 from flowgraph import DataError, load_flight, simulate
 from flowgraph.blocks.datasets.turns import from_angles, from_ned_attitude
-from flowgraph.blocks.geometry.rotations import rotate
+from flowgraph.blocks.geometry.rotations import rotate, to_matrix
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.datasets.test_satellites import S, deviations, inspected, refused
@@ -406,9 +406,27 @@ def test_two_antennas_tell_a_heading_in_a_table(tmp_path):
     np.testing.assert_allclose(each.streams["heading"]["deviation"], np.radians(0.5))
     assert "heading" in gnss_ins.case(each).recorded
     alone = {k: v for k, v in names.items() if not k.startswith("heading")}
+    case = gnss_ins.case(compass)
+    assert any(
+        n.startswith("info: the heading at the start is that of two antennas: known to") for n in case.notes
+    )
+    R = to_matrix(simulate(case.graph, case.inputs)["belief"]["attitude"][0], xp=np)
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(np.radians(60.0), abs=0.01)
     with pytest.raises(DeclarationError, match=r"heading lacks a field[\s\S]*heading.angle"):
         load_flight(f"csv:{file}", settings={**alone, "heading.deviation": "sd"})
     with pytest.raises(UnknownNameError, match="heading.axes"):
         read(heading__axes="nwu")
     with pytest.raises(DeclarationError, match=r"heading\.noise"):
         read(heading__noise="0")
+
+
+def test_a_slow_stream_of_a_table_with_a_fast_one_is_no_index_of_rows(tmp_path):
+    """Positions at whole seconds, in a table whose clock is told by its other rows; alone they are doubtful."""
+    file = tmp_path / "log.csv"
+    rows = [f"{0.5 * k},0,0,0.1,0,0,9.8," + ("1,2,3" if k % 2 == 0 else ",,") for k in range(40)]
+    file.write_text("\n".join(["t,wx,wy,wz,ax,ay,az,x,y,z", *rows]) + "\n")
+    place = {"leica.position": "x,y,z"}
+    names = {**place, "imu.gyro": "wx,wy,wz", "imu.specific_force": "ax,ay,az"}
+    doubted = lambda flight: any("as an index of rows is" in n for n in flight.notes)
+    assert not doubted(load_flight(f"csv:{file}", settings=names))
+    assert doubted(load_flight(f"csv:{file}", settings=place))
