@@ -421,7 +421,7 @@ def test_two_antennas_tell_a_heading_in_a_table(tmp_path):
 
 
 def test_a_slow_stream_of_a_table_with_a_fast_one_is_no_index_of_rows(tmp_path):
-    """Positions at whole seconds, in a table whose clock is told by its other rows; alone they are doubtful."""
+    """Positions at whole seconds, in a table whose other rows tell its clock; alone they are doubtful."""
     file = tmp_path / "log.csv"
     rows = [f"{0.5 * k},0,0,0.1,0,0,9.8," + ("1,2,3" if k % 2 == 0 else ",,") for k in range(40)]
     file.write_text("\n".join(["t,wx,wy,wz,ax,ay,az,x,y,z", *rows]) + "\n")
