@@ -331,7 +331,7 @@ def found_biases(result: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("seeds", "seconds"), [((0, 1), 6.0), pytest.param(range(8), 8.0, marks=pytest.mark.slow)]
+    ("seeds", "seconds"), [((0, 1), 6.0), pytest.param(range(6), 8.0, marks=pytest.mark.slow)]
 )
 def test_biases_of_several_flights_are_found(seeds, seconds):
     """Told of them, as the flights say, the filter is as honest as without any; else it is several times as
