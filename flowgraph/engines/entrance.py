@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flowgraph.data.inputs import NOT_FINITE, check_stamp, check_value, periods_lost, rule_of
-from flowgraph.data.tape import need_near
+from flowgraph.data.inputs import NOT_FINITE, check_value, periods_lost, rule_of
+from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, UnknownNameError
 from flowgraph.language.graph import Graph
 
