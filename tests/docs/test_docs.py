@@ -104,6 +104,7 @@ def wrong_in(words: list[str]) -> list[str]:
     sought = [b.partition("=")[0] for a, b in pairwise(words) if a in ("--fit", "--find")]
     if sought and words[0] in graph_names():
         prepare = find_graph(words[0]).prepare
+        assert prepare is not None
         wrong += [n for n in sought if not placed(n) and n.replace(".", "_") not in keyword_types(prepare)]
     return wrong
 
