@@ -16,13 +16,16 @@ from threading import Lock, get_ident
 from time import perf_counter
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 from flowgraph.data.arrival import stamp_events
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
-from flowgraph.data.tape import batches, merged, stack
+from flowgraph.data.tape import Tape, batches, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
+from flowgraph.engines.python.loop import Loop, feed, loop, numbers
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
@@ -86,6 +89,8 @@ class Run:
             self.state = state
         self._entrance = Entrance(graph, self._last, not_finite)
         self._recorded = True
+        self._loop: Loop | None = None
+        self._played, self._broken = 0, None  # ticks of the tape, and the time of the one that failed
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
         self._pushed: list[deque[Any]] | None = None
@@ -94,9 +99,16 @@ class Run:
             self._ticks: Iterator[tuple[int, int]] = iter(())
             feeds: list[Callable[[], Any]] = [q.popleft for q in self._pushed]
         else:
-            self._prepared = prepare(graph, inputs, self._last)
-            self._ticks, feeds = merged(self._prepared)
-            self._recorded = all(isinstance(s, Series) for s in self._prepared.values())
+            prepared = prepare(graph, inputs, self._last)
+            series = tuple(s for s in prepared.values() if isinstance(s, Series))
+            self._recorded = len(series) == len(prepared)
+            if self._recorded:
+                self._tape = Tape.of(series)
+                self._loop = loop(graph, self._tape.patterns)
+                self._ticks = zip(numbers(self._tape.time), numbers(self._tape.key), strict=True)
+                feeds = [feed(s, k, self._loop) for k, s in enumerate(series)]
+            else:
+                self._ticks, feeds = merged(prepared)
         self._names = {
             **bindings(graph),
             "r": self._registers,
@@ -111,12 +123,19 @@ class Run:
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
         }
         self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        if self._loop is not None:
+            names = self._names | self._loop.names | {"broken": self._breaks}
+            self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
     @_alone
     def step(self) -> bool:
         """Advance one tick; False when the inputs have ended."""
         self._refuse_if_stopped()
+        if self._loop is not None:
+            before = self._played
+            self._go_on(1)
+            return self._played > before
         tick = next(self._ticks, None)
         if tick is None:
             return False
@@ -186,6 +205,16 @@ class Run:
     def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
         """Run until the inputs end, or for `most` ticks, telling `meter` now and then."""
         self._refuse_if_stopped()
+        if self._loop is not None:
+            left = len(self._tape.time) - self._played
+            left = left if most is None else min(left, most)
+            while left > 0:
+                count = left if meter is None else min(left, _BATCH)
+                self._go_on(count)
+                left -= count
+                if meter is not None:
+                    meter.update(self.ticks, self.time)
+            return self
         for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
             self._advance(batch)
             if meter is not None:
@@ -234,6 +263,35 @@ class Run:
         self._account(batch)
         self.wall_s += perf_counter() - start
 
+    def _go_on(self, count: int) -> None:
+        """So many ticks of a recording in its loop, or as many as there are."""
+        start, first = perf_counter(), self._played
+        last = min(first + count, len(self._tape.time))
+        try:
+            self._goes_through(itertools.islice(self._ticks, last - first))
+        except BaseException as error:
+            at = self._tape.time[first] if self._broken is None else self._broken
+            done = int(np.searchsorted(self._tape.time, at))
+            self._has_gone(first, done)
+            self._stopped = int(at)
+            self._explain(error, self._stopped)
+            raise
+        self._has_gone(first, last)
+        self.wall_s += perf_counter() - start
+
+    def _breaks(self, time: int | None) -> None:
+        self._broken = time
+
+    def _has_gone(self, first: int, last: int) -> None:
+        """Count ticks of the tape, and note when each source came last."""
+        self._played, self.ticks = last, self.ticks + last - first
+        if last > first:
+            self.time = max(self.time, int(self._tape.time[last - 1]))
+        for k, name in enumerate(self._last):
+            rows = np.flatnonzero(self._tape.key[first:last] >> k & 1)
+            if len(rows):
+                self._last[name] = int(self._tape.time[first + rows[-1]])
+
     def _refuse_if_stopped(self) -> None:
         if self._stopped is not None:
             raise DataError(
@@ -262,6 +320,7 @@ class Run:
         while trace is not None:
             if trace.tb_frame.f_code.co_name == "react":
                 for known in list(self.graph.plans.values()):
+                    known = known.plan if isinstance(known, Loop) else known
                     if (
                         isinstance(known, Plan)
                         and known.code.co_filename == trace.tb_frame.f_code.co_filename
