@@ -32,6 +32,8 @@ def _whole(xp: Any, x: Any, kind: np.dtype[Any]) -> Any:
             number = limits.min if number < 0.0 else limits.max if number > 0.0 else 0
         return kind.type(int(number))
     least, beyond = x.dtype.type(limits.min), x.dtype.type(2.0 ** (limits.bits - (kind.kind == "i")))
+    if isinstance(x, np.ndarray) and x.size and least <= x.min() and x.max() < beyond:
+        return x.astype(kind)  # as nearly always; a NaN is not within
     fits = (x >= least) & (x < beyond)  # False for NaN
     inside = xp.where(fits, x, x.dtype.type(0)).astype(kind)
     low, high = kind.type(limits.min), kind.type(limits.max)

@@ -2,9 +2,8 @@
 
 A recording says beforehand which patterns of present sources occur. So one function goes through its ticks,
 and what a run keeps between them (registers, stamps) lies in local variables until it ends or breaks. The
-reactions are those of `plan`, but for blocks of single numbers, which are written out as `scalars` says:
-they pass plain Python numbers from one to the next, and a NumPy scalar is made only for a block that is
-called.
+reactions are those of `plan`, but for blocks that `steps` can write out: they pass the leaves of a value in
+variables, and one is put together only for a block that is called, and for what is collected.
 
 A loop is written where every block could be recorded, so that none sees or keeps more than its ports: one
 that might look at the run in the middle of a tick is called tick by tick. So is everything while a debugger
@@ -16,7 +15,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -24,10 +22,10 @@ import numpy as np
 
 from flowgraph.data.series import Series
 from flowgraph.engines.python.plan import Plan, Presence, Writer, compiled, named
-from flowgraph.engines.python.scalars import KINDS, plain, silent, written
+from flowgraph.engines.python.steps import KINDS, Written, silent, single, written
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.language.recording import StepTrace
-from flowgraph.types import ArrayType, Type, flatten, leaves_of, unflatten
+from flowgraph.types import ArrayType, Signal, StructType, Type, leaves_of, unflatten
 
 MOST_PATTERNS = 8
 """With more patterns than these the text would be longer than what it saves."""
@@ -37,11 +35,11 @@ _PART = 4096
 
 @dataclass(frozen=True)
 class Loop:
-    """A compiled loop, the names that it needs, and the sources whose values it reads as Python's numbers."""
+    """A compiled loop, the names that it needs, and the sources of which it reads the leaves."""
 
     plan: Plan
     names: dict[str, Any]
-    plain: frozenset[int]
+    open: frozenset[int]
 
 
 def loop(graph: Graph, patterns: tuple[int, ...]) -> Loop | None:
@@ -62,8 +60,13 @@ def numbers(array: np.ndarray) -> Iterator[Any]:
 
 def feed(series: Series, k: int, to: Loop | None) -> Callable[[], Any]:
     """The values of source k one after the other, as a loop reads them."""
-    single = to is not None and k in to.plain
-    return numbers(series.leaves["value"]).__next__ if single else iter(series).__next__
+    if to is None or k not in to.open:
+        return iter(series).__next__
+    columns = [
+        numbers(array) if single(leaf) else iter(array)
+        for array, (_, leaf) in zip(series.leaves.values(), leaves_of(series.type), strict=True)
+    ]
+    return columns[0].__next__ if isinstance(series.type, ArrayType) else zip(*columns, strict=True).__next__
 
 
 def _may(graph: Graph) -> bool:
@@ -74,21 +77,20 @@ def _may(graph: Graph) -> bool:
 
 
 def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
-    which = _Scalars(graph, patterns)
+    which = _Which(graph, patterns)
     lines, owner = ["def react(ticks):", "    t = None"], {}
-    used = sorted({i for i, _ in graph.registers})
-    loads, stores = [], []
-    for index in used:
-        register = graph.nodes[index]
-        assert isinstance(register, RegisterNode)
+    stores = []
+    for index, register in graph.registers:
         if index in which.registers:
-            local = which.locals(index)
-            loads.append(f"    {', '.join(local)}, = open{index}(r[{index}])")
-            stores.append(f"        r[{index}] = close{index}({', '.join(local)})")
+            local = ", ".join(which.locals(index))
+            lines.append(f"    {local}, = {', '.join(leaves(register.type, f'r[{index}]'))},")
+            stores.append(
+                f"        r[{index}] = {put_together(register.type, which.locals(index), str(index))}"
+            )
         else:
-            loads.append(f"    r{index} = r[{index}]")
+            lines.append(f"    r{index} = r[{index}]")
             stores.append(f"        r[{index}] = r{index}")
-    lines += [*loads, "    try:", "        for t, key in ticks:"]
+    lines += ["    try:", "        for t, key in ticks:"]
     for n, key in enumerate(patterns):
         lines.append(f"            {'if' if n == 0 else 'elif'} key == {key}:")
         writer = _LoopWriter(graph, key, which, len(lines))
@@ -97,53 +99,67 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
         owner |= writer.owner
     lines += ["    except BaseException:", "        broken(t)", "        raise"]
     lines += ["    finally:", *(stores or ["        pass"])]
-    names: dict[str, Any] = {"int32": np.int32, "bool_": np.bool_}
-    for index in which.registers:
-        names[f"open{index}"] = partial(_open, graph.nodes[index].type)  # type: ignore[union-attr]
-        names[f"close{index}"] = partial(_close, graph.nodes[index].type)  # type: ignore[union-attr]
-    for index, node in enumerate(graph.nodes):
-        for k, port in enumerate(node.outputs if isinstance(node, CallNode) else ()):
-            if index in which.calls:
-                names[f"close{index}_{k}"] = partial(_close, port.type)
     to = " or ".join(named(graph, key) for key in patterns)
-    text = "\n".join(lines) + "\n"
-    return Loop(compiled(graph, text, owner, to), names, frozenset(which.sources.values()))
+    code = compiled(graph, "\n".join(lines) + "\n", owner, to)
+    return Loop(code, which.names, frozenset(which.sources.values()))
 
 
-def _open(type_: Type, value: Any) -> list[Any]:
-    """The leaves of a register as Python's numbers."""
-    return [np.asarray(leaf).item() for leaf in flatten(value, type_)]
+def leaves(type_: Type, text: str) -> list[str]:
+    """The leaves of a value as expressions, single numbers as Python's."""
+    if isinstance(type_, ArrayType):
+        return [f"{KINDS[type_.dtype][0]}({text})" if single(type_) else text]
+    found = []
+    for k, (name, part) in enumerate(type_.fields):
+        of = f"[{k}]" if type_.cls is tuple else f"[{name!r}]" if type_.cls is dict else f".{name}"
+        found += leaves(part, text + of)
+    return found
 
 
-def _close(type_: Type, *leaves: Any) -> Any:
-    """A value of NumPy's numbers from Python's."""
-    kinds = [getattr(np, "float64" if t.dtype == "real" else KINDS[t.dtype][1]) for _, t in leaves_of(type_)]
-    return unflatten(type_, iter([kind(leaf) for kind, leaf in zip(kinds, leaves, strict=True)]))
+def put_together(type_: Type, parts: list[str], node: str) -> str:
+    """A value of its leaves as an expression, single numbers as NumPy's; `node` names what makes it."""
+    boxed = [
+        f"{KINDS[leaf.dtype][1]}({part})" if single(leaf) else part
+        for part, (_, leaf) in zip(parts, leaves_of(type_), strict=True)
+    ]
+    return boxed[0] if isinstance(type_, ArrayType) else f"make{node}({', '.join(boxed)})"
 
 
-class _Scalars:
-    """Which calls, sources and registers of a graph are written out as single numbers."""
+def _maker(type_: StructType) -> Callable[..., Any]:
+    if issubclass(type_.cls, Signal) and all(isinstance(t, ArrayType) for _, t in type_.fields):
+        return type_.cls
+    return lambda *parts: unflatten(type_, iter(parts))
+
+
+class _Which:
+    """Which calls of a graph are written out, and which sources and registers lie in variables by leaf."""
 
     def __init__(self, graph: Graph, patterns: tuple[int, ...]) -> None:
         self.graph = graph
+        self.names: dict[str, Any] = {
+            "int32": np.int32, "bool_": np.bool_, "concatenate": np.concatenate
+        }  # fmt: skip
+        self._texts: dict[tuple[int, int], Written] = {}
         writers = [Writer(graph, key) for key in patterns]
-        self.calls = {i: call for i, call in graph.calls if self._may(call, writers)}
-        ports = {
-            n: k for k, n in enumerate(i for i, n in enumerate(graph.nodes) if isinstance(n, SourceNode))
+        self.calls = {i: call for i, call in graph.calls if self._may(i, call, writers)}
+        ports = [i for i, n in enumerate(graph.nodes) if isinstance(n, SourceNode)]
+        read = {w.node for call in self.calls.values() for w in self._wires(call)}
+        self.sources = {i: k for k, i in enumerate(ports) if i in read}
+        states = {call.state for call in self.calls.values()}
+        self.registers = {
+            i: node
+            for i, node in graph.registers
+            if i in states or (node.feed is not None and self.here(node.feed))
         }
-        while True:
-            read = {w.node for call in self.calls.values() for w in self._wires(call)}
-            self.sources = {
-                i: k
-                for i, k in ports.items()
-                if i in read and isinstance(t := graph.nodes[i].type, ArrayType) and plain(t)  # type: ignore[union-attr]
-            }
-            self.registers = self._registers()
-            wrong = [i for i, call in self.calls.items() if not all(map(self._single, call.arguments))]
-            if not wrong:
-                break
-            for i in wrong:
-                del self.calls[i]
+        for (index, _), text in self._texts.items():
+            if index in self.calls:
+                self.names |= text.names
+        for index, node in enumerate(graph.nodes):
+            types = [p.type for p in node.outputs] if isinstance(node, CallNode) else [node.type]
+            for k, type_ in enumerate(types):
+                if isinstance(type_, StructType):
+                    self.names[f"make{index}_{k}" if isinstance(node, CallNode) else f"make{index}"] = _maker(
+                        type_
+                    )
 
     def locals(self, register: int) -> list[str]:
         """The variables that hold the leaves of a register."""
@@ -159,22 +175,28 @@ class _Scalars:
         return register.type if isinstance(register, RegisterNode) else None
 
     def here(self, wire: Wire) -> bool:
-        """Whether a stream passes as Python's numbers."""
+        """Whether the leaves of a stream lie in variables."""
         return wire.node in self.calls or wire.node in self.sources
 
-    def _may(self, call: CallNode, writers: list[Writer]) -> bool:
-        ends = [port.type for port in call.outputs] + [t for a in call.arguments if (t := self.type(a))]
-        if call.block.fault is not None or not all(map(plain, ends)):
+    def text(self, index: int, call: CallNode, writer: Writer) -> Written | None:
+        """The call's step as text, as it fires in a pattern."""
+        step = writer.variant(call)
+        known = index, id(step)
+        if known not in self._texts:
+            state = None if call.state is None else self.graph.nodes[call.state].type  # type: ignore[union-attr]
+            made = written(step, [self.type(a) for a in call.arguments], state, index)
+            if made is None:
+                return None
+            self._texts[known] = made
+        return self._texts[known]
+
+    def _may(self, index: int, call: CallNode, writers: list[Writer]) -> bool:
+        if call.block.fault is not None or not silent(call.block):
             return False
-        if not silent(call.block) or not all(map(silent, call.settings.values())):
+        if not all(map(silent, call.settings.values())):
             return False
         fires = [w for w in writers if w.when(call.firing) is not False]
-        return all(self.written(call, w) is not None for w in fires)
-
-    def written(self, call: CallNode, writer: Writer) -> Any:
-        """The call's step as text, as it fires in a pattern."""
-        state = None if call.state is None else self.graph.nodes[call.state].type  # type: ignore[union-attr]
-        return written(writer.variant(call), [self.type(a) for a in call.arguments], state)
+        return all(self.text(index, call, w) is not None for w in fires)
 
     def _wires(self, call: CallNode) -> list[Wire]:
         found = [a.wire for a in call.arguments if a.wire is not None]
@@ -184,36 +206,29 @@ class _Scalars:
                 found.append(register.feed)
         return found
 
-    def _registers(self) -> dict[int, RegisterNode]:
-        states = {call.state for call in self.calls.values()}
-        return {
-            i: node
-            for i, node in self.graph.registers
-            if i in states or (node.feed is not None and plain(node.type) and self.here(node.feed))
-        }
-
-    def _single(self, argument: Argument) -> bool:
-        """Whether what comes is there as numbers, or is one that is made so by a word."""
-        if argument.wire is not None and self.here(argument.wire):
-            return True
-        if argument.register is not None and argument.register in self.registers:
-            return True
-        return self.type(argument) is None or isinstance(self.type(argument), ArrayType)
-
 
 class _LoopWriter(Writer):
     """Writes the reaction to one pattern, from a line of the loop on."""
 
-    def __init__(self, graph: Graph, key: int, which: _Scalars, first: int) -> None:
+    def __init__(self, graph: Graph, key: int, which: _Which, first: int) -> None:
         super().__init__(graph, key)
         self.which, self.first = which, first
         self.lines, self.indent = [], 4
-        self.leaves: dict[tuple[int, int], list[str]] = {(i, 0): [f"x{i}"] for i in which.sources}
+        self.leaves: dict[tuple[int, int], list[str]] = {}
         self.next: dict[int, list[str]] = {}
 
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)
         self.owner[self.first + len(self.lines)] = owner
+
+    def read(self, index: int, k: int, node: SourceNode) -> None:
+        if index not in self.which.sources:
+            super().read(index, k, node)
+            return
+        single_ = isinstance(node.type, ArrayType)
+        names = [f"x{index}_{n}" for n in range(len(leaves_of(node.type)))]
+        self.emit(f"{', '.join(names)}{'' if single_ else ','} = n{k}()", node.path)
+        self.leaves[index, 0] = names
 
     def stamp(self, register: int) -> str:
         return f"r{register}"
@@ -222,13 +237,14 @@ class _LoopWriter(Writer):
         node = self.which.registers.get(register)
         if node is None:
             return f"r{register}"
-        return self._boxed(node.type, self.which.locals(register), f"close{register}")
+        return put_together(node.type, self.which.locals(register), str(register))
 
     def value(self, wire: Wire) -> str:
         if not self.which.here(wire):
             return super().value(wire)
-        leaves = self._leaves(wire)
-        return self._boxed(self.graph.port(wire).type, leaves, f"close{wire.node}_{wire.output}")
+        call = isinstance(self.graph.nodes[wire.node], CallNode)
+        maker = f"{wire.node}_{wire.output}" if call else str(wire.node)
+        return put_together(self.graph.port(wire).type, self._leaves(wire), maker)
 
     def kept(self, wire: Wire) -> str:
         if self.which.here(wire) and isinstance(self.graph.port(wire).type, ArrayType):
@@ -250,19 +266,13 @@ class _LoopWriter(Writer):
         absent = ["None"] * len(leaves_of(self.graph.port(wire).type))
         return self.leaves.get((wire.node, wire.output), absent)
 
-    @staticmethod
-    def _boxed(type_: Type, leaves: list[str], close: str) -> str:
-        if isinstance(type_, ArrayType):
-            return f"{KINDS[type_.dtype][1]}({leaves[0]})"
-        return f"{close}({', '.join(leaves)})"
-
     def fire(self, index: int, call: CallNode, firing: Presence) -> None:
         if index not in self.which.calls:
             super().fire(index, call, firing)
             return
-        step = self.variant(call)
-        constants, lines = self.which.written(call, self)
-        local = dict(constants)
+        step, text = self.variant(call), self.which.text(index, call, self)
+        assert text is not None
+        local, numbers = dict(text.constants), set(text.numbers)
         if firing is not True:
             for k, dynamic in enumerate(call.dynamic):
                 if dynamic:
@@ -280,50 +290,65 @@ class _LoopWriter(Writer):
         for argument, given in zip(call.arguments, step.arguments, strict=True):
             if given:
                 local |= dict(zip(given, self._read(argument), strict=True))
-        for i, form in lines:
-            self.emit(f"w{index}_{i.out} = {form.format(*(local[a] for a in i.args))}", call.path)
+        for line in text.lines:
+            i = line.instruction
+            self.emit(f"w{index}_{i.out} = {line.form.format(*(local[a] for a in i.args))}", call.path)
             local[i.out] = f"w{index}_{i.out}"
-        made = {i.out for i, _ in lines} | set(constants)
+
+        def own(numbers_: Iterable[int], type_: Type) -> list[str]:
+            return [
+                self._own(index, n, leaf, local, numbers, call)
+                for n, (_, leaf) in zip(numbers_, leaves_of(type_), strict=True)
+            ]
+
         for k, (output, dynamic) in enumerate(zip(step.outputs, call.dynamic, strict=True)):
             if dynamic:
                 there = output.presence
                 known = str(there == "always") if isinstance(there, str) else local[there]
                 self.emit(f"p{index}_{k} = {known}", call.path)
             if output.leaves:
-                self.leaves[index, k] = [self._own(index, n, local, made, call) for n in output.leaves]
-        self.next[index] = [self._own(index, n, local, made, call) for n in step.next_state]
+                self.leaves[index, k] = own(output.leaves, call.outputs[k].type)
+        if call.state is not None:
+            self.next[index] = own(step.next_state, self.graph.nodes[call.state].type)  # type: ignore[union-attr]
         if firing is not True:
             if len(self.lines) == before:
                 self.emit("pass", call.path)
             self.indent -= 1
 
-    def _own(self, index: int, number: int, local: dict[int, str], made: set[int], call: CallNode) -> str:
-        """A value in a variable of its own: a register may be written before it is read."""
-        if number in made or local[number].startswith(("w", "x")):
-            return local[number]
-        self.emit(f"w{index}_{number} = {local[number]}", call.path)
-        made.add(number)
-        local[number] = f"w{index}_{number}"
+    def _own(
+        self,
+        index: int,
+        number: int,
+        leaf: ArrayType,
+        local: dict[int, str],
+        numbers: set[int],
+        call: CallNode,
+    ) -> str:
+        """A value in a variable of its own, since a register may be written before it is read; a single
+        number as Python's."""
+        text = local[number]
+        if single(leaf) and number not in numbers:
+            text = f"{KINDS[leaf.dtype][0]}({text})"
+            numbers.add(number)
+        if text != f"w{index}_{number}":
+            self.emit(f"w{index}_{number} = {text}", call.path)
+            local[number] = f"w{index}_{number}"
         return local[number]
 
-    def _read(self, argument: Argument) -> Iterable[str]:
+    def _read(self, argument: Argument) -> list[str]:
         """The leaves of what comes to a port."""
+        type_ = self.which.type(argument)
+        assert type_ is not None
         if argument.wire is not None:
-            if self.which.here(argument.wire):
-                return self._leaves(argument.wire)
-            return [self._number(argument, super().value(argument.wire))]
+            here = self.which.here(argument.wire)
+            return self._leaves(argument.wire) if here else leaves(type_, super().value(argument.wire))
         assert argument.register is not None
         node = self.graph.nodes[argument.register]
         assert isinstance(node, RegisterNode)
         if argument.register not in self.which.registers:
-            return [self._number(argument, self.argument(argument))]
+            return leaves(type_, self.argument(argument))
         held = self.which.locals(argument.register)
         if node.role != "latest" or node.feed is None:
             return held
         there, new = self.fresh(node.feed), self._leaves(node.feed)
         return [self.choose(there, a, b) for a, b in zip(new, held, strict=True)]
-
-    def _number(self, argument: Argument, text: str) -> str:
-        type_ = self.which.type(argument)
-        assert isinstance(type_, ArrayType)
-        return f"{KINDS[type_.dtype][0]}({text})"

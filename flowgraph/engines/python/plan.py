@@ -88,7 +88,7 @@ class Writer:
             (i, n) for i, n in enumerate(self.graph.nodes) if isinstance(n, SourceNode)
         ):
             if self.present[node.clock]:
-                self.emit(f"x{index} = n{k}()", node.path)
+                self.read(index, k, node)
         for index, call in self.graph.calls:
             self.call(index, call)
         for index, call in self.graph.calls:
@@ -106,6 +106,10 @@ class Writer:
             )
         if len(self.lines) == before:
             self.emit("pass", "")
+
+    def read(self, index: int, k: int, node: SourceNode) -> None:
+        """The line that takes the next value of source k."""
+        self.emit(f"x{index} = n{k}()", node.path)
 
     def held(self, register: int) -> str:
         """What a register holds, as a block is handed it."""
