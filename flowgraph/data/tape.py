@@ -7,6 +7,7 @@ tick by tick (`merged`). Either way a tick is a time and a key, with bit k set w
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,9 @@ import numpy as np
 from flowgraph.data.series import Series
 from flowgraph.errors import DataError
 from flowgraph.language.graph import Graph
-from flowgraph.types import DTYPES, StructType, Type, flatten, leaves_of, unflatten
+from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
+
+_WIDE = 64
 
 
 @dataclass(frozen=True)
@@ -131,11 +134,23 @@ def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series
         columns = [list(c) for c in zip(*(flatten(v, type_) for v in values), strict=True)] or [
             [] for _ in leaves
         ]
-    made: list[np.ndarray] = [
-        np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
-        for column, (_, leaf) in zip(columns, leaves, strict=True)
-    ]
+    return joined(times, columns, type_, name)
+
+
+def joined(times: list[int], columns: Iterable[list[Any]], type_: Type, name: str) -> Series:
+    """A series from times and a list of values for each leaf."""
+    made = [_stacked(column, leaf) for column, (_, leaf) in zip(columns, leaves_of(type_), strict=True)]
     return Series(np.asarray(times, dtype=np.int64), unflatten(type_, iter(made)), type=type_, name=name)
+
+
+def _stacked(column: Any, leaf: ArrayType) -> np.ndarray:
+    """One array (n, ...) of n values of a leaf."""
+    kind = DTYPES[leaf.dtype]
+    wide = math.prod(d for d in leaf.shape if isinstance(d, int)) >= _WIDE
+    if wide and column and all(type(x) is np.ndarray and x.shape == leaf.shape for x in column):
+        whole = np.concatenate(column)  # copies whole arrays, where `asarray` asks each for its numbers
+        return whole.astype(kind, copy=False).reshape(len(column), *leaf.shape)
+    return np.asarray(column, dtype=kind).reshape(len(column), *leaf.shape)
 
 
 def merged(

@@ -35,11 +35,13 @@ _PART = 4096
 
 @dataclass(frozen=True)
 class Loop:
-    """A compiled loop, the names that it needs, and the sources of which it reads the leaves."""
+    """A compiled loop, the names that it needs, and where it goes by leaves: which sources it reads, and
+    which of the collected streams it keeps."""
 
     plan: Plan
     names: dict[str, Any]
     open: frozenset[int]
+    kept: frozenset[int]
 
 
 def loop(graph: Graph, patterns: tuple[int, ...]) -> Loop | None:
@@ -101,7 +103,8 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
     lines += ["    finally:", *(stores or ["        pass"])]
     to = " or ".join(named(graph, key) for key in patterns)
     code = compiled(graph, "\n".join(lines) + "\n", owner, to)
-    return Loop(code, which.names, frozenset(which.sources.values()))
+    kept = frozenset(k for k, c in enumerate(graph.collected) if which.here(c.wire))
+    return Loop(code, which.names, frozenset(which.sources.values()), kept)
 
 
 def leaves(type_: Type, text: str) -> list[str]:
@@ -136,7 +139,7 @@ class _Which:
     def __init__(self, graph: Graph, patterns: tuple[int, ...]) -> None:
         self.graph = graph
         self.names: dict[str, Any] = {
-            "int32": np.int32, "bool_": np.bool_, "concatenate": np.concatenate
+            "int32": np.int32, "bool_": np.bool_, "concatenate": np.concatenate, "asarray": np.asarray
         }  # fmt: skip
         self._texts: dict[tuple[int, int], Written] = {}
         writers = [Writer(graph, key) for key in patterns]
@@ -246,10 +249,10 @@ class _LoopWriter(Writer):
         maker = f"{wire.node}_{wire.output}" if call else str(wire.node)
         return put_together(self.graph.port(wire).type, self._leaves(wire), maker)
 
-    def kept(self, wire: Wire) -> str:
-        if self.which.here(wire) and isinstance(self.graph.port(wire).type, ArrayType):
-            return self._leaves(wire)[0]
-        return self.value(wire)
+    def kept(self, k: int, wire: Wire) -> str:
+        if not self.which.here(wire):
+            return super().kept(k, wire)
+        return "; ".join(f"c{k}_{n}({leaf})" for n, leaf in enumerate(self._leaves(wire)))
 
     def remembered(self, index: int, register: int) -> str:
         if index not in self.which.calls:

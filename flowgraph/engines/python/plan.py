@@ -102,7 +102,7 @@ class Writer:
                 self.guarded(self.fresh(register.feed), self.fed(index, register.feed), register.path)
         for k, collected in enumerate(self.graph.collected):
             self.guarded(
-                self.fresh(collected.wire), f"c{k}({self.kept(collected.wire)}); u{k}(t)", collected.name
+                self.fresh(collected.wire), f"{self.kept(k, collected.wire)}; u{k}(t)", collected.name
             )
         if len(self.lines) == before:
             self.emit("pass", "")
@@ -127,9 +127,9 @@ class Writer:
         """The line that writes a stream into its register."""
         return f"r[{register}] = {self.value(wire)}"
 
-    def kept(self, wire: Wire) -> str:
-        """What a run keeps of a stream that it collects."""
-        return self.value(wire)
+    def kept(self, k: int, wire: Wire) -> str:
+        """The statement that keeps the value of collected stream k."""
+        return f"c{k}({self.value(wire)})"
 
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)

@@ -22,7 +22,7 @@ from flowgraph.data.arrival import stamp_events
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
-from flowgraph.data.tape import Tape, batches, merged, stack
+from flowgraph.data.tape import Tape, batches, joined, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.loop import Loop, feed, loop, numbers
@@ -32,6 +32,7 @@ from flowgraph.engines.trouble import overflow_error
 from flowgraph.errors import DataError, FifoOverflowError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
+from flowgraph.types import leaves_of
 
 _BATCH = 2048
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -123,8 +124,12 @@ class Run:
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
         }
         self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        self._columns: dict[int, list[list[Any]]] = {}  # of what the loop keeps by leaves
         if self._loop is not None:
-            names = self._names | self._loop.names | {"broken": self._breaks}
+            types = [graph.port(c.wire).type for c in graph.collected]
+            self._columns = {k: [[] for _ in leaves_of(types[k])] for k in self._loop.kept}
+            keep = {f"c{k}_{n}": c.append for k, some in self._columns.items() for n, c in enumerate(some)}
+            names = self._names | self._loop.names | keep | {"broken": self._breaks}
             self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
@@ -378,10 +383,13 @@ class Run:
     def result(self) -> Result:
         """The collected streams so far."""
         self._refuse_others("result")
-        series = {
-            c.name: stack(times, values, self.graph.port(c.wire).type, c.name)
-            for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)
-        }
+        series = {}
+        for k, collected in enumerate(self.graph.collected):
+            type_, name, times = self.graph.port(collected.wire).type, collected.name, self._times[k]
+            by_leaf = k in self._columns
+            series[name] = (joined if by_leaf else stack)(
+                times, self._columns[k] if by_leaf else self._values[k], type_, name
+            )
         return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
 
     def drain(self) -> Result:
@@ -389,7 +397,7 @@ class Run:
         found = self.result()
         found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
         self._drained = self.ticks, self.wall_s
-        for kept in (*self._times, *self._values):
+        for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
             kept.clear()
         return found
 

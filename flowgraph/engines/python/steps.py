@@ -13,10 +13,11 @@ does more than its list says, as one that prints.
 
 from __future__ import annotations
 
+import ast
 import dis
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
 from types import BuiltinFunctionType, CellType, FunctionType
 from typing import Any
@@ -66,12 +67,13 @@ _ARRAYS = {
     "add": "{0} + {1}", "subtract": "{0} - {1}", "multiply": "{0} * {1}", "divide": "{0} / {1}",
     "negative": "-{0}", "matmul": "{0} @ {1}", "matrix_transpose": "{0}.mT", "materialise": "{0}",
 }  # fmt: skip
+_LIFTED = 1_000_000  # added to the number of a value, for the same as an array
 _CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | {"vecdot"}
 
 
 @dataclass(frozen=True)
 class Line:
-    """An instruction as an expression of its arguments {0}, {1}, ..., and whether it gives Python's number."""
+    """An instruction as an expression of its arguments {0}, {1}, ..., and whether it is a Python number."""
 
     instruction: Instruction
     form: str
@@ -86,13 +88,15 @@ class Written:
         constants: as text, by value number.
         lines: in their order.
         numbers: the values that are Python's numbers; all others are NumPy's.
-        names: what the text needs, with {n} for the number of the call in them.
+        names: what the text needs, with the number of the call in them.
+        scalars: the values of NumPy's without axes.
     """
 
     constants: dict[int, str]
     lines: list[Line]
     numbers: set[int]
     names: dict[str, Any]
+    scalars: set[int]
 
 
 def single(type_: ArrayType) -> bool:
@@ -105,7 +109,7 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
     if not isinstance(step, StepTrace) or step.sites:
         return None
     trace = step.trace
-    made = Written({}, [], {step.time, step.dt}, {})
+    made = Written({}, [], {step.time, step.dt}, {}, set())
     kinds: dict[int, str] = {step.time: "int64", step.dt: "real"}
     for type_, numbers in ((state, step.state), *zip(arguments, step.arguments, strict=True)):
         for n, (_, leaf) in zip(numbers or (), leaves_of(type_) if numbers and type_ else (), strict=True):
@@ -126,12 +130,26 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
     for i in reversed(trace.instructions):
         if i.out in wanted:
             wanted |= set(i.args)
-    for i in trace.instructions:
-        if i.out in wanted:
+    first: dict[tuple[Any, ...], int] = {}  # what is computed twice, once
+    same: dict[int, int] = {}
+    for whole in trace.instructions:
+        if whole.out in wanted:
+            i = replace(whole, args=tuple(same.get(a, a) for a in whole.args))
             kinds[i.out] = i.spec.dtype
+            again = first.setdefault((i.op, i.args, repr(i.attrs), i.spec), i.out)
+            if again != i.out:
+                same[i.out] = again
+                if again in made.numbers:
+                    made.numbers.add(i.out)
+                made.lines.append(Line(replace(i, args=(again,)), "{0}", again in made.numbers))
+                continue
             form = _number(i, kinds) if made.numbers.issuperset(i.args) else None
             if form is not None:
                 made.numbers.add(i.out)
+            elif not i.spec.shape:
+                made.scalars.add(i.out)
+            else:
+                i = _with_arrays(i, kinds, made, call)
             made.lines.append(Line(i, form or _array(i, kinds, made, call), form is not None))
     return made
 
@@ -160,6 +178,29 @@ def _number(i: Instruction, kinds: dict[int, str]) -> str | None:
     return None if whole is None else f"({whole} + {half}) % {2 * half} - {half}"
 
 
+def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> Instruction:
+    """The instruction, with arrays of no axes for the Python numbers that an array is combined with: NumPy
+    takes twice as long over the others."""
+    if i.op not in _ARRAYS or not i.spec.shape:
+        return i
+    given = []
+    for a in i.args:
+        if a in made.numbers and kinds[a] == "real":
+            lifted = a + _LIFTED
+            if a in made.constants:
+                made.constants[lifted] = f"k{call}_{lifted}"
+                made.names[made.constants[lifted]] = np.asarray(ast.literal_eval(made.constants[a]))
+            elif lifted not in kinds:
+                spec = i.spec._replace(shape=())
+                line = replace(i, op="asarray", args=(a,), attrs={}, out=lifted, spec=spec)
+                made.lines.append(Line(line, "asarray({0})", False))
+            kinds[lifted] = "real"
+            given.append(lifted)
+        else:
+            given.append(a)
+    return replace(i, args=tuple(given))
+
+
 def _array(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> str:
     """An instruction on arrays, or on numbers of NumPy's."""
     places = [f"{{{k}}}" for k in range(len(i.args))]
@@ -167,11 +208,12 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> s
     if not made.numbers.issuperset(i.args):
         if i.op in _ARRAYS and not i.attrs:
             return _ARRAYS[i.op]
+        if i.op == "reshape" and i.args[0] in made.scalars:
+            return f"{{0}}[{', '.join(['None'] * len(i.attrs['shape'])) or '()'}]"
         if i.op == "reshape":
             return f"{{0}}.reshape({tuple(i.attrs['shape'])})"
         if i.op == "getitem":
-            made.names[name] = tuple(e if isinstance(e, int) else slice(*e) for e in i.attrs["index"])
-            return f"{{0}}[{name}]"
+            return f"{{0}}[{_index(i.attrs['index'])}]"
     if i.op == "concat":
         return f"concatenate(({', '.join(places)},), {i.attrs['axis']})"
     called = i.op in _CALLED and not i.attrs
@@ -186,6 +228,17 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> s
         for p, a in zip(places, i.args, strict=True)
     ]  # a whole number of Python's says not how wide it is
     return f"{name}({', '.join(given)})"
+
+
+def _index(entries: Sequence[Any]) -> str:
+    """An index as text; what takes the whole of the last axes is left out, since it is the same view."""
+    kept = list(entries)
+    while len(kept) > 1 and kept[-1] == [None, None, None]:
+        kept.pop()
+    return ", ".join(
+        str(e) if isinstance(e, int) else ":".join("" if part is None else str(part) for part in e)
+        for e in kept
+    )
 
 
 def silent(step: Any) -> bool:
