@@ -1,9 +1,9 @@
-"""The random words and normal numbers of `random`, in NumPy with few passes over memory, or in Python for a few.
+"""The random words and normal numbers of `random`, in NumPy with few passes, or in Python for a few.
 
 The same integers, step by step. A product of 32 bits by 32 is written once as 64, and its halves are read as
-views; each round then is one product and two exclusive ors in place. The segment of a normal number is found in
-one table that holds start and fall side by side. One number alone is made with Python's integers, since each
-pass over an array of four costs as much as all of its arithmetic.
+views; each round then is one product and two exclusive ors. The segment of a normal number is found in one
+table that holds start and fall side by side. A few words are made with Python's integers, since each pass
+over a short array costs as much as all of its arithmetic.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ _M = (0xD2511F53, 0xCD9E8D57)
 _W = (0x9E3779B9, 0xBB67AE85)
 _WORD = 0xFFFFFFFF
 _PRODUCTS = np.array([[_M[0]], [_M[1]]], dtype=np.uint64)
-_FEW = 4  # counters up to which Python's integers are quicker
+FEW = 16
+"""Words up to which Python's integers are quicker."""
+
 _LOW, _HIGH = (0, 1) if sys.byteorder == "little" else (1, 0)
 
 
 def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np.ndarray:
     """`count` random words (uint32) of Philox4x32; see `random.words`."""
+    if count <= FEW:
+        return np.array(few_words(count, name, int(time), seed, rounds), np.uint32)
     n = -(-count // 4)
     time, key = int(time), (int(seed[0]), int(seed[1]))
     low, high = time & _WORD, (time >> 32) & _WORD
-    if n <= _FEW:
-        made = [_one(k, name, low, high, key, rounds) for k in range(n)]
-        return np.array([w for part in zip(*made, strict=True) for w in part][:count], np.uint32)
     even = np.empty((2, n), np.uint32)
     even[0], even[1] = np.arange(n, dtype=np.uint32), low
     odd: np.ndarray = np.array([[name], [high]], np.uint32)
@@ -41,6 +42,13 @@ def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np
         if r + 1 < rounds:
             odd = halves[::-1, :, _LOW].copy()
     return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)[:count]
+
+
+def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> list[int]:
+    """The same as Python's integers."""
+    low, high, key = time & _WORD, (time >> 32) & _WORD, (int(seed[0]), int(seed[1]))
+    made = [_one(k, name, low, high, key, rounds) for k in range(-(-count // 4))]
+    return [w for part in zip(*made, strict=True) for w in part][:count]
 
 
 def _one(

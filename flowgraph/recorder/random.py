@@ -143,7 +143,11 @@ class Site:
 
 def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.ndarray) -> Any:
     """The same numbers as in any namespace, with fewer passes over them."""
-    bits = numpy_random.words(math.prod(shape), name, time, seed, ROUNDS)
+    count = math.prod(shape)
+    if kind == "uniform" and count <= numpy_random.FEW:
+        few = [(w >> 8) * 2.0**-24 for w in numpy_random.few_words(count, name, int(time), seed, ROUNDS)]
+        return np.array(few).reshape(shape)
+    bits = numpy_random.words(count, name, time, seed, ROUNDS)
     if kind == "uniform":
         return uniform_from(bits, xp=NUMPY).reshape(shape)
     made = numpy_random.normals(bits, _pairs(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
