@@ -22,6 +22,7 @@ if _TYPE_CHECKING:
     from flowgraph.engines.python.run import Run
     from flowgraph.engines.simulate import simulate
     from flowgraph.engines.state import load_state, save_state
+    from flowgraph.engines.streaming import Streamed, simulate_to_parquet
     from flowgraph.errors import (
         ClockError,
         CycleError,
@@ -152,6 +153,8 @@ _LATER = {
     "Checkpoint": "flowgraph.engines.options",
     "Run": "flowgraph.engines.python.run",
     "simulate": "flowgraph.engines.simulate",
+    "simulate_to_parquet": "flowgraph.engines.streaming",
+    "Streamed": "flowgraph.engines.streaming",
     "load_state": "flowgraph.engines.state",
     "save_state": "flowgraph.engines.state",
     "lower": "flowgraph.pipeline.lowering",
@@ -231,6 +234,7 @@ __all__ = [
     "Series",
     "Signal",
     "Stream",
+    "Streamed",
     "Tick",
     "TypeMismatchError",
     "UnknownNameError",
@@ -277,6 +281,7 @@ __all__ = [
     "scan",
     "simulate",
     "simulate_many",
+    "simulate_to_parquet",
     "sink",
     "stacked",
     "stamp_of",

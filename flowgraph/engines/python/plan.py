@@ -310,9 +310,9 @@ def bindings(graph: Graph) -> dict[str, Any]:
     return names
 
 
-def bound(plan_: Plan, names: dict[str, Any]) -> Callable[[int], None]:
+def bound(plan_: Plan, names: dict[str, Any]) -> Callable[..., None]:
     """The reaction as a function, over one run's names."""
     scope = dict(names)
     exec(plan_.code, scope)  # text written above from the graph, never from a file
-    reaction: Callable[[int], None] = scope["react"]
+    reaction: Callable[..., None] = scope.pop("react")  # else it would hold itself
     return reaction

@@ -7,6 +7,7 @@ plain tree of arrays, which can be saved, loaded and resumed to the same bits.
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -91,7 +92,8 @@ class Run:
         self._entrance = Entrance(graph, self._last, not_finite)
         self._recorded = True
         self._loop: Loop | None = None
-        self._played, self._broken = 0, None  # ticks of the tape, and the time of the one that failed
+        self._played = 0  # ticks of the tape
+        self._broken: list[int | None] = []  # the time of the tick that failed
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
         self._pushed: list[deque[Any]] | None = None
@@ -110,10 +112,11 @@ class Run:
                 feeds = [feed(s, k, self._loop) for k, s in enumerate(series)]
             else:
                 self._ticks, feeds = merged(prepared)
+        here = weakref.proxy(self)  # a run that nobody holds is gone at once, with all that it has kept
         self._names = {
             **bindings(graph),
             "r": self._registers,
-            "overflow": self._overflow,
+            "overflow": lambda index, time: here._overflow(index, time),
             **{
                 f"d{index}": partial(NumpyDraw, call.draws, self._key)
                 for index, call in graph.calls
@@ -129,7 +132,7 @@ class Run:
             types = [graph.port(c.wire).type for c in graph.collected]
             self._columns = {k: [[] for _ in leaves_of(types[k])] for k in self._loop.kept}
             keep = {f"c{k}_{n}": c.append for k, some in self._columns.items() for n, c in enumerate(some)}
-            names = self._names | self._loop.names | keep | {"broken": self._breaks}
+            names = self._names | self._loop.names | keep | {"broken": self._broken.append}
             self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
@@ -275,7 +278,7 @@ class Run:
         try:
             self._goes_through(itertools.islice(self._ticks, last - first))
         except BaseException as error:
-            at = self._tape.time[first] if self._broken is None else self._broken
+            at = next((time for time in self._broken if time is not None), int(self._tape.time[first]))
             done = int(np.searchsorted(self._tape.time, at))
             self._has_gone(first, done)
             self._stopped = int(at)
@@ -283,9 +286,6 @@ class Run:
             raise
         self._has_gone(first, last)
         self.wall_s += perf_counter() - start
-
-    def _breaks(self, time: int | None) -> None:
-        self._broken = time
 
     def _has_gone(self, first: int, last: int) -> None:
         """Count ticks of the tape, and note when each source came last."""
