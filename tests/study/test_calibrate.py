@@ -14,8 +14,9 @@ from flowgraph.blocks.signals import Position
 from flowgraph.cli import app
 from flowgraph.errors import DeclarationError
 from flowgraph.graphs.gnss_ins import gnss_ins
-from flowgraph.study.calibrate import _apart, calibrate
+from flowgraph.study.calibrate import _apart, _truth_stays, calibrate
 from flowgraph.study.guess import Guess, _by_vectors, guess_offset
+from flowgraph.study.trials import Trials
 from flowgraph.study.tune import Fit, Recording
 from tests.calibration import off, recorded
 from tests.recordings import recordings
@@ -196,3 +197,38 @@ def test_what_calibrate_refuses_is_said_in_its_name():
     with pytest.raises(DeclarationError, match=r"vicon.lever: these are no bounds") as refused:
         calibrate("ekf", [Fit("vicon.lever", 0.2, -0.2)], [Recording("sim")])
     assert refused.value.fix == "swap the bounds: low -0.2, high 0.2"
+
+
+SHORT = {"duration": 2.0, "imu.rate": 50.0, "vicon.rate": 25.0}
+
+
+@pytest.mark.slow
+def test_a_clock_is_that_of_the_truth_where_there_is_one_of_its_own():
+    """A unit whose stamps are 20 ms off: the innovations follow it, the truth does not."""
+    fits = [Fit("vicon.time_offset", -0.1, 0.1)]
+    settings = {**SHORT, "duration": 8.0, "imu.time_offset": 0.02}
+    found = {
+        m: calibrate("ekf", fits, [Recording("sim")], engine="c", settings=settings, measure=m)
+        for m in (None, "error", "likelihood")
+    }
+    clocks = {m: float(f.parameters["vicon.time_offset"]) for m, f in found.items()}
+    assert clocks[None] == clocks["error"]
+    assert clocks["likelihood"] == pytest.approx(0.02, abs=0.006)
+    assert abs(clocks["error"]) < 0.012
+
+
+@pytest.mark.parametrize(("truth", "stays"), [("sim", True), ("moved", False), ("none", False)])
+def test_a_truth_that_an_offset_moves_or_that_is_none_judges_no_clock(truth, stays, monkeypatch):
+    import flowgraph.study.trials as trials
+
+    def flight(data, seed, settings):
+        made = load_flight("sim", settings={n: str(v) for n, v in SHORT.items()})
+        assert made.truth is not None
+        late = round(float(settings.get("vicon.time_offset", 0.0)) * 1e9)
+        known = made.truth if truth == "sim" else Series(made.truth.time + late, made.truth.values)
+        return replace(made, truth=None if truth == "none" else known)
+
+    monkeypatch.setattr(trials, "loaded", flight)
+    monkeypatch.setattr(trials, "prepared", lambda g, data, seed, settings: (None, flight(data, seed, {})))
+    problem = Trials("ekf", [Recording("sim")], SHORT, "likelihood", None, "reference")
+    assert _truth_stays(problem, [Fit("vicon.time_offset", -0.1, 0.1)]) is stays
