@@ -35,7 +35,7 @@ class Tape:
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
         time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [None if len(s) == len(time) else np.searchsorted(time, s.time) for s in series]
+        rows = [None if len(s) == len(time) else _rows(time, s.time) for s in series]
         if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
             time = np.concatenate([s.time for s in series])
             time.sort(kind="stable")  # merges runs that are sorted already
@@ -62,8 +62,11 @@ class Tape:
     @property
     def patterns(self) -> tuple[int, ...]:
         """The keys that occur, in order."""
-        few = len(self.series) <= 16
-        return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
+        if len(self.series) > 16:
+            return tuple(np.unique(self.key).tolist())
+        seen = np.zeros(1 << len(self.series), bool)
+        seen[self.key] = True
+        return tuple(np.flatnonzero(seen).tolist())
 
 
 def need_near(first: int, time: int) -> None:
@@ -80,6 +83,17 @@ def need_near(first: int, time: int) -> None:
             got=f"{time - first} ns",
             fix="check the unit and the origin of the stamps: one source may count from another time",
         )
+
+
+def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Where `some` times lie among all; counted where these are equally far apart, and else looked for."""
+    if len(time) > 1 and len(some) and time[0] <= some[0] and some[-1] <= time[-1]:
+        step = (int(time[-1]) - int(time[0])) // (len(time) - 1)
+        if 0 < step and int(time[-1]) - int(time[0]) < 2**63:
+            rows = (some - time[0]) // step
+            if rows[-1] < len(time) and np.array_equal(time.take(rows, mode="clip"), some):
+                return np.asarray(rows)
+    return np.searchsorted(time, some)
 
 
 def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
