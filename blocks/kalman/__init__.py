@@ -5,8 +5,9 @@ it, in Joseph form, with gates and with missing entries; its extended form takes
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open, `robust` for outliers, and `learned` for a noise
 that nobody knows. `smoothing` goes back over a run and adds to each state what later measurements say of it;
-`backward` is that as a graph, `parallel` filters and smooths all steps of a recording at once, and `learning` finds the linear model that explains a recording. What moves and
-what is measured is not said here: see `models`.
+`backward` is that as a graph, `parallel` filters and smooths all steps of a recording at once, and `learning`
+finds the linear model that explains a recording. What moves and what is measured is not said here: see
+`models`.
 """
 
 from __future__ import annotations
