@@ -41,7 +41,7 @@ def tick_by_tick(monkeypatch: pytest.MonkeyPatch, work: Any) -> Any:
         return work()
 
 
-def full_or_result(drawn_graph: Any, inputs: Any) -> Result | tuple[str, int]:
+def full_or_result(drawn_graph: Any, inputs: Any) -> Result | tuple[str, int | None]:
     try:
         return simulate(drawn_graph, inputs)
     except FifoOverflowError as error:
@@ -122,8 +122,9 @@ def test_a_step_that_does_more_than_compute_is_called(capsys):
         return x + 1.0
 
     @block
-    def choosing(x):
-        return x + 2.0 if isinstance(x, np.generic) else x + 3.0
+    def choosing(x: Any):
+        more: float = 2.0 if isinstance(x, np.generic) else 3.0
+        return x + more
 
     def quiet(x):
         return x * 2.0
@@ -144,8 +145,8 @@ def test_a_step_that_does_more_than_compute_is_called(capsys):
 
 def test_an_error_leaves_the_registers_of_the_last_good_tick():
     @block
-    def tender(x):
-        if isinstance(x, np.generic) and x > 2.0:
+    def tender(x: Any):
+        if isinstance(x, np.generic) and float(x) > 2.0:  # type: ignore[arg-type]
             raise RuntimeError("too much")
         return x
 

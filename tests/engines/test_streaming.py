@@ -106,7 +106,7 @@ def test_what_the_folder_holds_is_respected(tmp_path):
     simulate_to_parquet(two.build(), inputs(10), tmp_path / "a")
     with pytest.raises(DataError, match="already here") as error:
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "a")
-    assert "resume=True" in error.value.fix
+    assert "resume=True" in str(error.value.fix)
     with pytest.raises(DataError, match="another seed"):
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "a", seed=1, resume=True)
     with pytest.raises(DataError, match="no streamed run"):

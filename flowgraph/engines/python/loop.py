@@ -80,7 +80,7 @@ def _may(graph: Graph) -> bool:
 
 def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
     which = _Which(graph, patterns)
-    lines, owner = ["def react(ticks):", "    t = None"], {}
+    lines, owner = ["def react(ticks):", "    t = None"], dict[int, str]()
     stores = []
     for index, register in graph.registers:
         if index in which.registers:
