@@ -3,38 +3,7 @@
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
-from flowgraph.errors import (
-    ClockError,
-    CycleError,
-    DataError,
-    DeclarationError,
-    DivergedError,
-    FifoOverflowError,
-    FlowgraphError,
-    LoweringError,
-    MissingDependencyError,
-    OutputError,
-    PipelineError,
-    PluginError,
-    TypeMismatchError,
-    UnknownNameError,
-)
-from flowgraph.language.block import Block, block, when
-from flowgraph.language.clock import aperiodic, periodic
-from flowgraph.language.declare import delay, graph
-from flowgraph.language.graph import Graph
-from flowgraph.language.joins import collect, every, latest, merge, sink
-from flowgraph.language.late import absent_for, label_data, resample_at, zip_last
-from flowgraph.language.moore import moore
-from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
-from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
-from flowgraph.language.stamps import stamp_of
-from flowgraph.language.stream import Held, Stream, apply
-from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
-from flowgraph.language.typed import Namespace, typed_block
-from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
 from flowgraph.moved import lead as _lead
-from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 from flowgraph.verbs import provide as _provide
 
 if _TYPE_CHECKING:
@@ -53,12 +22,111 @@ if _TYPE_CHECKING:
     from flowgraph.engines.python.run import Run
     from flowgraph.engines.simulate import simulate
     from flowgraph.engines.state import load_state, save_state
+    from flowgraph.engines.streaming import Streamed, simulate_to_parquet
+    from flowgraph.errors import (
+        ClockError,
+        CycleError,
+        DataError,
+        DeclarationError,
+        DivergedError,
+        FifoOverflowError,
+        FlowgraphError,
+        LoweringError,
+        MissingDependencyError,
+        OutputError,
+        PipelineError,
+        PluginError,
+        TypeMismatchError,
+        UnknownNameError,
+    )
+    from flowgraph.language.block import Block, block, when
+    from flowgraph.language.clock import aperiodic, periodic
+    from flowgraph.language.declare import delay, graph
+    from flowgraph.language.graph import Graph
+    from flowgraph.language.joins import collect, every, latest, merge, sink
+    from flowgraph.language.late import absent_for, label_data, resample_at, zip_last
+    from flowgraph.language.moore import moore
+    from flowgraph.language.operations import drop, group_by, scan, take_while, tap, until, unzip
+    from flowgraph.language.pairs import match, zip, zip_latest, zip_latest_right
+    from flowgraph.language.stamps import stamp_of
+    from flowgraph.language.stream import Held, Stream, apply
+    from flowgraph.language.timed import delta_time, high_pass, integrate, low_pass
+    from flowgraph.language.typed import Namespace, typed_block
+    from flowgraph.language.windows import batch, flat_map, padded, reduce, stacked, window
     from flowgraph.pipeline.lowering import lower
     from flowgraph.pipeline.pipeline import Pipeline
     from flowgraph.recorder.derivatives import jacobian
+    from flowgraph.types import Array, Scalar, Signal, Tick, boolean, integer, real
 
-# What is done with a graph is imported when it is first asked for: who declares pays for no engine.
+# A name is imported when it is first asked for: who declares a graph pays for no engine, and who asks for a
+# version pays for neither.
 _LATER = {
+    "ClockError": "flowgraph.errors",
+    "CycleError": "flowgraph.errors",
+    "DataError": "flowgraph.errors",
+    "DeclarationError": "flowgraph.errors",
+    "DivergedError": "flowgraph.errors",
+    "FifoOverflowError": "flowgraph.errors",
+    "FlowgraphError": "flowgraph.errors",
+    "LoweringError": "flowgraph.errors",
+    "MissingDependencyError": "flowgraph.errors",
+    "OutputError": "flowgraph.errors",
+    "PipelineError": "flowgraph.errors",
+    "PluginError": "flowgraph.errors",
+    "TypeMismatchError": "flowgraph.errors",
+    "UnknownNameError": "flowgraph.errors",
+    "Block": "flowgraph.language.block",
+    "block": "flowgraph.language.block",
+    "when": "flowgraph.language.block",
+    "aperiodic": "flowgraph.language.clock",
+    "periodic": "flowgraph.language.clock",
+    "delay": "flowgraph.language.declare",
+    "graph": "flowgraph.language.declare",
+    "Graph": "flowgraph.language.graph",
+    "collect": "flowgraph.language.joins",
+    "every": "flowgraph.language.joins",
+    "latest": "flowgraph.language.joins",
+    "merge": "flowgraph.language.joins",
+    "sink": "flowgraph.language.joins",
+    "absent_for": "flowgraph.language.late",
+    "label_data": "flowgraph.language.late",
+    "resample_at": "flowgraph.language.late",
+    "zip_last": "flowgraph.language.late",
+    "moore": "flowgraph.language.moore",
+    "drop": "flowgraph.language.operations",
+    "group_by": "flowgraph.language.operations",
+    "scan": "flowgraph.language.operations",
+    "take_while": "flowgraph.language.operations",
+    "tap": "flowgraph.language.operations",
+    "until": "flowgraph.language.operations",
+    "unzip": "flowgraph.language.operations",
+    "match": "flowgraph.language.pairs",
+    "zip": "flowgraph.language.pairs",
+    "zip_latest": "flowgraph.language.pairs",
+    "zip_latest_right": "flowgraph.language.pairs",
+    "stamp_of": "flowgraph.language.stamps",
+    "Held": "flowgraph.language.stream",
+    "Stream": "flowgraph.language.stream",
+    "apply": "flowgraph.language.stream",
+    "delta_time": "flowgraph.language.timed",
+    "high_pass": "flowgraph.language.timed",
+    "integrate": "flowgraph.language.timed",
+    "low_pass": "flowgraph.language.timed",
+    "Namespace": "flowgraph.language.typed",
+    "typed_block": "flowgraph.language.typed",
+    "batch": "flowgraph.language.windows",
+    "flat_map": "flowgraph.language.windows",
+    "padded": "flowgraph.language.windows",
+    "reduce": "flowgraph.language.windows",
+    "stacked": "flowgraph.language.windows",
+    "window": "flowgraph.language.windows",
+    "Array": "flowgraph.types",
+    "Scalar": "flowgraph.types",
+    "Signal": "flowgraph.types",
+    "Tick": "flowgraph.types",
+    "boolean": "flowgraph.types",
+    "integer": "flowgraph.types",
+    "real": "flowgraph.types",
     "batched": "flowgraph.data.arrival",
     "delayed": "flowgraph.data.arrival",
     "reorder": "flowgraph.data.arrival",
@@ -85,6 +153,8 @@ _LATER = {
     "Checkpoint": "flowgraph.engines.options",
     "Run": "flowgraph.engines.python.run",
     "simulate": "flowgraph.engines.simulate",
+    "simulate_to_parquet": "flowgraph.engines.streaming",
+    "Streamed": "flowgraph.engines.streaming",
     "load_state": "flowgraph.engines.state",
     "save_state": "flowgraph.engines.state",
     "lower": "flowgraph.pipeline.lowering",
@@ -164,6 +234,7 @@ __all__ = [
     "Series",
     "Signal",
     "Stream",
+    "Streamed",
     "Tick",
     "TypeMismatchError",
     "UnknownNameError",
@@ -210,6 +281,7 @@ __all__ = [
     "scan",
     "simulate",
     "simulate_many",
+    "simulate_to_parquet",
     "sink",
     "stacked",
     "stamp_of",

@@ -88,10 +88,11 @@ class _Moved:
         module.__spec__ = self._own.pop(spec.name)
 
 
-class _Package(ModuleType):
-    """The package at the top: an old module never takes the place of the function of its name.
+class Package(ModuleType):
+    """A package in which a module never takes the place of the function of its name.
 
-    To import `flowgraph.graph` would set the attribute `graph`, which is the decorator.
+    To import `flowgraph.graph` would set the attribute `graph`, which is the decorator; so would
+    `flowgraph.graphs.ekf` hide the graph.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -101,5 +102,5 @@ class _Package(ModuleType):
 
 def lead(package: ModuleType) -> None:
     """Let old names lead to the modules, and let `package` keep what it lists in `__all__`."""
-    package.__class__ = _Package
+    package.__class__ = Package
     sys.meta_path.insert(0, _Moved())  # before files below a package that moved are found a second time

@@ -71,9 +71,10 @@ def test_the_plain_model_of_the_libraries_moves_as_its_states_say():
 
 def test_the_import_bench_names_the_heaviest_modules(capsys):
     main(["--quick", "--json", "--only", "import"])
-    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    row, declared, first = json.loads(capsys.readouterr().out)["rows"]
     modules = row["details"]["heaviest_modules"]
-    assert row["bound"] == "ours < 0.4 s"
+    assert (row["bound"], first["bound"]) == ("ours < 0.06 s", "ours <= 0.5 s")
+    assert 0.0 < row["ours"] < declared["ours"] < first["ours"]  # each does what the one before did, and more
     assert row["details"]["bare_process_s"] > 0.0
     assert len(modules) == 15
     times = [m["own_ms"] for m in modules]
@@ -81,7 +82,7 @@ def test_the_import_bench_names_the_heaviest_modules(capsys):
 
 
 def test_every_module_that_an_import_brings_is_weighed():
-    names = {m["module"] for m in imports.heaviest("flowgraph", 10_000)}
+    names = {m["module"] for m in imports.heaviest("flowgraph.language.graph", 10_000)}
     assert {"flowgraph", "flowgraph.language.graph", "numpy"} <= names
 
 

@@ -28,12 +28,30 @@ def test_links_are_relative(name: str) -> None:
     assert not (ROOT / name).is_symlink()
 
 
-def test_import_is_light() -> None:
-    """`import flowgraph` loads no library that only some of its uses need."""
-    code = f"import sys, flowgraph; print(*[name for name in {HEAVY!r} if name in sys.modules])"
+def loaded(program: str, names: tuple[str, ...]) -> list[str]:
+    """Which of the modules a fresh process has loaded after some lines."""
+    code = f"import sys\n{program}\nprint(*[name for name in {names!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
+    return done.stdout.split()
+
+
+def test_import_is_light() -> None:
+    """`import flowgraph` loads nothing that no name was asked of; to declare loads no library but NumPy."""
+    assert loaded("import flowgraph", (*HEAVY, "numpy", "flowgraph.types", "flowgraph.language")) == []
+    declare = "from flowgraph import Signal, Stream, block, graph, latest, real, window, zip, simulate"
+    assert loaded(declare, HEAVY) == []
+    assert loaded(declare, ("numpy", "flowgraph.language.graph"))  # the test can see what is loaded
+
+
+def test_a_graph_brings_no_other_graph() -> None:
+    others = ("flowgraph.graphs.ukf", "flowgraph.graphs.rbpf_indoor", "cv2")
+    assert loaded("from flowgraph.graphs import ins_eskf", others) == []
+    whole = (
+        "from flowgraph.graphs import ekf, ins_eskf; import flowgraph.graphs.ekf; ekf.build, ins_eskf.build"
+    )
+    assert loaded(f"{whole}; from flowgraph.graphs import ekf; ekf.build", others) == []
+    assert loaded("from flowgraph.graphs import ukf", others) == ["flowgraph.graphs.ukf"]
 
 
 def test_entry_points_exist() -> None:

@@ -5,8 +5,9 @@ it, in Joseph form, with gates and with missing entries; its extended form takes
 its Jacobian. `roots` carries a triangular root of the covariance instead, with twice the digits. `lost` is
 for controls that do not come and gates that do not open, `robust` for outliers, and `learned` for a noise
 that nobody knows. `smoothing` goes back over a run and adds to each state what later measurements say of it;
-`backward` is that as a graph, and `learning` finds the linear model that explains a recording. What moves and
-what is measured is not said here: see `models`.
+`backward` is that as a graph, `parallel` filters and smooths all steps of a recording at once, and `learning`
+finds the linear model that explains a recording. What moves and what is measured is not said here: see
+`models`.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ from flowgraph.blocks.kalman.lost import (
     stay,
 )
 from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
+from flowgraph.blocks.kalman.parallel import LinearSteps, Passed, linear_pass
 from flowgraph.blocks.kalman.robust import ROBUST, Robust, huber, reweighted, student_t
 from flowgraph.blocks.kalman.roots import correct_root, predict_root, update_extended_root, update_root
 from flowgraph.blocks.kalman.smoothing import (
@@ -103,6 +105,9 @@ __all__ = [
     "lost_variances",
     "covariance_root",
     "LinearModel",
+    "LinearSteps",
+    "Passed",
+    "linear_pass",
     "LinearGaussian",
     "Learned",
     "LEARNT",

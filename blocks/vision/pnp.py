@@ -24,7 +24,6 @@ from __future__ import annotations
 import itertools
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -36,7 +35,6 @@ from flowgraph.blocks.vision.tags import TagMap
 
 __all__ = ["Solution", "find_pose", "quaternion_of", "rotation_of", "solve"]
 
-_REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-14)
 _HOPELESS = 4.0  # a start with so many times the best one's error is not refined
 _APART = 16.0  # squared errors closer than this, in units of the noise, do not tell two poses apart
 _DOUBTFUL = 4.0  # a tag so many deviations off (root mean square of its corners) makes the others be asked
@@ -100,6 +98,9 @@ def _fit(
     pixel_noise: float,
 ) -> Solution | None:
     """The pose that all tags together explain best."""
+    import cv2  # it takes 50 ms, for which only who solves for a pose should wait
+
+    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-14)
     used = np.ones(len(z), bool)
     z = np.ascontiguousarray(z.reshape(-1, 2))
     X = np.ascontiguousarray(X.reshape(-1, 3))
@@ -107,7 +108,7 @@ def _fit(
         return None
     found = []
     for r, t in _starts(z, X, camera, near):
-        r, t = cv2.solvePnPRefineLM(X, z, camera.K, np.array(camera.distortion), r, t, _REFINE)
+        r, t = cv2.solvePnPRefineLM(X, z, camera.K, np.array(camera.distortion), r, t, until)
         error = _squared_error(z, X, camera, r, t)
         if np.isfinite(error):
             found.append((error, r, t))
@@ -180,6 +181,8 @@ def _starts(
     z: np.ndarray, X: np.ndarray, camera: Camera, near: tuple[np.ndarray, np.ndarray] | None
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Rotation vectors (3, 1) and translations (3, 1) worth refining."""
+    import cv2  # as above
+
     ideal = np.ascontiguousarray(camera.undistort(z))
     flags = [cv2.SOLVEPNP_SQPNP]
     centred = X - X.mean(axis=0)
@@ -200,6 +203,8 @@ def _starts(
 
 def _squared_error(z: np.ndarray, X: np.ndarray, camera: Camera, r: np.ndarray, t: np.ndarray) -> float:
     """The sum of squared distances, px^2; infinite where a point would lie behind the camera."""
+    import cv2  # as above
+
     seen = X @ cv2.Rodrigues(r)[0].T + t[:, 0]
     if not (np.isfinite(seen).all() and (seen[:, 2] > 1e-6).all()):
         return np.inf

@@ -334,7 +334,8 @@ def check_event(
 ) -> tuple[int, Any]:
     """Check one event as it arrives; returns it with an integer time and read-only arrays."""
     time = check_stamp(name, time)
-    check_times(name, np.asarray([time], dtype=np.int64), timing, before)
+    if before == NEVER or time <= before or not _as_declared(time - before, timing):
+        check_times(name, np.asarray([time], dtype=np.int64), timing, before)
     return time, check_value(name, time, value, type_)
 
 

@@ -7,6 +7,7 @@ tick by tick (`merged`). Either way a tick is a time and a key, with bit k set w
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,9 @@ import numpy as np
 from flowgraph.data.series import Series
 from flowgraph.errors import DataError
 from flowgraph.language.graph import NEVER, Graph
-from flowgraph.types import DTYPES, StructType, Type, flatten, leaves_of, unflatten
+from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
+
+_WIDE = 64
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Tape:
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
         time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [None if len(s) == len(time) else np.searchsorted(time, s.time) for s in series]
+        rows = [None if len(s) == len(time) else _rows(time, s.time) for s in series]
         if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
             time = np.concatenate([s.time for s in series])
             time.sort(kind="stable")  # merges runs that are sorted already
@@ -59,8 +62,11 @@ class Tape:
     @property
     def patterns(self) -> tuple[int, ...]:
         """The keys that occur, in order."""
-        few = len(self.series) <= 16
-        return tuple((np.flatnonzero(np.bincount(self.key)) if few else np.unique(self.key)).tolist())
+        if len(self.series) > 16:
+            return tuple(np.unique(self.key).tolist())
+        seen = np.zeros(1 << len(self.series), bool)
+        seen[self.key] = True
+        return tuple(np.flatnonzero(seen).tolist())
 
 
 def check_stamp(name: str, time: Any) -> int:
@@ -102,6 +108,17 @@ def need_near(first: int, time: int) -> None:
             got=f"{time - first} ns",
             fix="check the unit and the origin of the stamps: one source may count from another time",
         )
+
+
+def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Where `some` times lie among all; counted where these are equally far apart, and else looked for."""
+    if len(time) > 1 and len(some) and time[0] <= some[0] and some[-1] <= time[-1]:
+        step = (int(time[-1]) - int(time[0])) // (len(time) - 1)
+        if 0 < step and int(time[-1]) - int(time[0]) < 2**63:
+            rows = (some - time[0]) // step
+            if rows[-1] < len(time) and np.array_equal(time.take(rows, mode="clip"), some):
+                return np.asarray(rows)
+    return np.searchsorted(time, some)
 
 
 def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
@@ -156,11 +173,23 @@ def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series
         columns = [list(c) for c in zip(*(flatten(v, type_) for v in values), strict=True)] or [
             [] for _ in leaves
         ]
-    made: list[np.ndarray] = [
-        np.asarray(column, dtype=DTYPES[leaf.dtype]).reshape(len(times), *leaf.shape)
-        for column, (_, leaf) in zip(columns, leaves, strict=True)
-    ]
+    return joined(times, columns, type_, name)
+
+
+def joined(times: list[int], columns: Iterable[list[Any]], type_: Type, name: str) -> Series:
+    """A series from times and a list of values for each leaf."""
+    made = [_stacked(column, leaf) for column, (_, leaf) in zip(columns, leaves_of(type_), strict=True)]
     return Series(np.asarray(times, dtype=np.int64), unflatten(type_, iter(made)), type=type_, name=name)
+
+
+def _stacked(column: Any, leaf: ArrayType) -> np.ndarray:
+    """One array (n, ...) of n values of a leaf."""
+    kind = DTYPES[leaf.dtype]
+    wide = math.prod(d for d in leaf.shape if isinstance(d, int)) >= _WIDE
+    if wide and column and all(type(x) is np.ndarray and x.shape == leaf.shape for x in column):
+        whole = np.concatenate(column)  # copies whole arrays, where `asarray` asks each for its numbers
+        return whole.astype(kind, copy=False).reshape(len(column), *leaf.shape)
+    return np.asarray(column, dtype=kind).reshape(len(column), *leaf.shape)
 
 
 def merged(

@@ -73,6 +73,8 @@ class NumpyNamespace:
     @staticmethod
     def asarray(x: Any, /, *, dtype: Any = None, copy: bool | None = None) -> Any:
         """`numpy.asarray`; what becomes a whole number does so as in `astype`."""
+        if type(x) is np.ndarray and copy is None and (dtype is None or x.dtype == dtype):
+            return x
         if dtype is None:
             return np.asarray(x, copy=copy)
         found = np.asarray(x)

@@ -16,13 +16,14 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from statistics import NormalDist
 from typing import Any, Protocol
 
 import numpy as np
 
 from flowgraph.errors import DeclarationError
+from flowgraph.recorder import numpy_random
 from flowgraph.recorder.namespaces import NUMPY
 
 ROUNDS = 7
@@ -126,16 +127,36 @@ class Site:
     kind: str
     shape: tuple[int, ...]
 
-    @property
+    @cached_property
     def hash(self) -> int:
         """The 32-bit number that stands for the name in the counter."""
         return int.from_bytes(hashlib.blake2b(self.name.encode(), digest_size=4).digest(), "little")
 
     def numbers(self, time: Any, seed: Any, *, xp: Any) -> Any:
         """The draws of this site at a time."""
+        if xp is NUMPY:
+            return _in_numpy(self.kind, self.shape, self.hash, time, seed)
         bits = words(math.prod(self.shape), self.hash, time, seed, xp=xp)
         made = {"normal": normal_from, "uniform": uniform_from}[self.kind](bits, xp=xp)
         return xp.reshape(made, self.shape)
+
+
+def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.ndarray) -> Any:
+    """The same numbers as in any namespace, with fewer passes over them."""
+    count = math.prod(shape)
+    if kind == "uniform" and count <= numpy_random.FEW:
+        few = [(w >> 8) * 2.0**-24 for w in numpy_random.few_words(count, name, int(time), seed, ROUNDS)]
+        return np.array(few).reshape(shape)
+    bits = numpy_random.words(count, name, time, seed, ROUNDS)
+    if kind == "uniform":
+        return uniform_from(bits, xp=NUMPY).reshape(shape)
+    made = numpy_random.normals(bits, _pairs(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
+    return made.reshape(shape)
+
+
+@lru_cache(maxsize=1)
+def _pairs() -> np.ndarray:
+    return numpy_random.pairs(*segments(), _BASE)
 
 
 def site(prefix: str, kind: str, name: str, shape: Any) -> Site:
@@ -168,10 +189,20 @@ class NumpyDraw:
         self._prefix, self._seed, self._time = prefix, seed, time
 
     def normal(self, name: str, shape: tuple[int, ...]) -> Any:
-        return site(self._prefix, "normal", name, shape).numbers(self._time, self._seed, xp=NUMPY)
+        return self._numbers("normal", name, shape)
 
     def uniform(self, name: str, shape: tuple[int, ...]) -> Any:
-        return site(self._prefix, "uniform", name, shape).numbers(self._time, self._seed, xp=NUMPY)
+        return self._numbers("uniform", name, shape)
+
+    def _numbers(self, kind: str, name: str, shape: tuple[int, ...]) -> Any:
+        try:
+            found = _known_site(self._prefix, kind, name, shape)
+        except TypeError:  # a shape that is no tuple of numbers: `site` says so
+            found = site(self._prefix, kind, name, shape)
+        return found.numbers(self._time, self._seed, xp=NUMPY)
+
+
+_known_site = lru_cache(maxsize=1024)(site)
 
 
 def seed_words(seed: int) -> np.ndarray:

@@ -32,11 +32,19 @@ def _whole(xp: Any, x: Any, kind: np.dtype[Any]) -> Any:
             number = limits.min if number < 0.0 else limits.max if number > 0.0 else 0
         return kind.type(int(number))
     least, beyond = x.dtype.type(limits.min), x.dtype.type(2.0 ** (limits.bits - (kind.kind == "i")))
+    if isinstance(x, np.ndarray) and x.size and _within(x, least, beyond):
+        return x.astype(kind)  # as nearly always
     fits = (x >= least) & (x < beyond)  # False for NaN
     inside = xp.where(fits, x, x.dtype.type(0)).astype(kind)
     low, high = kind.type(limits.min), kind.type(limits.max)
     found = xp.where(x >= beyond, high, xp.where(x < least, low, inside))
     return found[()] if isinstance(found, np.ndarray) and not found.ndim else found
+
+
+def _within(x: np.ndarray, least: Any, beyond: Any) -> bool:
+    """Whether all entries are; a NaN is not."""
+    low, high = np.minimum.reduce(x, axis=None), np.maximum.reduce(x, axis=None)
+    return bool(least <= low and high < beyond)
 
 
 def floor_divide(xp: Any, a: Any, b: Any) -> Any:

@@ -66,7 +66,7 @@ def against_numpy(*, duration: float = 20.0, repeats: int = 9) -> list[Row]:
         lambda: seconds(lambda: direct_eskf.run(**direct)) * scale,
         repeats,
     )
-    bound, met = "ratio <= 1.5", ratio <= 1.5
+    bound, met = "ratio <= 1.2", ratio <= 1.2
     return [Row("ins_eskf, python", ours, peer, "us/tick", "direct NumPy", ratio, bound, met)]
 
 

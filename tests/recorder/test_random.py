@@ -16,8 +16,9 @@ from flowgraph import (
     lower,
     simulate,
 )
-from flowgraph.recorder.namespaces import NUMPY
-from flowgraph.recorder.random import Site, normal_from, philox, seed_words
+from flowgraph.recorder import numpy_random
+from flowgraph.recorder.namespaces import NUMPY, NumpyNamespace
+from flowgraph.recorder.random import Site, normal_from, philox, seed_words, words
 
 PI = ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0")
 ONES = ("ffffffff " * 4, "ffffffff " * 2)
@@ -185,3 +186,22 @@ def test_names_of_one_hash_are_refused():
 
     with pytest.raises(DeclarationError, match="would draw the numbers of"):
         twice.build()
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform"])
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (16,), (17,), (3, 100)])
+def test_the_ways_of_numpy_give_the_same_numbers(kind, shape):
+    """Few are made with Python's integers, many with few passes; another namespace has neither."""
+    for time, seed in ((0, 0), (-5, 2**63 + 1), (2**62 + 7, 12345)):
+        site, key = Site("a/b", kind, shape), seed_words(seed)
+        ours, plain = (site.numbers(time, key, xp=xp) for xp in (NUMPY, NumpyNamespace()))
+        assert ours.dtype == plain.dtype
+        assert ours.shape == plain.shape
+        assert ours.tobytes() == plain.tobytes()
+
+
+@pytest.mark.parametrize("count", [1, 4, 16, 17, 1000])
+def test_words_are_the_same_by_python_s_integers(count):
+    few = numpy_random.few_words(count, 77, -3, seed_words(9), 7)
+    assert few == words(count, 77, -3, seed_words(9), xp=NUMPY).tolist()
+    assert few == numpy_random.words(count, 77, -3, seed_words(9), 7).tolist()

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from flowgraph.data.export.packages import needed
-from flowgraph.data.files import put
+from flowgraph.data.files import put, whole
 from flowgraph.data.frames import columns_of
 from flowgraph.data.series import Series
 from flowgraph.errors import writes
@@ -49,6 +50,51 @@ def write_parquet(
     return files
 
 
+class ParquetParts:
+    """Files that grow by row groups: `NAME/part-00000.parquet` and on, of which each is whole or not there.
+
+    Used as a context: what was added within it is one part of each stream. Where it ends with an error no
+    part of it is there.
+
+    Raises:
+        MissingDependencyError: without pyarrow.
+        OutputError: where a file cannot be written.
+    """
+
+    def __init__(self, folder: str | Path, number: int, about: Mapping[str, str]) -> None:
+        self._arrow, self._parquet = (needed(p, "Parquet", "parquet") for p in ("pyarrow", "pyarrow.parquet"))
+        self._folder, self._number, self._about = Path(folder), number, about
+        self._open = ExitStack()
+        self._writers: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def add(self, streams: Mapping[str, Series]) -> None:
+        """One row group of each stream that has events."""
+        for name, series in streams.items():
+            table = _table(self._arrow, series, self._about)
+            if name not in self._writers:
+                file = self._open.enter_context(whole(part_file(self._folder, name, self._number)))
+                self._writers[name] = self._parquet.ParquetWriter(file, table.schema)
+            if len(series):
+                self._writers[name].write_table(table)
+
+    def __exit__(self, *error: Any) -> bool | None:
+        if error[0] is None:
+            for writer in self._writers.values():
+                writer.close()
+        return self._open.__exit__(*error)
+
+
+def part_file(folder: str | Path, stream: str, number: int) -> Path:
+    """The file of a part of a stream; its folder is made."""
+    target = Path(folder) / stream.replace("/", ".")
+    with writes(target):
+        target.mkdir(parents=True, exist_ok=True)
+    return target / f"part-{number:05}.parquet"
+
+
 def _table(arrow: Any, series: Series, about: Mapping[str, str]) -> Any:
     own = {"time": series.time, **({"stamp": series.stamp} if series.is_late else {})}
     fields = [arrow.field(name, arrow.int64(), metadata={"unit": "ns"}) for name in own]
@@ -64,4 +110,4 @@ def _table(arrow: Any, series: Series, about: Mapping[str, str]) -> Any:
     return arrow.table(arrays, schema=arrow.schema(fields, metadata=dict(about)))
 
 
-__all__ = ["write_parquet"]
+__all__ = ["ParquetParts", "part_file", "write_parquet"]

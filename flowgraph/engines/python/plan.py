@@ -40,14 +40,23 @@ class Plan:
 def plan(graph: Graph, key: int) -> Plan:
     """The reaction for the pattern `key` (bit k: source k has an event); kept with the graph."""
     if key not in graph.plans:
-        writer = _Writer(graph, key)
+        writer = Writer(graph, key)
         text, nodes = writer.write()
-        names = "+".join(n for k, n in enumerate(graph.sources) if key >> k & 1) or "nothing"
-        file = f"<reaction of {graph.name} {id(graph):x} to {names}>"
-        linecache.cache[file] = (len(text), None, text.splitlines(True), file)
-        graph.plans[key] = Plan(compile(text, file, "exec"), text, nodes)
+        graph.plans[key] = compiled(graph, text, nodes, named(graph, key))
     found: Plan = graph.plans[key]
     return found
+
+
+def named(graph: Graph, key: int) -> str:
+    """A pattern by the names of its sources."""
+    return "+".join(n for k, n in enumerate(graph.sources) if key >> k & 1) or "nothing"
+
+
+def compiled(graph: Graph, text: str, nodes: Mapping[int, str], to: str) -> Plan:
+    """A text as code, which tracebacks and debuggers can show."""
+    file = f"<reaction of {graph.name} {id(graph):x} to {to}>"
+    linecache.cache[file] = (len(text), None, text.splitlines(True), file)
+    return Plan(compile(text, file, "exec"), text, nodes)
 
 
 def presence(result: Any) -> tuple[bool, Any]:
@@ -57,7 +66,9 @@ def presence(result: Any) -> tuple[bool, Any]:
     return result if isinstance(result, When) else (True, result)
 
 
-class _Writer:
+class Writer:
+    """Writes the reaction to one pattern."""
+
     def __init__(self, graph: Graph, key: int) -> None:
         self.graph = graph
         self.present = {node.clock: bool(key >> k & 1) for k, node in enumerate(graph.sources.values())}
@@ -67,31 +78,58 @@ class _Writer:
         self.indent = 1
 
     def write(self) -> tuple[str, dict[int, str]]:
+        self.reaction()
+        return "\n".join(self.lines) + "\n", self.owner
+
+    def reaction(self) -> None:
+        """The lines of one tick: what is present, the calls in their order, then all that is written."""
+        before = len(self.lines)
         for k, (index, node) in enumerate(
             (i, n) for i, n in enumerate(self.graph.nodes) if isinstance(n, SourceNode)
         ):
             if self.present[node.clock]:
-                self.emit(f"x{index} = n{k}()", node.path)
+                self.read(index, k, node)
         for index, call in self.graph.calls:
             self.call(index, call)
         for index, call in self.graph.calls:
             firing = self.when(call.firing)
             if call.state is not None:
-                self.guarded(firing, f"r[{call.state}] = s{index}", call.path)
+                self.guarded(firing, self.remembered(index, call.state), call.path)
             if call.stamp is not None:
-                self.guarded(firing, f"r[{call.stamp}] = t", call.path)
+                self.guarded(firing, f"{self.stamp(call.stamp)} = t", call.path)
         for index, register in self.graph.registers:
             if register.feed is not None:
-                self.guarded(
-                    self.fresh(register.feed), f"r[{index}] = {self.value(register.feed)}", register.path
-                )
+                self.guarded(self.fresh(register.feed), self.fed(index, register.feed), register.path)
         for k, collected in enumerate(self.graph.collected):
             self.guarded(
-                self.fresh(collected.wire), f"c{k}({self.value(collected.wire)}); u{k}(t)", collected.name
+                self.fresh(collected.wire), f"{self.kept(k, collected.wire)}; u{k}(t)", collected.name
             )
-        if len(self.lines) == 1:
+        if len(self.lines) == before:
             self.emit("pass", "")
-        return "\n".join(self.lines) + "\n", self.owner
+
+    def read(self, index: int, k: int, node: SourceNode) -> None:
+        """The line that takes the next value of source k."""
+        self.emit(f"x{index} = n{k}()", node.path)
+
+    def held(self, register: int) -> str:
+        """What a register holds, as a block is handed it."""
+        return f"r[{register}]"
+
+    def stamp(self, register: int) -> str:
+        """The place of the time at which a call last fired."""
+        return f"r[{register}]"
+
+    def remembered(self, index: int, register: int) -> str:
+        """The line that writes the new state of a call."""
+        return f"r[{register}] = s{index}"
+
+    def fed(self, register: int, wire: Wire) -> str:
+        """The line that writes a stream into its register."""
+        return f"r[{register}] = {self.value(wire)}"
+
+    def kept(self, k: int, wire: Wire) -> str:
+        """The statement that keeps the value of collected stream k."""
+        return f"c{k}({self.value(wire)})"
 
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)
@@ -140,7 +178,7 @@ class _Writer:
             return "None"
         register = self.graph.nodes[argument.register]
         assert isinstance(register, RegisterNode)
-        held = f"r[{argument.register}]"
+        held = self.held(argument.register)
         if register.role == "latest" and register.feed is not None:
             return self.choose(self.fresh(register.feed), self.value(register.feed), held)
         return held
@@ -151,15 +189,18 @@ class _Writer:
 
     def call(self, index: int, call: CallNode) -> None:
         firing = self.when(call.firing)
-        if firing is False:
-            return
+        if firing is not False:
+            self.fire(index, call, firing)
+
+    def fire(self, index: int, call: CallNode, firing: Presence) -> None:
+        """The lines of a call that fires, or fires on a condition."""
         outputs = [f"v{index}_{k}" for k in range(len(call.outputs))]
         if firing is not True:
             for k, (name, dynamic) in enumerate(zip(outputs, call.dynamic, strict=True)):
                 self.emit(f"{name} = None" + (f"; p{index}_{k} = False" if dynamic else ""), call.path)
             self.emit(f"if {firing}:", call.path)
             self.indent += 1
-        inputs = [f"r[{call.state}]"] if call.state is not None else []
+        inputs = [self.held(call.state)] if call.state is not None else []
         inputs += [self.argument(a) for a in call.arguments]
         inputs += [f"{k}=k{index}_{k}" for k in call.settings]
         for handed in sorted(call.block.handed):
@@ -169,7 +210,7 @@ class _Writer:
                     "t": "int64(t)",
                     "xp": "xp",
                     "path": repr(call.path),
-                    "dt": self.dt(call.stamp),
+                    "dt": "" if call.stamp is None else self.dt(call.stamp),
                     "draw": f"d{index}(t)",
                 }[handed]
             )
@@ -186,19 +227,23 @@ class _Writer:
         if firing is not True:
             self.indent -= 1
 
-    def unpack(self, index: int, call: CallNode, k: int) -> str:
+    def variant(self, call: CallNode) -> Any:
+        """How its step was recorded, where the pattern says which of its optional inputs are there."""
         wires = [a.wire for a in call.arguments if a.optional and a.wire is not None]
         choice = tuple(self.fresh(w) for w in wires)
-        step = call.variants.get(choice) if all(isinstance(c, bool) for c in choice) else None  # type: ignore[arg-type]
+        return call.variants.get(choice) if all(isinstance(c, bool) for c in choice) else None  # type: ignore[arg-type]
+
+    def unpack(self, index: int, call: CallNode, k: int) -> str:
+        step = self.variant(call)
         name, flag = f"v{index}_{k}", f"p{index}_{k}"
         if not isinstance(step, StepTrace):
             return f"{flag}, {name} = presence({name})"
         known = step.outputs[k].presence
         return f"{flag} = {known == 'always'}" if isinstance(known, str) else f"{flag}, {name} = {name}"
 
-    @staticmethod
-    def dt(stamp: int | None) -> str:
-        return f"real((t - r[{stamp}]) * 1e-9) if r[{stamp}] != NEVER else real(0.0)"
+    def dt(self, stamp: int) -> str:
+        last = self.stamp(stamp)
+        return f"real((t - {last}) * 1e-9) if {last} != NEVER else real(0.0)"
 
 
 def _locked(value: Any) -> None:
@@ -265,9 +310,9 @@ def bindings(graph: Graph) -> dict[str, Any]:
     return names
 
 
-def bound(plan_: Plan, names: dict[str, Any]) -> Callable[[int], None]:
+def bound(plan_: Plan, names: dict[str, Any]) -> Callable[..., None]:
     """The reaction as a function, over one run's names."""
     scope = dict(names)
     exec(plan_.code, scope)  # text written above from the graph, never from a file
-    reaction: Callable[[int], None] = scope["react"]
+    reaction: Callable[..., None] = scope.pop("react")  # else it would hold itself
     return reaction

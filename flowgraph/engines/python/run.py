@@ -7,6 +7,7 @@ plain tree of arrays, which can be saved, loaded and resumed to the same bits.
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,19 +17,23 @@ from threading import Lock, get_ident
 from time import perf_counter
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 from flowgraph.data.arrival import stamp_events
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
-from flowgraph.data.tape import batches, merged, stack
+from flowgraph.data.tape import Tape, batches, joined, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
+from flowgraph.engines.python.loop import Loop, feed, loop, numbers
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
 from flowgraph.errors import DataError, FifoOverflowError
 from flowgraph.language.graph import NEVER, CallNode, Graph
 from flowgraph.recorder.random import NumpyDraw, seed_words
+from flowgraph.types import leaves_of
 
 _BATCH = 2048
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -86,6 +91,9 @@ class Run:
             self.state = state
         self._entrance = Entrance(graph, self._last, not_finite)
         self._recorded = True
+        self._loop: Loop | None = None
+        self._played = 0  # ticks of the tape
+        self._broken: list[int | None] = []  # the time of the tick that failed
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
         self._pushed: list[deque[Any]] | None = None
@@ -94,13 +102,21 @@ class Run:
             self._ticks: Iterator[tuple[int, int]] = iter(())
             feeds: list[Callable[[], Any]] = [q.popleft for q in self._pushed]
         else:
-            self._prepared = prepare(graph, inputs, self._last)
-            self._ticks, feeds = merged(self._prepared)
-            self._recorded = all(isinstance(s, Series) for s in self._prepared.values())
+            prepared = prepare(graph, inputs, self._last)
+            series = tuple(s for s in prepared.values() if isinstance(s, Series))
+            self._recorded = len(series) == len(prepared)
+            if self._recorded:
+                self._tape = Tape.of(series)
+                self._loop = loop(graph, self._tape.patterns)
+                self._ticks = zip(numbers(self._tape.time), numbers(self._tape.key), strict=True)
+                feeds = [feed(s, k, self._loop) for k, s in enumerate(series)]
+            else:
+                self._ticks, feeds = merged(prepared)
+        here = weakref.proxy(self)  # a run that nobody holds is gone at once, with all that it has kept
         self._names = {
             **bindings(graph),
             "r": self._registers,
-            "overflow": self._overflow,
+            "overflow": lambda index, time: here._overflow(index, time),
             **{
                 f"d{index}": partial(NumpyDraw, call.draws, self._key)
                 for index, call in graph.calls
@@ -111,12 +127,23 @@ class Run:
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
         }
         self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        self._columns: dict[int, list[list[Any]]] = {}  # of what the loop keeps by leaves
+        if self._loop is not None:
+            types = [graph.port(c.wire).type for c in graph.collected]
+            self._columns = {k: [[] for _ in leaves_of(types[k])] for k in self._loop.kept}
+            keep = {f"c{k}_{n}": c.append for k, some in self._columns.items() for n, c in enumerate(some)}
+            names = self._names | self._loop.names | keep | {"broken": self._broken.append}
+            self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
     @_alone
     def step(self) -> bool:
         """Advance one tick; False when the inputs have ended."""
         self._refuse_if_stopped()
+        if self._loop is not None:
+            before = self._played
+            self._go_on(1)
+            return self._played > before
         tick = next(self._ticks, None)
         if tick is None:
             return False
@@ -186,6 +213,16 @@ class Run:
     def to_end(self, meter: Meter | None = None, *, most: int | None = None) -> Run:
         """Run until the inputs end, or for `most` ticks, telling `meter` now and then."""
         self._refuse_if_stopped()
+        if self._loop is not None:
+            left = len(self._tape.time) - self._played
+            left = left if most is None else min(left, most)
+            while left > 0:
+                count = left if meter is None else min(left, _BATCH)
+                self._go_on(count)
+                left -= count
+                if meter is not None:
+                    meter.update(self.ticks, self.time)
+            return self
         for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
             self._advance(batch)
             if meter is not None:
@@ -234,6 +271,32 @@ class Run:
         self._account(batch)
         self.wall_s += perf_counter() - start
 
+    def _go_on(self, count: int) -> None:
+        """So many ticks of a recording in its loop, or as many as there are."""
+        start, first = perf_counter(), self._played
+        last = min(first + count, len(self._tape.time))
+        try:
+            self._goes_through(itertools.islice(self._ticks, last - first))
+        except BaseException as error:
+            at = next((time for time in self._broken if time is not None), int(self._tape.time[first]))
+            done = int(np.searchsorted(self._tape.time, at))
+            self._has_gone(first, done)
+            self._stopped = int(at)
+            self._explain(error, self._stopped)
+            raise
+        self._has_gone(first, last)
+        self.wall_s += perf_counter() - start
+
+    def _has_gone(self, first: int, last: int) -> None:
+        """Count ticks of the tape, and note when each source came last."""
+        self._played, self.ticks = last, self.ticks + last - first
+        if last > first:
+            self.time = max(self.time, int(self._tape.time[last - 1]))
+        for k, name in enumerate(self._last):
+            rows = np.flatnonzero(self._tape.key[first:last] >> k & 1)
+            if len(rows):
+                self._last[name] = int(self._tape.time[first + rows[-1]])
+
     def _refuse_if_stopped(self) -> None:
         if self._stopped is not None:
             raise DataError(
@@ -262,6 +325,7 @@ class Run:
         while trace is not None:
             if trace.tb_frame.f_code.co_name == "react":
                 for known in list(self.graph.plans.values()):
+                    known = known.plan if isinstance(known, Loop) else known
                     if (
                         isinstance(known, Plan)
                         and known.code.co_filename == trace.tb_frame.f_code.co_filename
@@ -319,10 +383,13 @@ class Run:
     def result(self) -> Result:
         """The collected streams so far."""
         self._refuse_others("result")
-        series = {
-            c.name: stack(times, values, self.graph.port(c.wire).type, c.name)
-            for c, times, values in zip(self.graph.collected, self._times, self._values, strict=True)
-        }
+        series = {}
+        for k, collected in enumerate(self.graph.collected):
+            type_, name, times = self.graph.port(collected.wire).type, collected.name, self._times[k]
+            by_leaf = k in self._columns
+            series[name] = (joined if by_leaf else stack)(
+                times, self._columns[k] if by_leaf else self._values[k], type_, name
+            )
         return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
 
     def drain(self) -> Result:
@@ -330,7 +397,7 @@ class Run:
         found = self.result()
         found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
         self._drained = self.ticks, self.wall_s
-        for kept in (*self._times, *self._values):
+        for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
             kept.clear()
         return found
 

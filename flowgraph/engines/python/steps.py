@@ -1,0 +1,271 @@
+"""Steps written out: what a block does, as lines of Python that need not call it.
+
+The recorded list of a step is its text: an operation on arrays becomes a line that calls NumPy's function
+itself, with nothing of the block around it, no signal to take apart and none to put together. Single numbers
+are Python's own, which cost less than the addition that a NumPy scalar takes part in, where Python does the
+same to the bit: sums, differences and products of reals (both are IEEE doubles), comparisons, logic,
+selections, and counts within 32 or 64 bits, which wrap around as NumPy's do. A quotient is not among them,
+which Python refuses where IEEE gives an infinity, nor is a function of a library.
+
+Left to be called is what somebody would miss: a step that was not recorded, one that draws, and a user's that
+does more than its list says, as one that prints.
+"""
+
+from __future__ import annotations
+
+import ast
+import dis
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from functools import partial
+from types import BuiltinFunctionType, CellType, FunctionType
+from typing import Any
+
+import numpy as np
+
+from flowgraph.language.block import Block
+from flowgraph.language.capturing import is_own_function, names_read
+from flowgraph.language.recording import StepTrace
+from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.ops import ELEMENTWISE, OPS, bound_attrs
+from flowgraph.recorder.trace import Instruction
+from flowgraph.types import ArrayType, Signal, StructType, Type, dtype_name, leaves_of
+
+_NOT_STRAIGHT = (
+    "POP_JUMP", "JUMP", "FOR_ITER", "RAISE", "STORE_GLOBAL", "STORE_ATTR", "STORE_SUBSCR", "STORE_DEREF",
+    "DELETE", "IMPORT", "YIELD", "RETURN_GENERATOR", "SEND", "BEFORE_WITH", "MAKE_FUNCTION",
+)  # fmt: skip
+_PLAIN = (bool, int, float, str, np.generic, np.ndarray, np.ufunc, ArrayType, StructType, Signal)
+
+KINDS = {"real": ("float", "real"), "bool": ("bool", "bool_"), "int32": ("int", "int32"),
+         "int64": ("int", "int64")}  # fmt: skip
+"""Kinds of single numbers that are written out: what makes one Python's, and what NumPy's."""
+
+_REAL = {
+    "add": "{0} + {1}", "subtract": "{0} - {1}", "multiply": "{0} * {1}", "square": "{0} * {0}",
+    "negative": "-{0}", "positive": "{0}", "abs": "abs({0})",
+}  # fmt: skip
+_COMPARED = {
+    "equal": "{0} == {1}", "not_equal": "{0} != {1}", "less": "{0} < {1}", "less_equal": "{0} <= {1}",
+    "greater": "{0} > {1}", "greater_equal": "{0} >= {1}",
+}  # fmt: skip
+_LOGIC = {
+    "logical_and": "{0} and {1}", "logical_or": "{0} or {1}", "logical_xor": "{0} != {1}",
+    "logical_not": "not {0}", "bitwise_and": "{0} and {1}", "bitwise_or": "{0} or {1}",
+    "bitwise_xor": "{0} != {1}", "bitwise_invert": "not {0}",
+}  # fmt: skip
+_WHOLE = {"add": "{0} + {1}", "subtract": "{0} - {1}", "multiply": "{0} * {1}"}
+_ENDS = {"minimum": "min({0}, {1})", "maximum": "max({0}, {1})"}
+_CASTS = {
+    ("bool", "real"): "float({0})", ("int32", "real"): "float({0})", ("int64", "real"): "float({0})",
+    ("bool", "int32"): "int({0})", ("bool", "int64"): "int({0})", ("int32", "int64"): "{0}",
+}  # fmt: skip
+
+
+_ARRAYS = {
+    "add": "{0} + {1}", "subtract": "{0} - {1}", "multiply": "{0} * {1}", "divide": "{0} / {1}",
+    "negative": "-{0}", "matmul": "{0} @ {1}", "matrix_transpose": "{0}.mT", "materialise": "{0}",
+}  # fmt: skip
+_LIFTED = 1_000_000  # added to the number of a value, for the same as an array
+_CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | {"vecdot"}
+
+
+@dataclass(frozen=True)
+class Line:
+    """An instruction as an expression of its arguments {0}, {1}, ..., and whether it is a Python number."""
+
+    instruction: Instruction
+    form: str
+    number: bool
+
+
+@dataclass(frozen=True)
+class Written:
+    """A step as text.
+
+    Args:
+        constants: as text, by value number.
+        lines: in their order.
+        numbers: the values that are Python's numbers; all others are NumPy's.
+        names: what the text needs, with the number of the call in them.
+        scalars: the values of NumPy's without axes.
+    """
+
+    constants: dict[int, str]
+    lines: list[Line]
+    numbers: set[int]
+    names: dict[str, Any]
+    scalars: set[int]
+
+
+def single(type_: ArrayType) -> bool:
+    """Whether a leaf passes from block to block as a number of Python's."""
+    return not type_.shape and type_.dtype in KINDS
+
+
+def written(step: Any, arguments: Sequence[Type | None], state: Type | None, call: int) -> Written | None:
+    """A recorded step as text; None where it has to be called. `call` is its number, for the names."""
+    if not isinstance(step, StepTrace) or step.sites:
+        return None
+    trace = step.trace
+    made = Written({}, [], {step.time, step.dt}, {}, set())
+    kinds: dict[int, str] = {step.time: "int64", step.dt: "real"}
+    for type_, numbers in ((state, step.state), *zip(arguments, step.arguments, strict=True)):
+        for n, (_, leaf) in zip(numbers or (), leaves_of(type_) if numbers and type_ else (), strict=True):
+            kinds[n] = leaf.dtype
+            if single(leaf):
+                made.numbers.add(n)
+    for n, array in trace.constants.items():
+        kinds[n] = dtype_name(array)
+        value = array.item() if not array.shape and kinds[n] in KINDS else None
+        if value is not None and (not isinstance(value, float) or math.isfinite(value)):
+            made.constants[n] = f"({value!r})"
+            made.numbers.add(n)
+        else:
+            made.constants[n] = f"k{call}_{n}"
+            made.names[made.constants[n]] = array
+    wanted = {n for o in step.outputs for n in (*o.leaves, o.presence) if isinstance(n, int)}
+    wanted |= set(step.next_state)
+    for i in reversed(trace.instructions):
+        if i.out in wanted:
+            wanted |= set(i.args)
+    first: dict[tuple[Any, ...], int] = {}  # what is computed twice, once
+    same: dict[int, int] = {}
+    for whole in trace.instructions:
+        if whole.out in wanted:
+            i = replace(whole, args=tuple(same.get(a, a) for a in whole.args))
+            kinds[i.out] = i.spec.dtype
+            again = first.setdefault((i.op, i.args, repr(i.attrs), i.spec), i.out)
+            if again != i.out:
+                same[i.out] = again
+                if again in made.numbers:
+                    made.numbers.add(i.out)
+                made.lines.append(Line(replace(i, args=(again,)), "{0}", again in made.numbers))
+                continue
+            form = _number(i, kinds) if made.numbers.issuperset(i.args) else None
+            if form is not None:
+                made.numbers.add(i.out)
+            elif not i.spec.shape:
+                made.scalars.add(i.out)
+            else:
+                i = _with_arrays(i, kinds, made, call)
+            made.lines.append(Line(i, form or _array(i, kinds, made, call), form is not None))
+    return made
+
+
+def _number(i: Instruction, kinds: dict[int, str]) -> str | None:
+    """An instruction on Python's numbers; None where Python might do another thing."""
+    of = [kinds[a] for a in i.args]
+    if i.spec.shape or i.spec.dtype not in KINDS or not of:
+        return None
+    if i.op == "where":
+        return "{1} if {0} else {2}" if of[0] == "bool" and of[1] == of[2] == i.spec.dtype else None
+    if i.op == "astype":
+        return "{0}" if of[0] == i.spec.dtype else _CASTS.get((of[0], i.spec.dtype))
+    if any(k != of[0] for k in of):
+        return None
+    if i.op in _COMPARED:
+        return _COMPARED[i.op]
+    if of[0] == "bool":
+        return _LOGIC.get(i.op)
+    if of[0] == "real":
+        return _REAL.get(i.op) if i.spec.dtype == "real" else None
+    if i.op in _ENDS:
+        return _ENDS[i.op]
+    half = 1 << (31 if of[0] == "int32" else 63)
+    whole = _WHOLE.get(i.op)
+    return None if whole is None else f"({whole} + {half}) % {2 * half} - {half}"
+
+
+def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> Instruction:
+    """The instruction, with arrays of no axes for the Python numbers that an array is combined with: NumPy
+    takes twice as long over the others."""
+    if i.op not in _ARRAYS or not i.spec.shape:
+        return i
+    given = []
+    for a in i.args:
+        if a in made.numbers and kinds[a] == "real":
+            lifted = a + _LIFTED
+            if a in made.constants:
+                made.constants[lifted] = f"k{call}_{lifted}"
+                made.names[made.constants[lifted]] = np.asarray(ast.literal_eval(made.constants[a]))
+            elif lifted not in kinds:
+                spec = i.spec._replace(shape=())
+                line = replace(i, op="asarray", args=(a,), attrs={}, out=lifted, spec=spec)
+                made.lines.append(Line(line, "asarray({0})", False))
+            kinds[lifted] = "real"
+            given.append(lifted)
+        else:
+            given.append(a)
+    return replace(i, args=tuple(given))
+
+
+def _array(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> str:
+    """An instruction on arrays, or on numbers of NumPy's."""
+    places = [f"{{{k}}}" for k in range(len(i.args))]
+    name = f"o{call}_{i.out}"
+    if not made.numbers.issuperset(i.args):
+        if i.op in _ARRAYS and not i.attrs:
+            return _ARRAYS[i.op]
+        if i.op == "reshape" and i.args[0] in made.scalars:
+            return f"{{0}}[{', '.join(['None'] * len(i.attrs['shape'])) or '()'}]"
+        if i.op == "reshape":
+            return f"{{0}}.reshape({tuple(i.attrs['shape'])})"
+        if i.op == "getitem":
+            return f"{{0}}[{_index(i.attrs['index'])}]"
+    if i.op == "concat":
+        return f"concatenate(({', '.join(places)},), {i.attrs['axis']})"
+    called = i.op in _CALLED and not i.attrs
+    if called:
+        made.names[name] = NUMPY.linalg.vecdot if i.op == "vecdot" else getattr(NUMPY, i.op)
+    else:
+        made.names[name] = partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, np.float64))
+    given = [
+        f"{KINDS[kinds[a]][1]}({p})"
+        if a in made.numbers and not (called and kinds[a] in ("real", "bool"))
+        else p
+        for p, a in zip(places, i.args, strict=True)
+    ]  # a whole number of Python's says not how wide it is
+    return f"{name}({', '.join(given)})"
+
+
+def _index(entries: Sequence[Any]) -> str:
+    """An index as text; what takes the whole of the last axes is left out, since it is the same view."""
+    kept = list(entries)
+    while len(kept) > 1 and kept[-1] == [None, None, None]:
+        kept.pop()
+    return ", ".join(
+        str(e) if isinstance(e, int) else ":".join("" if part is None else str(part) for part in e)
+        for e in kept
+    )
+
+
+def silent(step: Any) -> bool:
+    """Whether a function does nothing that its recorded list does not: nobody misses the call.
+
+    So it is for a user's function that is one straight expression of its arguments, of numbers, and of
+    functions that are so themselves. One that prints, branches on what it is handed, raises or writes is
+    called. Functions of this package only hand on the functions that they were given.
+    """
+    if isinstance(step, FunctionType):
+        held = [cell.cell_contents for cell in step.__closure__ or () if cell != CellType()]
+        held += [*(step.__defaults__ or ()), *(step.__kwdefaults__ or {}).values()]
+        if is_own_function(step):
+            code, around = step.__code__, step.__globals__
+            if any(i.opname.startswith(_NOT_STRAIGHT) for i in dis.get_instructions(code)):
+                return False
+            names = set(names_read(code)) - set(code.co_freevars)
+            if not all(name in around for name in names):
+                return False  # of Python itself, such as print
+            held += [around[name] for name in names]
+        return all(map(silent, held))
+    if isinstance(step, Block):
+        return silent(step.step)
+    if isinstance(step, partial):
+        return all(map(silent, (step.func, *step.args, *step.keywords.values())))
+    if isinstance(step, BuiltinFunctionType):
+        return step.__module__ == "_operator"
+    if isinstance(step, tuple):
+        return all(map(silent, step))
+    return step is None or isinstance(step, _PLAIN) or is_dataclass(step)

@@ -1,0 +1,89 @@
+"""The random words and normal numbers of `random`, in NumPy with few passes, or in Python for a few.
+
+The same integers, step by step. A product of 32 bits by 32 is written once as 64, and its halves are read as
+views; each round then is one product and two exclusive ors. The segment of a normal number is found in one
+table that holds start and fall side by side. A few words are made with Python's integers, since each pass
+over a short array costs as much as all of its arithmetic.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+_M = (0xD2511F53, 0xCD9E8D57)
+_W = (0x9E3779B9, 0xBB67AE85)
+_WORD = 0xFFFFFFFF
+_PRODUCTS = np.array([[_M[0]], [_M[1]]], dtype=np.uint64)
+FEW = 16
+"""Words up to which Python's integers are quicker."""
+
+_LOW, _HIGH = (0, 1) if sys.byteorder == "little" else (1, 0)
+
+
+def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np.ndarray:
+    """`count` random words (uint32) of Philox4x32; see `random.words`."""
+    if count <= FEW:
+        return np.array(few_words(count, name, int(time), seed, rounds), np.uint32)
+    n = -(-count // 4)
+    time, key = int(time), (int(seed[0]), int(seed[1]))
+    low, high = time & _WORD, (time >> 32) & _WORD
+    even = np.empty((2, n), np.uint32)
+    even[0], even[1] = np.arange(n, dtype=np.uint32), low
+    odd: np.ndarray = np.array([[name], [high]], np.uint32)
+    products = np.empty((2, n), np.uint64)
+    halves = products.view(np.uint32).reshape(2, n, 2)
+    for r in range(rounds):
+        np.multiply(even, _PRODUCTS, out=products)
+        np.bitwise_xor(halves[::-1, :, _HIGH], odd, out=even)
+        even ^= np.array([[(key[0] + _W[0] * r) & _WORD], [(key[1] + _W[1] * r) & _WORD]], np.uint32)
+        if r + 1 < rounds:
+            odd = halves[::-1, :, _LOW].copy()
+    return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)[:count]
+
+
+def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> list[int]:
+    """The same as Python's integers."""
+    low, high, key = time & _WORD, (time >> 32) & _WORD, (int(seed[0]), int(seed[1]))
+    made = [_one(k, name, low, high, key, rounds) for k in range(-(-count // 4))]
+    return [w for part in zip(*made, strict=True) for w in part][:count]
+
+
+def _one(
+    index: int, name: int, low: int, high: int, key: tuple[int, int], rounds: int
+) -> tuple[int, int, int, int]:
+    """The four words of one counter, those of even numbers first."""
+    a, b, c, d = index, name, low, high
+    k, q = key
+    for _ in range(rounds):
+        left, right = a * _M[0], c * _M[1]
+        a, b, c, d = (right >> 32) ^ b ^ k, right & _WORD, (left >> 32) ^ d ^ q, left & _WORD
+        k, q = (k + _W[0]) & _WORD, (q + _W[1]) & _WORD
+    return a, c, b, d
+
+
+def pairs(start: np.ndarray, slope: np.ndarray, base: int) -> np.ndarray:
+    """The table of segments: (base + n, 2) int32 as int64, start and slope side by side from `base` on."""
+    table = np.zeros((base + len(start), 2), np.int32)
+    table[base:, 0], table[base:, 1] = start, slope
+    return table.view(np.int64)[:, 0]
+
+
+def normals(bits: np.ndarray, table: np.ndarray, segment_bits: int, place_bits: int, scale: float) -> Any:
+    """Standard normal numbers from words; see `random.normal_from`. `table` is that of `pairs`."""
+    tail = bits >> np.uint32(1)
+    tail |= np.uint32(1)
+    form = tail.view(np.int32).astype(np.float32).view(np.int32)
+    place = form >> np.int32(23 - segment_bits - place_bits)
+    place &= np.int32((1 << place_bits) - 1)
+    form >>= np.int32(23 - segment_bits)
+    found = table.take(form).view(np.int32).reshape(-1, 2)
+    place *= found[:, 1]
+    place += np.int32(1 << (place_bits - 1))
+    place >>= np.int32(place_bits)
+    np.subtract(found[:, 0], place, out=place)
+    signs = np.array([scale, -scale]).take((bits & np.uint32(1)).view(np.int32))
+    signs *= place
+    return signs
