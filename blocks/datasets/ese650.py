@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
@@ -222,5 +222,6 @@ def _attitudes(rots: np.ndarray, file: Path) -> np.ndarray:
         )
     q = np.full((len(rots), 4), np.nan)
     if seen.any():
-        q[seen] = Rotation.from_matrix(rots[seen]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        turns = scipy.spatial.transform.Rotation.from_matrix(rots[seen])
+        q[seen] = turns.as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return q
