@@ -100,7 +100,7 @@ def _begin(build: Builder, register: int, start: Stream[Any], places: list[int])
     assert isinstance(node, RegisterNode)
     clock = reduce(operator.or_, (reader.firing for reader in reading.values()))
     held: Held[Any] = Held(build, register, node.type, node.path)
-    first = merge(start, held.at(clock, name=f"{node.path}_held"), tie="left", name=f"{node.path}_first")
+    first = merge(start, held.at(clock), tie="left")
     check_fits(first.type, node.type, given_at=first.label, wanted_at=node.path, sizes={})
     for place, reader in reading.items():
         moved = tuple(

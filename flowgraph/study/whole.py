@@ -105,7 +105,7 @@ def _begun(experiment: Experiment, case: Case) -> list[dict[str, Any]] | None:
         ticks = {**experiment.ticks, BEGIN: _once(BEGIN, first)}
         sources = {name: _source(build, series) for name, series in ticks.items()}
         made = _world(experiment, sources)
-        starts = case.begin(_firsts(made), sources[BEGIN])
+        starts = case.begin(_firsts(build, made), sources[BEGIN])
         for name, stream in starts.items():
             build.collect(name, stream)
         graph = build.freeze("", {})
@@ -136,10 +136,10 @@ def _composed(experiment: Experiment, case: Case, parts: dict[str, str], *, begi
         sources = {name: _source(build, series) for name, series in inputs.items()}
         made = _world(experiment, sources)
         wires = {
-            name: made[whose] if name == whose else _picked(made[whose], given[name], sources[name])
+            name: made[whose] if name == whose else _picked(build, made[whose], given[name], sources[name])
             for name, whose in parts.items()
         }
-        starts = case.begin(_firsts(made), sources[BEGIN]) if begin and case.begin is not None else {}
+        starts = case.begin(_firsts(build, made), sources[BEGIN]) if begin and case.begin is not None else {}
         streams = inlined(build, case.graph, wires, starts)
         wired = in_graph(streams, made["truth"], sources[END])
         if wired is None:
@@ -160,18 +160,24 @@ def _once(name: str, time: int) -> Series:
     return Series(np.array([time]), np.ones(1, dtype=bool), name=name)
 
 
-def _picked(stream: Stream[Any], of: Series, at: Stream[Any]) -> Stream[Any]:
+def _picked(build: Builder, stream: Stream[Any], of: Series, at: Stream[Any]) -> Stream[Any]:
     """Some fields of a stream as a stream of its own type and clock, which ticks when the stream does."""
     kind = of.type
     assert isinstance(kind, StructType)
     names = [name for name, _ in kind.fields]
     some: Block[Any] = Block(lambda x: kind.cls(**{n: getattr(x, n) for n in names}), name=f"{of.name}_of")
-    return latest(some(stream), init=_none(kind), at=at, name=f"{of.name}_now")  # type: ignore[no-any-return]
+    with build.scope("flight", given=False):  # apart from all names that a filter may have
+        return latest(some(stream), init=_none(kind), at=at)  # type: ignore[no-any-return]
 
 
-def _firsts(made: Mapping[str, Stream[Any]]) -> Callable[[str], Any]:
+def _firsts(build: Builder, made: Mapping[str, Stream[Any]]) -> Callable[[str], Any]:
     """The streams of a world, each held from its first value on: no clock tells that all are there then."""
-    return lambda name: latest(made[name], init=_none(made[name].type), name=f"{name}_first")
+
+    def first(name: str) -> Any:
+        with build.scope("flight", given=False):
+            return latest(made[name], init=_none(made[name].type))
+
+    return first
 
 
 def _none(kind: Type) -> Any:
