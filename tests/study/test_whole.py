@@ -113,7 +113,8 @@ def test_a_start_that_follows_from_the_flight_is_made_in_the_graph(name: str, mo
         got = whole.score(simulate(whole.graph, whole.inputs, engine="python", seed=seed))
         want = case.score(simulate(case.graph, case.inputs, engine="reference", seed=seed))
         assert got.keys() == want.keys()
-        np.testing.assert_allclose(list(got.values()), list(want.values()), rtol=1e-9, atol=1e-9)
+        for figure, value in want.items():
+            assert got[figure] == pytest.approx(value, rel=1e-9, abs=1e-9), figure
 
 
 def test_a_start_in_the_graph_that_is_not_the_case_s_is_not_taken() -> None:
