@@ -181,7 +181,7 @@ def _firsts(build: Builder, made: Mapping[str, Stream[Any]]) -> Callable[[str], 
 
 
 def _none(kind: Type) -> Any:
-    return unflatten(kind, iter([np.zeros(of.shape) for _, of in leaves_of(kind)]))
+    return unflatten(kind, iter([np.zeros([int(n) for n in of.shape]) for _, of in leaves_of(kind)]))
 
 
 def _source(build: Builder, series: Series) -> Stream[Any]:
