@@ -48,7 +48,7 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.data.export.text import write_tum
-from flowgraph.data.files import put
+from flowgraph.data.files import need_place, put
 from flowgraph.data.notes import note
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
@@ -153,6 +153,8 @@ def run(
     forms = wanted_forms(export, out)
     if out is not None:
         make_ready(out)
+    if html is not None:
+        need_place(html)
     others = runs_before(html, beside)
     notes: dict[str, None] = {}
 
