@@ -11,12 +11,12 @@ from flowgraph.engines.fixed import rules, shifts
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.fixed.text import Text
 from flowgraph.errors import LoweringError
-from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.ops import SINC, Spec
 
 _JOIN = {"logical_and": "&&", "logical_or": "||"}
 _BITS = {"bitwise_and": "&", "bitwise_or": "|", "bitwise_xor": "^"}
 _WHOLE = {"floor": 0, "ceil": 1, "trunc": 2, "round": 3}
-_ONE = {"sqrt": "fx_square_root", "exp": "fx_exponential", "log": "fx_logarithm"}
+_ONE = {"sqrt": "fx_square_root", "exp": "fx_exponential", "log": "fx_logarithm", SINC: "fx_sine_over"}
 _TWO = {"atan2": "fx_angle", "hypot": "fx_length"}
 
 

@@ -103,6 +103,13 @@ static inline int64_t fx_sine(int64_t x, int64_t fraction, int64_t out, int ahea
   return (n + ahead) & 2 ? -value : value;
 }
 
+static inline int64_t fx_sine_over(int64_t x, int64_t fraction, int64_t out) {
+  int64_t turns = fx_shift(x * FX_QUARTER_TURNS, fraction + 1);
+  if (fx_down(turns + (1 << 29), 30) != 0)
+    return fx_quotient(fx_sine(x, fraction, 30, 0), x, out + fraction - 30);
+  return fx_shift(fx_horner(fx_sinc, 6, fx_down(turns * turns + (1 << 29), 30)), 30 - out);
+}
+
 static inline int64_t fx_exponential(int64_t x, int64_t fraction, int64_t out) {
   int64_t y = fx_shift(x * FX_LOG2_E, fraction);
   int64_t n = fx_down(y + (1 << 29), 30);

@@ -81,6 +81,7 @@ def mixed(x: Three, *, xp) -> Three:
     count = xp.astype(xp.floor(4.0 * x), xp.int32) % 3
     most = xp.max(turned) - xp.min(x) + xp.sum(x) / 3.0
     steps = xp.cumulative_sum(xp.abs(x)) + xp.asarray(count, dtype=x.dtype)
+    most = most + xp.sum(xp.unnormalized_sinc(3.0 * x) - xp.unnormalized_sinc(0.0 * x))
     return order * most + xp.remainder(steps, 1.5) - xp.round(up) + xp.copysign(xp.hypot(x, up), x)
 
 
