@@ -56,8 +56,8 @@ SINC = "unnormalized_sinc"
 FUNCTIONS = frozenset(f"{_OF_ONE} {_OF_TWO}".split())
 """Functions of real numbers; C has them under the same names."""
 
-_UNARY = f"""abs negative sign square positive {_OF_ONE} {SINC} floor ceil round trunc logical_not isfinite isnan
-bitwise_invert"""
+_UNARY = f"""abs negative sign square positive {_OF_ONE} {SINC} floor ceil round trunc logical_not
+isfinite isnan bitwise_invert"""
 """Those among the operations element by element that take one argument; the others take two."""
 
 
