@@ -43,19 +43,10 @@ static inline int fx_bits(int64_t x) {
   return n + (x != 0);
 }
 
-static inline int64_t fx_fit(int64_t x, uint8_t *off, int place, int64_t most) { /* or the largest, marked */
-  if (x == FX_NAN || (x <= most && x >= -most)) return x;
-  off[place] |= 1;
-  off[FX_SIZE] = 1;
-  return x > 0 ? most : -most;
-}
-
 static inline int64_t fx_lost(int64_t x, int is_not_zero, int64_t *count) {
   if (x == 0 && is_not_zero) ++*count;
   return x;
 }
-#define FX_FIT(x, place) fx_fit(x, off, place, FX_MOST)
-#define FX_MARK(place, why) (off[place] |= (why), off[FX_SIZE] = 1)
 
 static inline int64_t fx_quotient(int64_t a, int64_t b, int64_t up) {
   if (a == 0) return 0;
@@ -191,16 +182,43 @@ static inline int64_t fx_float32_bits(int64_t x) {
 """
 
 
+_MARKED = r"""
+static inline int64_t fx_fit(int64_t x, uint8_t *off, int place, int64_t most) { /* or the largest, marked */
+  if (x == FX_NAN || (x <= most && x >= -most)) return x;
+  off[place] |= 1;
+  off[FX_SIZE] = 1;
+  return x > 0 ? most : -most;
+}
+#define FX_FIT(x, place) fx_fit(x, off, place, FX_MOST)
+#define FX_MARK(place, why) (off[place] |= (why), off[FX_SIZE] = 1)
+"""
+
+_COUNTED = r"""
+static inline int64_t fx_fit(int64_t x, int64_t *count, int64_t most) { /* or the largest, counted */
+  if (x == FX_NAN || (x <= most && x >= -most)) return x;
+  ++*count;
+  return x > 0 ? most : -most;
+}
+"""
+
+
 def _list(numbers: list[int]) -> str:
     return ", ".join(f"INT64_C({n})" for n in numbers)
 
 
-def kernels(most: int, size: int) -> str:
-    """The text, with the constants of `integers`, the largest word, and the number of words that are kept."""
+def kernels(most: int, size: int | None) -> str:
+    """The text, with the constants of `integers`, and the largest word.
+
+    Args:
+        most: that.
+        size: the number of words that are kept, and marked where they are cut; None where this is counted.
+    """
     assert NOT_A_NUMBER == -z.LIMIT
     head = _HEAD.format(
         turn=z.QUARTER_TURNS, quarter=z.QUARTER, log2_e=z.LOG2_E, ln_2=z.LN_2, half=z.HALF_TURN,
         sinc=_list(z.SINC), cosine=_list(z.COSINE), power=_list(z.POWER), angles=_list(z.ANGLES),
     )  # fmt: skip
-    sizes = f"#define FX_MOST INT64_C({most})\n#define FX_SIZE {size}\n#define FX_STEPS {len(z.ANGLES)}"
-    return f"#include <stdint.h>\n{head}{sizes}\n{_BODY}"
+    sizes = f"#define FX_STEPS {len(z.ANGLES)}"
+    if size is not None:
+        sizes += f"\n#define FX_MOST INT64_C({most})\n#define FX_SIZE {size}"
+    return f"#include <stdint.h>\n{head}{sizes}\n{_BODY}{_COUNTED if size is None else _MARKED}"
