@@ -200,7 +200,7 @@ class _Search:
 
     def _player(self, formats: Formats, flights: Sequence[_Ready]) -> CompiledIntegers:
         patterns = sorted({key for one in (*self._flights, *self._held) for key in one.tape.patterns})
-        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns)
+        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns, tabled=True)
 
     def _widened(self, player: CompiledIntegers, flights: Sequence[_Ready], where: str, bits: int) -> bool:
         counts = Counts()

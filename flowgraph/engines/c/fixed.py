@@ -33,21 +33,30 @@ class CompiledIntegers(Player):
 
     The C stops at a tick in which a word was marked, for here it is known what takes the word, and goes on.
 
+    Args:
+        pipeline: with formats.
+        patterns: of present inputs that come.
+        tabled: whether it is compiled once for all formats of a structure, and slower then.
+
     Attributes:
         counts: of the last run.
     """
 
-    def __init__(self, pipeline: Pipeline, patterns: Sequence[int]) -> None:
+    def __init__(self, pipeline: Pipeline, patterns: Sequence[int], *, tabled: bool = False) -> None:
         self.pipeline = pipeline
-        self.source = Source(pipeline, patterns)
+        self.source = Source(pipeline, patterns, tabled=tabled)
         self.counts = Counts()
         by_place = sorted((p, n) for n, p in self.source.place.items())
         self._places, self._values = np.array([p for p, _ in by_place]), [n for _, n in by_place]
-        self._play = load({"fixed.c": f"{self.source.text}\n{self.source.play}"}, FLAGS).fx_play
+        self._library = load({"fixed.c": f"{self.source.text}\n{self.source.play}"}, FLAGS)
+        self._play = self._library.fx_play
         self._play.restype = ctypes.c_int64
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         source, pipeline = self.source, self.pipeline
+        if source.tabled:
+            for name, numbers in (("fx_s", source.shifts), ("fx_m", source.mosts)):
+                ctypes.c_void_p.in_dll(self._library, name).value = numbers.ctypes.data
         player = Integers(pipeline, cells, seed)
         held = [c for r in pipeline.registers for c in r.cells]
         w, off = source.first.copy(), np.zeros(source.size + 1, np.uint8)

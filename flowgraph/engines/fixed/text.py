@@ -23,11 +23,16 @@ class Text:
         places: where values lie.
         marks: whether what is cut is marked where it lies, in `off`, and lost words are counted by value.
             Else all of a kind are counted together, in `count`.
+        tabled: whether shifts and the largest words are read from `fx_s` and `fx_m` when it runs, so that the
+            text is that of a structure, whatever the formats: `shifts` and `mosts` are what goes there.
     """
 
-    def __init__(self, player: Integers, places: Places, *, marks: bool = True) -> None:
+    def __init__(self, player: Integers, places: Places, *, marks: bool = True, tabled: bool = False) -> None:
         self.player, self.pipeline = player, player.pipeline
-        self.places, self.marks = places, marks
+        self.places, self.marks, self.tabled = places, marks, tabled
+        self.shifts: list[np.ndarray] = []
+        self.mosts: list[int] = []
+        self._shifts = 0
         self.tables: dict[bytes, str] = {}
         self.lines: list[str] = []
         self.indent = 1
@@ -49,12 +54,23 @@ class Text:
             )
         return self.tables[key].split()[3].split("[")[0]
 
+    def row(self, by: np.ndarray, place: str) -> str:
+        """The element at a place of a row of shifts."""
+        if not self.tabled:
+            return f"{self.table(by)}[{place}]"
+        base, self._shifts = self._shifts, self._shifts + by.size
+        self.shifts.append(np.ravel(by))
+        return f"fx_s[{plus(base, place)}]"
+
     def shift(self, by: np.ndarray, index: Sequence[str]) -> str:
         """A shift at an index of the loops around: a number, or an element of a table."""
+        if self.tabled:
+            by = np.asarray(by)
+            return self.row(by, flat(by.shape, index) if by.size != 1 else "0")
         by = slim(np.asarray(by))
         if by.size == 1:
             return str(int(by.ravel()[0]))
-        return f"{self.table(by)}[{flat(by.shape, index)}]"
+        return self.row(by, flat(by.shape, index))
 
     @contextmanager
     def loops(self, shape: Sequence[int]) -> Iterator[list[str]]:
@@ -97,6 +113,9 @@ class Text:
         if not self.marks:
             most = int(self.player.most) if self.most is None else self.most
             return f"{place} = {narrow(place, f'fx_fit({text}, count, INT64_C({most}))')};"
+        if self.tabled:
+            self.mosts.append(int(self.player.most) if self.most is None else self.most)
+            return f"{place} = fx_fit({text}, off, {place[2:-1]}, fx_m[{len(self.mosts) - 1}]);"
         if self.most is None or self.most == int(self.player.most):
             return f"{place} = FX_FIT({text}, {place[2:-1]});"
         return f"{place} = fx_fit({text}, off, {place[2:-1]}, INT64_C({self.most}));"

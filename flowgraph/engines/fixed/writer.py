@@ -8,7 +8,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
 from flowgraph.engines.fixed.elements import Elements
-from flowgraph.engines.fixed.shifts import Site, slim
+from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.fixed.text import flat, narrow, plus, unless_none, wide
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.trace import Instruction
@@ -217,7 +217,7 @@ class Writer(Elements):
             left, right = shifts.shifts_of_search(s)
             with self.loops(i.spec.shape) as index:
                 q = self.shift(right, index)
-            p = f"{self.table(np.broadcast_to(left, (n,)))}[middle]"
+            p = self.row(np.broadcast_to(left, (n,)), "middle")
         order = "<=" if i.attrs.get("side", "left") == "right" else "<"
         middle = wide(self.element(i.args[0], (n,), "middle"))
         with self.loops(i.spec.shape) as index:
@@ -308,7 +308,7 @@ class Writer(Elements):
         if real:
             f = s.real(0)
             by = shifts.between(f, np.broadcast_to(f.min(axis=axis, keepdims=True), f.shape))
-        by = slim(np.broadcast_to(by, shape)) if real else by
+        by = np.broadcast_to(by, shape) if real else by
         with self.loops(i.spec.shape) as index:
             chosen = self.word(i.args[1], index[axis : axis + len(indices)])
             at = [*index[:axis], "n", *index[axis + len(indices) :]]
