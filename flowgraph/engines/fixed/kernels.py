@@ -143,7 +143,8 @@ static FX_CALL int64_t fx_length(int64_t a, int64_t b, int64_t fraction_a, int64
   return fx_shift(fx_root_of(p * p + q * q), (30 - top) - out);
 }
 
-static FX_CALL int64_t fx_whole(int64_t x, int64_t fraction, int how) { /* 0 floor, 1 ceil, 2 trunc, 3 round */
+static FX_CALL int64_t fx_whole(int64_t x, int64_t fraction, int how) {
+  /* 0 floor, 1 ceil, 2 trunc, 3 round */
   int f = fraction < 0 ? 0 : fraction > 62 ? 62 : (int)fraction;
   if (fraction < 0) x = fx_shift(x, fraction < -62 ? -62 : fraction);
   if (how == 1 || (how == 2 && x < 0)) return -fx_down(-x, f);
