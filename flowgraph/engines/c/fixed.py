@@ -19,7 +19,7 @@ from flowgraph.engines.fixed.source import Source
 from flowgraph.engines.options import Meter
 from flowgraph.pipeline.formats import real_numbers
 from flowgraph.pipeline.pipeline import Pipeline
-from flowgraph.pipeline.program import needed
+from flowgraph.pipeline.program import needed_of
 from flowgraph.recorder.ops import Spec
 from flowgraph.types import DTYPES
 
@@ -114,7 +114,8 @@ class CompiledIntegers(Player):
         marked = {
             self._values[k] for k in np.searchsorted(self._places, np.flatnonzero(off[:-1]), "right") - 1
         }
-        taken = needed(program, _Words(w, self.source.place, self.pipeline.specs)) if marked else {}
+        words = _Words(w, self.source.place, self.pipeline.specs)
+        taken = needed_of(program, words, marked) if marked else {}
         for n in marked:
             p, shape = self.source.place[n], self.pipeline.specs[n].shape
             marks = off[p : p + math.prod(shape)].reshape(shape)
