@@ -117,11 +117,14 @@ def _files(folder: Path, unit: str) -> tuple[Path, Path]:
     for file in found:
         if not file.is_file():
             units = sorted(f.stem.removeprefix("IMU_") for f in folder.glob("IMU_*.csv"))
+            flights = sorted(f.parent.name for f in folder.glob("*/GT.csv"))
             raise DataError(
                 "this is no flight of the outdoor quadrotor",
                 path=str(file),
                 expected="a folder with GT.csv and IMU_1.csv",
-                got="no such file" + (f"; there are units {', '.join(units)}" if units else ""),
+                got="no such file"
+                + (f"; there are units {', '.join(units)}" if units else "")
+                + (f"; there are flights {', '.join(flights)}" if flights else ""),
                 fix="name the folder of one flight, outdoor_quadrotor:DIR:IMU",
             )
     return found

@@ -45,7 +45,6 @@ from flowgraph.cli.terminal import (
     reports_errors,
     runs_table,
     table,
-    without_font_warnings,
     writing,
 )
 from flowgraph.data.export.text import write_tum
@@ -101,26 +100,26 @@ def show(
     from flowgraph.pipeline.format_words import formats_by_path
     from flowgraph.pipeline.lowering import lower
 
-    built, _ = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
+    built, inputs = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     words: dict[str, str] = {}
     if formats is not None:
         words = formats_by_path(with_formats(lower(built, dtype="fixed"), load_formats(formats)))
     if output is None:
         width = out_console.width if out_console.is_terminal else None
-        print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
+        print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width, inputs=inputs))))
         if words:
             out_console.print(
                 table([{"path": path or built.name, "words": said} for path, said in words.items()])
             )
         return
-    with writing(output), without_font_warnings():
+    with writing(output):
         if output.suffix.lower() == ".html":
             costs = costs_by_path(built)
             for path, said in words.items():
                 costs.setdefault(path, {})["words"] = said
-            diagram_page(built, output, fold=fold, costs=costs)
+            diagram_page(built, output, fold=fold, costs=costs, inputs=inputs)
         else:
-            built.draw(str(output), fold=fold, words=words)
+            built.draw(str(output), fold=fold, words=words, inputs=inputs)
 
 
 @app.command()
@@ -311,7 +310,7 @@ def _write_report(
 def _draw(file: Path, draw: Callable[[Path], object]) -> str | None:
     """Make a picture, or return a note that says why there is none: it must not take the results with it."""
     try:
-        with writing(file), without_font_warnings():
+        with writing(file):
             draw(file)
     except Exception as error:
         why = str(error) if isinstance(error, FlowgraphError) else f"{type(error).__name__}: {error}"

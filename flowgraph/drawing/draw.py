@@ -14,8 +14,12 @@ import shutil
 import struct
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from flowgraph.data.arrival import lateness_words
 from flowgraph.data.files import put
+from flowgraph.data.series import Flight
+from flowgraph.drawing.fonts import without_font_warnings
 from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.text import (
     Link,
@@ -65,6 +69,7 @@ def draw(
     fold: int | None = None,
     legend: bool = True,
     words: Mapping[str, str] | None = None,
+    inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str | Path:
     """Draw the block diagram.
 
@@ -75,6 +80,7 @@ def draw(
         fold: graphs nested deeper than this are drawn as one box: 0 folds all of them, None none.
         legend: whether to say below the title what the kinds of arrow mean.
         words: a line more for the box of a path, such as its number formats; under "" for the title.
+        inputs: what the sources are fed; of one whose values arrive late the diagram says so.
 
     Raises:
         UnknownNameError: for another ending or direction.
@@ -86,10 +92,10 @@ def draw(
     ending = ".svg" if path is None else path.suffix.lower()
     if ending not in ENDINGS:
         raise UnknownNameError("file ending", ending, ENDINGS, path=str(file))
-    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend, words=words)
+    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend, words=words, inputs=inputs)
     if ending == ".html":
         costs = {at: {"words": line} for at, line in (words or {}).items()}
-        return diagram_page(graph, file, fold=fold, rankdir=rankdir, costs=costs)
+        return diagram_page(graph, file, fold=fold, rankdir=rankdir, costs=costs, inputs=inputs)
     if path is None:
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
@@ -124,7 +130,8 @@ def _render(source: str, kind: str) -> bytes:
             got=f"{failed}, and no pygraphviz",
             fix="pip install pygraphviz, or install Graphviz; graph.text() needs neither",
         ) from None
-    return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
+    with without_font_warnings():
+        return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
 
 
 def _whole_png(made: bytes) -> bytes:
@@ -145,11 +152,12 @@ def dot_source(
     fold: int | None = None,
     legend: bool = True,
     words: Mapping[str, str] | None = None,
+    inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str:
     """The diagram in the DOT language; the arguments are those of `draw`."""
     if rankdir not in COMPASS:
         raise UnknownNameError("rankdir", rankdir, COMPASS, path=graph.name)
-    return _Diagram(graph, rankdir, fold, words or {}).source(legend)
+    return _Diagram(graph, rankdir, fold, words or {}, lateness_words(inputs)).source(legend)
 
 
 def _plain(text: str) -> str:
@@ -183,8 +191,15 @@ def _attributes(label: str = "", **attributes: object) -> str:
 class _Diagram:
     """One drawing of one graph: who is visible after folding, and the DOT statements for it."""
 
-    def __init__(self, graph: Graph, rankdir: str, fold: int | None, words: Mapping[str, str]) -> None:
-        self.graph, self.rankdir, self.words = graph, rankdir, words
+    def __init__(
+        self,
+        graph: Graph,
+        rankdir: str,
+        fold: int | None,
+        words: Mapping[str, str],
+        lateness: Mapping[str, str],
+    ) -> None:
+        self.graph, self.rankdir, self.words, self.lateness = graph, rankdir, words, lateness
         self.folded = folded_scopes(graph, fold)
         self.open = [s for s in graph.scopes if fold is None or scope_depth(graph, s) < fold]
         self.links = list(links(graph))
@@ -267,7 +282,11 @@ class _Diagram:
             tip = f"when the values of {node.clock.name} were true: {node.type}, with each of them"
         shape = {"TB": "invhouse", "BT": "house"}.get(self.rankdir, "cds")
         label = f"<b>{_escaped(node.path)}</b>{self.below(node.path)}"
-        return self.node(node.path, "source", label, shape, tip, margin="0.14,0.08")
+        if late := self.lateness.get(node.path):
+            label += f"<br/>{_font(late)}"
+            tip += f", {late}"
+        margin = "0.14,0.12" if late else "0.14,0.08"
+        return self.node(node.path, "source", label, shape, tip, margin=margin)
 
     def below(self, path: str) -> str:
         """A line under a name, where there is one more to say."""

@@ -85,6 +85,8 @@ def test_a_repeated_row_is_left_out_on_request(tmp_path):
 
 def test_what_is_missing_is_named(tmp_path):
     where = folder(tmp_path / "path_1")
+    with pytest.raises(DataError, match="no such file; there are flights path_1"):
+        load_flight(f"outdoor_quadrotor:{tmp_path}")
     with pytest.raises(DataError, match="there are units 1, 2"):
         load_flight(f"outdoor_quadrotor:{where}:7")
     with pytest.raises(DataError, match="no such file"):
