@@ -55,8 +55,8 @@ class CompiledIntegers(Player):
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         source, pipeline = self.source, self.pipeline
         if source.tabled:
-            for name, numbers in (("fx_s", source.shifts), ("fx_m", source.mosts)):
-                ctypes.c_void_p.in_dll(self._library, name).value = numbers.ctypes.data
+            for name, row in (("fx_s", source.shifts), ("fx_m", source.mosts)):
+                ctypes.c_void_p.in_dll(self._library, name).value = row.ctypes.data
         player = Integers(pipeline, cells, seed)
         held = [c for r in pipeline.registers for c in r.cells]
         w, off = source.first.copy(), np.zeros(source.size + 1, np.uint8)
