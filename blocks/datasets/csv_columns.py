@@ -71,6 +71,7 @@ SETTINGS: Mapping[str, str] = {
     "gps_velocity.axes": "of its three columns: enu (left out: east, north, up) or ned",
     "heading.axes": "enu (left out: from east, to the left) or ned (from north, to the right, as a compass)",
     "heading.noise": "rad, the deviation of a heading without a column for it",
+    "heading.baseline": "from the one antenna to the other in the body: three numbers; 1,0,0 if left out",
     **{
         f"{stream}.angles.order": "of the turns, each about an axis of the turned body: " + ", ".join(ORDERS)
         for stream in ("vicon", "truth")

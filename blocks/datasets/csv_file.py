@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight
+from flowgraph.blocks.datasets.adjust import three_numbers
 from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
 from flowgraph.blocks.datasets.csv_columns import OPTIONAL, SETTINGS, STREAMS, TURNS, WAYS, said_by
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
@@ -92,7 +93,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
     Returns:
         A `Flight` with the mapped streams and truth. info: `absent`; with an imu `imu_noise`; and
-        `position_noise`, `attitude_noise` where they are given.
+        `position_noise`, `attitude_noise`, `heading_baseline` where they are given.
 
     Raises:
         DataError: the file is missing or has no rows; a cell is not a number or a stamp (file, line); stamps
@@ -157,6 +158,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     if "imu" in made.streams:
         made.info["imu_noise"] = imu_noise(given, "csv", made.notes)
     measured_noise(given, "csv", made.info)
+    baseline = three_numbers(given, "heading.baseline", "csv")
+    if baseline is not None:
+        made.info["heading_baseline"] = baseline
     return made.flight()
 
 

@@ -279,6 +279,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         antennas = _by_antennas(imu, kept.get("heading")) if begin.unknown else None
         if antennas is not None:
             angle, unsure = antennas
+            ahead = on.flight.info.get("heading_baseline", (1.0, 0.0, 0.0))
+            angle -= math.atan2(ahead[1], ahead[0])
             begin, spread = (
                 begin._replace(attitude=turned(begin.attitude, angle)),
                 replace(spread, heading=unsure),

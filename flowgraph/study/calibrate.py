@@ -105,6 +105,7 @@ def calibrate(
     notes: list[str] = []
     guesses: dict[str, Guess] = {}
     left: set[int] = set()
+    begun: dict[str, float] = {}
     whole = _unthinned(problem, settings) if offsets else []
     for f in offsets:
         stream = f.name.rpartition(".")[0]
@@ -112,11 +113,11 @@ def calibrate(
         known = [g for g in told if g is not None and g.sure]
         if known:
             guesses[f.name] = known[0]
-            begun = float(np.median([g.offset for g in known]))  # one of another clock moves it least
-            found[f.name] = begun
-            said = f"{f.name}: begun at {begun:.4g} s, by {known[0].by}"
+            begin = float(np.median([g.offset for g in known]))  # one of another clock moves it least
+            found[f.name] = begun[f.name] = begin
+            said = f"{f.name}: begun at {begin:.4g} s, by {known[0].by}"
             notes.append(note("info", f"{said}, whose correlation is {known[0].correlation:.3f} there"))
-            said_of, apart = _apart(f.name, recordings, told, begun)
+            said_of, apart = _apart(f.name, recordings, told, begin)
             notes += said_of
             left |= apart
         else:
@@ -134,12 +135,11 @@ def calibrate(
             if side is not None and width == widths[-1]:
                 notes.append(note("warning", f"{f.name} ended at its {side} bound: widen it"))
             elif not inside and width == widths[-1]:
-                notes.append(
-                    note(
-                        "warning",
-                        f"{f.name}: the {tried.measure} says no place near {value:.4g} s: it is a guess",
-                    )
-                )
+                kept = "it is a guess"
+                if f.name in begun:
+                    found[f.name], kept = begun[f.name], f"it stays at {begun[f.name]:.4g} s"
+                said = f"{f.name}: the {tried.measure} says no place near {value:.4g} s: {kept}"
+                notes.append(note("warning", said))
         if others:
             fixed = {f.name: found[f.name] for f in offsets}
             held = problem.at(fixed)

@@ -331,7 +331,7 @@ def found_biases(result: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("seeds", "seconds"), [((0, 1), 6.0), pytest.param(range(8), 8.0, marks=pytest.mark.slow)]
+    ("seeds", "seconds"), [((0, 1), 6.0), pytest.param(range(6), 8.0, marks=pytest.mark.slow)]
 )
 def test_biases_of_several_flights_are_found(seeds, seconds):
     """Told of them, as the flights say, the filter is as honest as without any; else it is several times as
@@ -349,9 +349,9 @@ def test_biases_of_several_flights_are_found(seeds, seconds):
         mean, deviations = found_biases(runs[0])
         assert (deviations[:3] < 0.015).all()
         off.append((mean - true) / deviations)
-    assert np.sqrt(np.mean(np.square(off))) < 1.5
+    assert np.sqrt(np.mean(np.square(off))) < 1.3
     rms = lambda scores, name: np.sqrt(np.mean([score[name] ** 2 for score in scores]))
-    for name, least in (("position_rmse_m", 1.8), ("velocity_rmse_mps", 2.5), ("attitude_rmse_deg", 2.0)):
+    for name, least in (("position_rmse_m", 1.8), ("velocity_rmse_mps", 2.5), ("attitude_rmse_deg", 1.7)):
         assert rms(theirs, name) > least * rms(ours, name), name
     assert np.mean([score["nees_mean"] for score in ours]) < 12.0
     assert all(score["position_3sigma"] > 0.99 for score in ours)

@@ -402,6 +402,12 @@ def test_two_antennas_tell_a_heading_in_a_table(tmp_path):
     np.testing.assert_allclose(compass.streams["heading"]["angle"], np.radians(60.0))
     np.testing.assert_allclose(compass.streams["heading"]["deviation"], 0.01)
     assert not any("heading:" in n for n in compass.notes)
+    across = gnss_ins.case(read(heading__axes="ned", heading__baseline="0,1,0"))  # the second one to the left
+    R = to_matrix(simulate(across.graph, across.inputs)["belief"]["attitude"][-1], xp=np)
+    # the body has turned by 0.1 rad/s for a second, and its antennas say that it stands
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(np.radians(-30.0), abs=0.02)
+    with pytest.raises(DeclarationError, match=r"heading\.baseline"):
+        read(heading__baseline="0,1")
     each = read(heading__deviation="sd", heading__deviation__unit="deg")
     np.testing.assert_allclose(each.streams["heading"]["deviation"], np.radians(0.5))
     assert "heading" in gnss_ins.case(each).recorded
