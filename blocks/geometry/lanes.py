@@ -66,8 +66,8 @@ def normalize(q: Array, *, xp: Any) -> Array:
 def exponential(v: Array, *, xp: Any) -> Array:
     """Exp: the quaternions (4, n) of rotation vectors (3, n) in rad (Solà eq. 101)."""
     u = 0.5 * v
-    half = xp.sqrt(xp.maximum(xp.sum(u * u, axis=0, keepdims=True), 1e-30))  # as in geometry: never 0/0
-    return xp.concat([xp.cos(half), xp.sin(half) / half * u], axis=0)
+    half = xp.sqrt(xp.sum(u * u, axis=0, keepdims=True))
+    return xp.concat([xp.cos(half), geometry.sinc(half, xp=xp) * u], axis=0)
 
 
 def rotation_matrices(q: Array, *, xp: Any) -> Array:

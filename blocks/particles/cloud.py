@@ -54,6 +54,8 @@ START_DRAWS = "start_cloud"
 DEPTH = 64.0
 """How far a particle falls behind the best in one reading at most: exp(-64) is nothing in a sum."""
 
+_BEYOND = 1.01  # times the distance at which a particle no longer matters: surely so
+
 _SQUARINGS = 5
 _ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
 _SPREAD = StartSpread()
@@ -93,9 +95,16 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
     error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
-    return LogLikelihood(
-        value=within_depth(xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant, xp=xp)
-    )
+    # who is too far to matter is put aside before the squares that tell: in words that hold the squares of
+    # half turns, the last bit is much beside those of a few degrees
+    squared = xp.sum(error * error, axis=0)
+    nearest = xp.min(squared)
+    near = squared <= nearest + _BEYOND * (2.0 * DEPTH * noise**2)
+    kept = xp.where(near[None, :], error, 0.0)
+    scaled = xp.sum(kept * kept, axis=0) * (-0.5 / noise**2)
+    least = xp.min(xp.where(near, scaled, 0.0))
+    value = xp.where(near, scaled, least - 2.0 * DEPTH)  # which `within_depth` brings up
+    return LogLikelihood(value=within_depth(value - constant, xp=xp))
 
 
 @block
