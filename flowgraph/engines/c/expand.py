@@ -16,6 +16,7 @@ from flowgraph.engines.c.nodes import Buffer, Node, View
 from flowgraph.engines.c.shapes import JOINS, Shapes, host_kind, within, without_zeros
 from flowgraph.engines.c.values import Value, lanes, row_major, space_of, unrolled
 from flowgraph.errors import LoweringError
+from flowgraph.pipeline.optimise.aside import Choice
 from flowgraph.recorder.ops import ELEMENTWISE, OPS, Spec, broadcast
 from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
@@ -76,6 +77,16 @@ class Expander(Shapes):
             out = View(into, i.spec.shape, 0, row_major(i.spec.shape))
         self.tape.origin = i.line
         self.tape.macro("replay", views, out, body=body_of(i.attrs["body"]))
+        return self.from_view(i.spec, out)
+
+    def chosen(self, i: Instruction, choice: Choice) -> Value:
+        """One array, or where a truth says so what a function of others makes."""
+        truth, other, *inputs = (self.known[a] for a in i.args)
+        self.tape.origin = i.line
+        views = [self.form.stored(other), *(self.form.own(x) for x in inputs)]
+        out = self.fresh(i.spec)
+        when = self.form.elements(truth).item()
+        self.tape.macro("choose", views, out, [when], choice=choice, truth=i.attrs["truth"])
         return self.from_view(i.spec, out)
 
     # -- products ------------------------------------------------------------------------------------

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.nodes import Macro, View
 from flowgraph.engines.c.syntax import ctype
 
+if TYPE_CHECKING:
+    from flowgraph.engines.c.statements import Writer
 
-def write_macro(w: Lines, m: Macro) -> None:
+
+def write_macro(w: Writer, m: Macro) -> None:
     """Write a macro's loops."""
     _MACROS[m.kind](w, m)
 
@@ -301,6 +305,27 @@ def _replay(w: Lines, m: Macro) -> None:
     w.line("}")
 
 
+def choice_call(w: Lines, m: Macro) -> str:
+    """The call of the function that makes a choice, which a file has once."""
+    choice = m.extra["choice"]
+    name = w.write.function(("choice", choice.key), "choice", w.write.choice, choice)
+    places = [f"&{w.at(v.buffer, str(v.offset))}" for v in (*m.inputs[1:], m.output)]
+    return f"{name}(s, {', '.join(places)});"
+
+
+def _choose(w: Writer, m: Macro) -> None:
+    """What is rarely taken is computed only then."""
+    called, when = choice_call(w, m), w.ref(m.args[0])
+    w.line(f"if ({when}) {{" if m.extra["truth"] else f"if (!({when})) {{")
+    w.line(f"    {called}")
+    w.line("} else {")
+    w.depth += 1
+    with Loops(w, m.output.shape) as at:
+        w.line(f"{element(w, m.output, at)} = {element(w, m.inputs[0], at)};")
+    w.depth -= 1
+    w.line("}")
+
+
 def _random(w: Lines, m: Macro) -> None:
     name = w.write.helper(f"fg_{m.extra['draws']}")
     blocks = m.output.buffer.size // 4
@@ -309,7 +334,7 @@ def _random(w: Lines, m: Macro) -> None:
            f"{w.at(m.inputs[0].buffer, '1')});")  # fmt: skip
 
 
-_MACROS: dict[str, Callable[[Lines, Macro], None]] = {
+_MACROS: dict[str, Callable[[Any, Macro], None]] = {
     "matmul": _matmul,
     "cholesky": _cholesky,
     "solve": _solve,
@@ -320,5 +345,6 @@ _MACROS: dict[str, Callable[[Lines, Macro], None]] = {
     "sort": _sort,
     "argsort": _sort,
     "random": _random,
+    "choose": _choose,
     "replay": _replay,
 }

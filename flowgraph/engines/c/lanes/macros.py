@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from flowgraph.engines.c.lanes.expressions import no_lanes
 from flowgraph.engines.c.lines import Lines
-from flowgraph.engines.c.macros import Loops, call, element, index
+from flowgraph.engines.c.macros import Loops, call, choice_call, element, index
 from flowgraph.engines.c.nodes import Macro, View
 
 if TYPE_CHECKING:
@@ -148,6 +148,23 @@ def _reduce(w: LaneWriter, m: Macro) -> None:
         w.line("}")
 
 
+def _choose(w: LaneWriter, m: Macro) -> None:
+    """What is rarely taken is computed where a lane takes it."""
+    other, out = m.inputs[0], m.output
+    where = w.promoted(m.args[0])
+    w.line("{")
+    w.depth += 1
+    w.line(f"const fg_mask taken = {where if m.extra['truth'] else f'~({where})'};")
+    w.line("const bool any = fg_mask_any(taken);")
+    w.line(f"if (any) {choice_call(w, m)}")
+    with Loops(w, out.shape) as at:
+        there, made = element(w, other, at), element(w, out, at)
+        there = w.write.splat("real", there) if other.buffer.kind == "const" else there
+        w.line(f"{made} = any ? fg_real_pick(taken, {made}, {there}) : {there};")
+    w.depth -= 1
+    w.line("}")
+
+
 def _random(w: LaneWriter, m: Macro) -> None:
     draws, blocks = m.extra["draws"], m.output.buffer.size // 4
     for needed in ("fg_philox", f"fg_one_{draws}"):
@@ -165,6 +182,7 @@ _MACROS = {
     "solve": _solve,
     "reduce": _reduce,
     "random": _random,
+    "choose": _choose,
 }
 
 RANDOM = """\
