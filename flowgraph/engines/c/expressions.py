@@ -40,6 +40,7 @@ class Expressions:
     ) -> None:
         self.real, self.turn, self.choice = real, turn, choice
         self.helpers: set[str] = set()
+        self.packs = False
         self.called: set[str] = set()
         self.functions: dict[Any, tuple[str, str]] = {}
 

@@ -24,7 +24,7 @@ from flowgraph.engines.c.header import header
 from flowgraph.engines.c.helpers import helper_text, own_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
-from flowgraph.engines.c.preamble import MACROS, REFUSED
+from flowgraph.engines.c.preamble import MACROS, PACK, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.syntax import comment, ctype, number
@@ -100,6 +100,7 @@ class File:
             "",
             REFUSED,
             MACROS,
+            PACK.replace("REAL", self.real) if self.expressions.packs else None,
             helper_text(self.expressions.helpers, self.real),
             own_text(self.expressions.called, self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),

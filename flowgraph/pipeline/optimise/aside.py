@@ -54,7 +54,6 @@ def put_aside(program: Program, kept: Collection[int] = ()) -> tuple[Program, li
         program: before arrays are taken apart.
         kept: values whose instructions must stay where they are.
     """
-    made = {i.out: i for i in program.instructions}
     users: dict[int, set[int]] = defaultdict(set)
     for i in program.instructions:
         for a in i.args:
@@ -71,10 +70,10 @@ def put_aside(program: Program, kept: Collection[int] = ()) -> tuple[Program, li
             if {program.specs[root], program.specs[other]} != {i.spec} or i.spec.dtype != "real":
                 continue
             part = _part(program, root, i.out, users, held)
-            inputs = tuple(dict.fromkeys(a for p in part for a in p.args if a in made or a not in program.constants))
             inside = {p.out for p in part}
-            inputs = tuple(a for a in inputs if a not in inside)
-            real = all(program.specs[a].dtype == "real" for a in inputs)
+            read = (a for p in part for a in p.args if a not in inside and a not in program.constants)
+            inputs = tuple(dict.fromkeys(read))
+            real = inputs and all(program.specs[a].dtype == "real" for a in inputs)
             if not real or sum(work(p, program.specs) for p in part) < LEAST_WORK:
                 continue
             gone |= inside
@@ -133,5 +132,5 @@ def _choice(program: Program, part: list[Instruction], inputs: tuple[int, ...], 
         names[root],
     )
     specs: dict[int, Spec] = {n: program.specs[n] for n in (*names, *constants)}
-    body = Program(constants, tuple(part), ((None, ()),), (root,), specs, lanes=program.lanes)
+    body = Program(constants, tuple(part), ((None, ()),), (root,), specs, inputs[:1], lanes=program.lanes)
     return Choice(body, inputs, key)
