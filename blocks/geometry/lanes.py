@@ -32,15 +32,25 @@ __all__ = [
 ]
 
 
+_FIRST, _SECOND = np.triu_indices(4)
+
+
 def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The quaternion product (4, 16), rotation matrix (9, 16) and rotated vector (3, 48) of 16 products."""
+    """The quaternion product (4, 16) of 16 products; rotation matrix (9, 10) and rotated vector (3, 30) of the
+    10 products of a quaternion with itself."""
     units = np.eye(4)
     pairs = [(a, b) for a in units for b in units]
     product = np.stack([geometry.multiply(a, b, xp=np) for a, b in pairs], axis=1)
     # what is bilinear in (q, q) follows from its values on sums of units: B(a, b) = (Q(a + b) - Q(a - b)) / 4
     square = lambda q: geometry.to_matrix(q, xp=np).reshape(9)
-    matrix = np.stack([(square(a + b) - square(a - b)) / 4.0 for a, b in pairs], axis=1)
-    rotated = matrix.reshape(3, 3, 16).transpose(1, 0, 2).reshape(3, 48)
+    matrix = np.stack(
+        [
+            (square(units[i] + units[j]) - square(units[i] - units[j])) / (4.0 if i == j else 2.0)
+            for i, j in zip(_FIRST, _SECOND, strict=True)
+        ],
+        axis=1,
+    )
+    rotated = matrix.reshape(3, 3, 10).transpose(1, 0, 2).reshape(3, 30)
     return product, matrix, rotated
 
 
@@ -51,6 +61,12 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 def products(a: Array, b: Array, *, xp: Any) -> Array:
     """The 16 products (16, n) of the parts of quaternions a and b (4, n)."""
     return xp.reshape(a[:, None, :] * b[None, :, :], (16, a.shape[-1]))
+
+
+def _squares(q: Array, xp: Any) -> Array:
+    """The 10 products (10, n) of the parts of quaternions q (4, n) with each other."""
+    parts = [q[k : k + 1, :] for k in range(4)]
+    return xp.concat([parts[i] * parts[j] for i, j in zip(_FIRST, _SECOND, strict=True)], axis=0)
 
 
 def multiply(a: Array, b: Array, *, xp: Any) -> Array:
@@ -72,17 +88,17 @@ def exponential(v: Array, *, xp: Any) -> Array:
 
 def rotation_matrices(q: Array, *, xp: Any) -> Array:
     """The rotation matrices (3, 3, n), body to world (Solà eq. 115)."""
-    return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ products(q, q, xp=xp), (3, 3, q.shape[-1]))
+    return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ _squares(q, xp), (3, 3, q.shape[-1]))
 
 
 def rotate(q: Array, v: Array, *, xp: Any) -> Array:
     """One body vector v (3) in world coordinates, for each attitude (4, n): (3, n).
 
-    R(q) v is linear in the products of q's parts, with a (3, 16) matrix that v alone makes: no rotation
+    R(q) v is linear in the products of q's parts, with a (3, 10) matrix that v alone makes: no rotation
     matrices.
     """
-    by_products = xp.reshape(v @ xp.asarray(_ROTATED, dtype=q.dtype), (3, 16))
-    return by_products @ products(q, q, xp=xp)
+    by_products = xp.reshape(v @ xp.asarray(_ROTATED, dtype=q.dtype), (3, 10))
+    return by_products @ _squares(q, xp)
 
 
 def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:

@@ -125,8 +125,11 @@ class Expander(Shapes):
         if only_inner and not any(fo) and math.prod(spec.shape) <= UNROLLED_SUMS:
             x, y = self.form.elements(a), self.form.elements(b)
             made = np.empty(spec.shape, object)
-            rank = len(spec.shape)
+            rank, even = len(spec.shape), _weighted(x, y)
             for index in np.ndindex(spec.shape):
+                if even and index[0] > index[1]:
+                    made[index] = made[index[::-1]]
+                    continue
                 p = x[within(x, (*index[:-1], 0), rank)]
                 q = y[within(y, (*index[:-2], 0, index[-1]), rank)]
                 term = self.tape.op("multiply", spec.dtype, p, q)
@@ -301,6 +304,21 @@ class Expander(Shapes):
 
 
 UNROLLED_SUMS = 64
+
+
+def _weighted(x: Any, y: Any) -> bool:
+    """Whether x (m, 1) holds the elements of y (1, m), each times the same: a sum of x y is then symmetric."""
+    if x.ndim != 2 or y.ndim != 2 or len(x) != y.shape[1]:
+        return False
+    times = []
+    for p, q in zip(x[:, 0], y[0], strict=True):
+        if p is q:
+            times.append(None)
+        elif p.op == "multiply" and q in p.args:
+            times.append(p.args[1 if p.args[0] is q else 0])
+        else:
+            return False
+    return all(t is times[0] for t in times)
 
 
 def _is_zero(node: Node) -> bool:

@@ -36,6 +36,13 @@ def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
 }
 """,
         ),
+        "fg_clip_32": (
+            (),
+            """static inline int32_t fg_clip_32(int32_t at, int32_t size) {
+    return at < 0 ? 0 : (at >= size ? size - 1 : at);
+}
+""",
+        ),
         "fg_float_bits": (
             (),
             """static inline int32_t fg_float_bits(int32_t x) {

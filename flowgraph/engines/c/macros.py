@@ -161,6 +161,10 @@ static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
     call(w, "cholesky", m, text)
 
 
+_SMALL = 32
+"""Numbers that stay in registers around a solution."""
+
+
 def _solve(w: Lines, m: Macro) -> None:
     real, plain, exchanging = w.write.real, w.write.helper("fg_solve_plain"), w.write.helper("fg_solve")
 
@@ -172,8 +176,9 @@ def _solve(w: Lines, m: Macro) -> None:
         for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{index(b.strides[-2:], "ij")}];
     }}
 """
+        where = "FG_INLINE" if n * (n + columns) <= _SMALL else "FG_APART"
         return f"""/* ({n} x {n}) x = ({n} x {columns}) */
-static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
+static {where} void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
 {{
     {real} matrix[{n * n}], right[{n * columns}];
 {given}    if (!{plain}(matrix, right, {n}, {columns})) {{
