@@ -35,9 +35,9 @@ __all__ = [
 _FIRST, _SECOND = np.triu_indices(4)
 
 
-def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The quaternion product (4, 16) of 16 products; rotation matrix (9, 10) and rotated vector (3, 30) of the
-    10 products of a quaternion with itself."""
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """The quaternion product (4, 16) of 16 products, and the rotation matrix (9, 10) of the 10 products of a
+    quaternion with itself."""
     units = np.eye(4)
     pairs = [(a, b) for a in units for b in units]
     product = np.stack([geometry.multiply(a, b, xp=np) for a, b in pairs], axis=1)
@@ -50,11 +50,10 @@ def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ],
         axis=1,
     )
-    rotated = matrix.reshape(3, 3, 10).transpose(1, 0, 2).reshape(3, 30)
-    return product, matrix, rotated
+    return product, matrix
 
 
-_PRODUCT, _MATRIX, _ROTATED = _tables()
+_PRODUCT, _MATRIX = _tables()
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
@@ -65,8 +64,7 @@ def products(a: Array, b: Array, *, xp: Any) -> Array:
 
 def _squares(q: Array, xp: Any) -> Array:
     """The 10 products (10, n) of the parts of quaternions q (4, n) with each other."""
-    parts = [q[k : k + 1, :] for k in range(4)]
-    return xp.concat([parts[i] * parts[j] for i, j in zip(_FIRST, _SECOND, strict=True)], axis=0)
+    return xp.concat([q[k : k + 1, :] * q[k:, :] for k in range(4)], axis=0)
 
 
 def multiply(a: Array, b: Array, *, xp: Any) -> Array:
@@ -94,11 +92,11 @@ def rotation_matrices(q: Array, *, xp: Any) -> Array:
 def rotate(q: Array, v: Array, *, xp: Any) -> Array:
     """One body vector v (3) in world coordinates, for each attitude (4, n): (3, n).
 
-    R(q) v is linear in the products of q's parts, with a (3, 10) matrix that v alone makes: no rotation
-    matrices.
+    v + w t + u x t with t = 2 u x v, where q = (w, u): no rotation matrices, and no products of q's parts.
     """
-    by_products = xp.reshape(v @ xp.asarray(_ROTATED, dtype=q.dtype), (3, 10))
-    return by_products @ _squares(q, xp)
+    u = q[1:, :]
+    t = 2.0 * cross(u, v[:, None, None], xp=xp)
+    return v[:, None] + q[:1, :] * t[:, 0, :] + cross(u, t, xp=xp)[:, 0, :]
 
 
 def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:
