@@ -292,7 +292,6 @@ class Writer(Lines):
             return self._times_inverse(*node.args)
         return self.write.write(node, [self.ref(a) for a in node.args])
 
-
     def _times_inverse(self, a: Node, b: Node) -> str:
         """A quotient by what is divided by often: one division, whose vectors take as long as ten products."""
         if b not in self.inverse:

@@ -126,9 +126,7 @@ def _choice(program: Program, part: list[Instruction], inputs: tuple[int, ...], 
 
     key = (
         tuple(program.specs[a] for a in inputs),
-        tuple(
-            (i.op, tuple(map(named, i.args)), json.dumps(i.attrs, sort_keys=True), i.spec) for i in part
-        ),
+        tuple((i.op, tuple(map(named, i.args)), json.dumps(i.attrs, sort_keys=True), i.spec) for i in part),
         names[root],
     )
     specs: dict[int, Spec] = {n: program.specs[n] for n in (*names, *constants)}
