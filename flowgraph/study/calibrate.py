@@ -127,10 +127,7 @@ def calibrate(
                 notes.append(note("warning", f"{f.name} ended at its {side} bound: widen it"))
             elif not inside and width == widths[-1]:
                 notes.append(
-                    note(
-                        "warning",
-                        f"{f.name}: the {tried.measure} says no place near {value:.4g} s: it is a guess",
-                    )
+                    note("warning", f"{f.name}: the {tried.measure} says no place near {value:.4g} s: it is a guess")
                 )
         if others:
             fixed = {f.name: found[f.name] for f in offsets}

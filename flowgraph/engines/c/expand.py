@@ -307,7 +307,7 @@ UNROLLED_SUMS = 64
 
 
 def _weighted(x: Any, y: Any) -> bool:
-    """Whether x (m, 1) holds the elements of y (1, m), each times the same: a sum of x y is then symmetric."""
+    """Whether x (m, 1) holds the elements of y (1, m), each times the same: sums of x y are symmetric."""
     if x.ndim != 2 or y.ndim != 2 or len(x) != y.shape[1]:
         return False
     times = []

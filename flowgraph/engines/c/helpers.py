@@ -124,8 +124,8 @@ static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
         ),
         "fg_solve_plain": (
             (),
-            f"""/* a x = b in place of b (n x m) for a symmetric positive matrix, which needs no exchange of rows;
-   whether it was one */
+            f"""/* a x = b in place of b (n x m), without exchange of rows; whether the matrix is one that
+   needs none: symmetric and positive */
 static FG_INLINE bool fg_solve_plain({real} *a, {real} *b, int32_t n, int32_t m) {{
     bool sound = true;
     for (int32_t j = 0; j < n; j++) {{

@@ -293,7 +293,7 @@ class Writer(Lines):
         return self.write.write(node, [self.ref(a) for a in node.args])
 
     def _times_inverse(self, a: Node, b: Node) -> str:
-        """A quotient by what is divided by often: one division, whose vectors take as long as ten products."""
+        """A quotient by what is divided by often: one division takes as long as ten products."""
         if b not in self.inverse:
             one = number(1.0, b.dtype, self.write.real)
             divisor = self.ref(b)

@@ -172,7 +172,7 @@ static FG_INLINE {real} fg_quarter({real} x, {word} more) {{
     const {real} k = t - {n(rounds)};
     const {real} r = {rest};
     const {word} q = fg_bits(t) + more, odd = 0u - (q & 1u);
-    const {word} y = (fg_bits(fg_cosine(r)) & odd) | (fg_bits(fg_sine(r)) & ~odd); /* both series, in one go */
+    const {word} y = (fg_bits(fg_cosine(r)) & odd) | (fg_bits(fg_sine(r)) & ~odd); /* by no branch */
     return fabs{f}(x) <= {n(form.most)} ? fg_from_bits(y ^ ((q & 2u) << {form.bits - 2})) : NAN;
 }}
 """,
