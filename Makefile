@@ -20,10 +20,10 @@ TYPED   = $(wildcard flowgraph examples tests)
 FRONT = flowgraph/drawing/front
 PAGES = flowgraph/drawing/pages
 
-.PHONY: help demo test test-slow lint bench docs front front-check clean
+.PHONY: help demo test test-slow lint bench docs site front front-check clean
 
 help:
-	@echo "make demo | test | test-slow | lint | bench | docs | front | clean"
+	@echo "make demo | test | test-slow | lint | bench | docs | site | front | clean"
 
 demo: $(VENV)/.with-xla
 	$(BIN)/flowgraph demo --out out $(ARGS)
@@ -46,6 +46,12 @@ bench: $(VENV)/.with-bench+xla+test
 docs: $(VENV)/.with-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file $(firstword $(wildcard mkdocs.yml docs/mkdocs.yml) mkdocs.yml) \
 		--site-dir $(CURDIR)/out/site
+
+# The site of this version beside those of earlier ones, on the local branch `gh-pages`: publish that.
+site: $(VENV)/.with-docs
+	PATH="$(CURDIR)/$(BIN):$$PATH" NO_MKDOCS_2_WARNING=1 mike deploy --update-aliases \
+		$$($(BIN)/python -c 'from importlib.metadata import version; print(version("flowgraph-filters"))') latest
+	$(BIN)/mike set-default latest
 
 # In a copy, so that what npm installs is no part of the package.
 front: out/front/.with-node

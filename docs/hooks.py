@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 import matplotlib
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -33,11 +34,13 @@ from flowgraph.data.registry import graph_names
 
 matplotlib.use("Agg")
 
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 RUN = ("index.md", "tutorial.md", "complementary.md")
 drawn: set[str] = set()
 log = logging.getLogger("mkdocs.hooks.pictures")
 
 
+@event_priority(100)  # the notebooks are there before the plugin that runs them looks
 def on_files(files: Any, config: Any) -> Any:
     """Add the pictures to the files of the site."""
     diagrams = dict(graphs())
@@ -47,6 +50,9 @@ def on_files(files: Any, config: Any) -> Any:
     pictures |= dict(screens.screens())
     for name, content in {**pictures, **dict(written_by_pages(Path(config["docs_dir"])))}.items():
         files.append(File.generated(config, f"generated/{name}", content=content))
+    for notebook in sorted(EXAMPLES.glob("notebooks/*.ipynb")):
+        place = str(notebook.relative_to(EXAMPLES))
+        files.append(File(place, str(EXAMPLES), config["site_dir"], config["use_directory_urls"]))
     for place, text in reference.pages():
         files.append(File.generated(config, place, content=text))
     return files
@@ -59,8 +65,16 @@ def on_post_build(config: Any) -> None:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the reference tables where a page has a mark for them."""
-    return library.filled(markdown, drawn)
+    """Put the reference tables where a page has a mark for them; notebooks are pages of the site."""
+    return library.filled(markdown, drawn).replace("](../examples/notebooks/", "](notebooks/")
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """In notebooks, links to files of the tree become links to pages of the site."""
+    if not page.file.src_uri.endswith(".ipynb"):
+        return html
+    html = re.sub(r'href="(?:\.\./)+docs/(\w+)\.md', r'href="../../\1/', html)
+    return re.sub(r'href="(\w+)\.ipynb', r'href="../\1/', html)
 
 
 def graphs() -> Iterator[tuple[str, bytes]]:

@@ -122,7 +122,9 @@ def main() -> dict[str, Any]:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
     sock.bind(("127.0.0.1", 0))
     sock.settimeout(20.0)
-    live = Live(graph, engine="c", lateness=LATENESS, deadline="1ms", record="arrived", on_output=seen)
+    live = Live(
+        graph, engine="c", lateness=LATENESS, deadline="1ms", record="arrived", on_output=seen, thread=False
+    )
     words = [sys.executable, __file__, "--send", str(sock.getsockname()[1]), "--seconds", str(given.seconds)]
     sender = subprocess.Popen(words)
     try:

@@ -217,6 +217,8 @@ def for_flight(on: OnFlight, *, filter: Outdoors) -> Case:
         "speed_noise": filter.speed_noise,
         "slip": filter.slip,
     }
+    if "heading" in inputs and "heading_baseline" in on.flight.info:
+        known["baseline"] = on.flight.info["heading_baseline"]
     return on.case(
         filter.score(
             on,

@@ -35,7 +35,9 @@ from flowgraph.blocks.outdoor.belief import (
     new_picture,
     observe_distance,
     observe_flow,
+    outdoor_navigation,
     outdoor_pose,
+    outdoor_space,
     outdoor_steps,
     picture_cross,
     predict_clone,
@@ -70,12 +72,13 @@ def outdoor_eskf(
 ):
     """Error-state Kalman filter of pose and velocity, with a clone of the pose at the last picture.
 
-    Of the sensors beside the IMU any are there. A `reading` of the IMU is of an "instant", or the "mean" over
+    Of the sensors beside the IMU any are there. With a `start` that has them (`start_outdoor`) the biases of
+    the IMU are estimated too. A `reading` of the IMU is of an "instant", or the "mean" over
     the time since the one before (`driving`).
     Collected: `belief` at every tick, and the innovation of each sensor where there was a reading;
     with `smoothing` what a smoother needs too.
     """
-    s = sensors
+    s, space = sensors, outdoor_space(start.mean)
     belief = delay(start, name="belief")
     last = delay(Imu.at_rest(), name="last_control")
     aids = [aid for aid in (gps, gps2, altimeter, magnetometer, optical_flow) if aid is not None]
@@ -105,7 +108,7 @@ def outdoor_eskf(
         return find_back(now, innovation, patience=patience, name=f"find_back_{name}", **lost)
 
     def fused(now: Stream[Gaussian], seen: Any, name: str, block: str, **sees: Any) -> Stream[Gaussian]:
-        now, innovation = update_extended(now, seen, space=OUTDOOR, name=block, **trust(name), **sees)
+        now, innovation = update_extended(now, seen, space=space, name=block, **trust(name), **sees)
         return told(now, innovation, name)
 
     for name, seen, lever in (("gps", gps, s.gps_lever), ("gps2", gps2, s.gps2_lever)):
@@ -133,7 +136,7 @@ def outdoor_eskf(
         now = new_picture(now, optical_flow, name="picture")
     last.feed(control)
     belief.feed(now)
-    return {"belief": outdoor_pose(now)}
+    return {"belief": outdoor_pose(now) if space is OUTDOOR else outdoor_navigation(now)}
 
 
 @on_flight(outdoor_eskf)
@@ -147,7 +150,7 @@ def for_flight(
     """
     inputs, sensors, first = started.begin(on)
     known: dict[str, Any] = {
-        "start": start_outdoor(first),
+        "start": start_outdoor(first, biases=started.estimates(on)),
         "sensors": sensors,
         "reading": reading_of(on.flight),
         "held": control.held(on, inputs["imu"], inputs),

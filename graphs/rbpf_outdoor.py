@@ -25,6 +25,7 @@ from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.spread import spread_outdoor
 from flowgraph.blocks.outdoor.cloud import (
     as_cloud,
+    cloud_biases,
     outdoor_belief,
     predict_outdoor,
     start_outdoor_cloud,
@@ -49,10 +50,10 @@ from flowgraph.blocks.signals import Cloud, Imu, MagneticField, OpticalFlow, Out
 
 @graph
 def average(cloud: Stream[OutdoorCloud], plain: Stream[Cloud]):
-    """The weighted expectation of the pose, and its covariance."""
+    """The weighted expectation of the pose, and its covariance; and of the weights themselves."""
     weight = weights(plain)
     pose = average_pose(plain, weight, average_attitude(plain, weight, name="attitude"), name="pose")
-    return pose, outdoor_belief(cloud, plain, weight, pose, name="spread")
+    return pose, outdoor_belief(cloud, plain, weight, pose, name="spread"), weight
 
 
 @graph
@@ -84,7 +85,8 @@ def rbpf_outdoor(
     in a row the particles become as unsure as the reading was far, and believe it.
     Collected: `pose` and `belief`, with its covariance, at every tick, averaged before resampling; the
     innovation of each sensor where there was a reading; `effective_sample_size`, `depleted` and `ancestors`
-    at every tick with a reading.
+    at every tick with a reading. With a `start` that has them (`start_outdoor_cloud`) the biases of the IMU
+    are estimated, and collected as `biases` at every tick.
     """
     s = sensors
     cloud = delay(start, name="cloud")
@@ -127,8 +129,10 @@ def rbpf_outdoor(
     fresh = take_picture(fresh, aids[0], draws=f"{draws}.attitude", name="picture")
     last.feed(control)
     cloud.feed(merge(fresh, now, tie="left", name="next"))
-    pose, belief = average(now, plain)
+    pose, belief, weight = average(now, plain)
     collect(belief, "belief")
+    if start.covariance.shape[0] > 12:
+        collect(cloud_biases(now, weight, name="biases"), "biases")
     collect(depletion(size, numbers=3), "depleted")
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}
 
@@ -163,7 +167,7 @@ def for_flight(
     return on.case(
         scored.score(on, pose_errors, estimate="belief"),
         inputs=inputs,
-        start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed),
+        start=start_outdoor_cloud(cloud.particles, first, seed=cloud.seed, biases=started.estimates(on)),
         sensors=sensors,
         held=control.held(on, inputs["imu"], inputs),
         reading=reading_of(on.flight),

@@ -50,6 +50,15 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
     return done
 
 
+@pytest.fixture(autouse=True)
+def same_numbers(request: pytest.FixtureRequest) -> None:
+    """A test draws the same numbers whatever was run before it: `RNG` of its module begins anew."""
+    generator = getattr(request.module, "RNG", None)
+    if generator is not None:
+        begun = request.module.__dict__.setdefault("_begun", generator.bit_generator.state)
+        generator.bit_generator.state = begun
+
+
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Put a distribution on the path, with its modules and its entry points, until the test ends."""

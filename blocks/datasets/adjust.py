@@ -32,6 +32,7 @@ __all__ = [
     "shifted",
     "stream_settings",
     "thinned",
+    "three_numbers",
     "turned",
 ]
 
@@ -82,7 +83,7 @@ def adjustment(given: Mapping[str, Any], name: str, path: str) -> Adjustment:
     Raises:
         DeclarationError: for one that is not usable. UnknownNameError: for another way with lost rows.
     """
-    turn = _three(given, f"{name}.mount", path)
+    turn = three_numbers(given, f"{name}.mount", path)
     mount = None
     if turn is not None:
         turned = scipy.spatial.transform.Rotation.from_rotvec(turn, degrees=True)
@@ -92,7 +93,7 @@ def adjustment(given: Mapping[str, Any], name: str, path: str) -> Adjustment:
         shift=offset(given, f"{name}.time_offset", path),
         every=round(1e9 * number(given, f"{name}.every", 0.0, path)),
         lost=chosen({"lost": given[f"{name}.lost"]} if f"{name}.lost" in given else {}, "lost", LOST, path),
-        lever=_three(given, f"{name}.lever", path),
+        lever=three_numbers(given, f"{name}.lever", path),
         mount=mount,
     )
 
@@ -109,7 +110,12 @@ def check_settings(given: Mapping[str, Any], path: str) -> None:
             adjustment(given, stream, path)
 
 
-def _three(given: Mapping[str, Any], name: str, path: str) -> tuple[float, ...] | None:
+def three_numbers(given: Mapping[str, Any], name: str, path: str) -> tuple[float, ...] | None:
+    """The setting `name`, three numbers with commas between; None where it is left out.
+
+    Raises:
+        DeclarationError: where it is something else.
+    """
     if name not in given:
         return None
     value = given[name]

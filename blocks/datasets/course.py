@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.parameters import Parameters
@@ -100,6 +99,9 @@ class Motion:
 
     def gyro(self, t: np.ndarray) -> np.ndarray:
         """(n, 3), rad/s, body."""
+        # scipy's rotations take half a second, which only a simulated course pays.
+        from scipy.spatial.transform import Rotation
+
         before, after = Rotation.from_matrix(self.attitude(t - _STEP)), self.attitude(t + _STEP)
         return np.asarray((before.inv() * Rotation.from_matrix(after)).as_rotvec() / (2.0 * _STEP))
 

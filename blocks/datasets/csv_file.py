@@ -17,16 +17,18 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight
+from flowgraph.blocks.datasets.adjust import three_numbers
 from flowgraph.blocks.datasets.cells import decimal_mark, is_date, numbers, stamps
-from flowgraph.blocks.datasets.csv_columns import SETTINGS, STREAMS, TURNS, said_by
+from flowgraph.blocks.datasets.csv_columns import OPTIONAL, SETTINGS, STREAMS, TURNS, WAYS, said_by
 from flowgraph.blocks.datasets.dialect import DELIMITERS, Sheet, read_sheet
-from flowgraph.blocks.datasets.places import from_ned
+from flowgraph.blocks.datasets.places import from_ned, height_of_pressure
 from flowgraph.blocks.datasets.shape import (
     Recording,
     chosen,
     imu_noise,
     known,
     measured_noise,
+    number,
     policy,
     the_file,
 )
@@ -39,6 +41,7 @@ from flowgraph.blocks.datasets.units import (
 from flowgraph.blocks.signals import (
     Attitude,
     GeodeticPosition,
+    GnssHeading,
     Height,
     Imu,
     MagneticField,
@@ -61,7 +64,8 @@ _SIGNALS: Mapping[frozenset[str], Any] = {
     frozenset(STREAMS["gps"]): GeodeticPosition,
     frozenset(STREAMS["gps_velocity"]): Velocity,
     frozenset(STREAMS["magnetometer"]): MagneticField,
-    frozenset(STREAMS["barometer"]): Height,
+    frozenset(("height",)): Height,
+    frozenset(STREAMS["heading"]): GnssHeading,
     frozenset(STREAMS["wheels"]): WheelSpeed,
     frozenset(STREAMS["truth"]) - {"angles", "matrix"}: NavigationState,
 }
@@ -73,6 +77,9 @@ _TRUTHS = [
 ]
 _TIMES = ("t", "time", "stamp", "timestamp", "timestamps", "time_stamp", "datetime", "date_time", "date")
 """Names, in small letters and without their unit, of a column that is a clock where no setting names one."""
+_HEADING_NOISE = 0.02
+"""rad: of two antennas a metre apart whose ambiguities are fixed, with their paths and their mast."""
+
 _INDEX = ("index", "row", "row.names")
 
 
@@ -86,7 +93,7 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
 
     Returns:
         A `Flight` with the mapped streams and truth. info: `absent`; with an imu `imu_noise`; and
-        `position_noise`, `attitude_noise` where they are given.
+        `position_noise`, `attitude_noise`, `heading_baseline` where they are given.
 
     Raises:
         DataError: the file is missing or has no rows; a cell is not a number or a stamp (file, line); stamps
@@ -132,12 +139,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
             group = places[stream, field]
             parts = [numbers(cells[k], sheet.where, k, decimal=decimal) for k in group]
             name, values = _converted(given, sheet, stream, field, group, np.stack(parts, axis=1), made.notes)
-            if (
-                stream == "gps_velocity"
-                and chosen(given, "gps_velocity.axes", ("enu", "ned"), "csv") == "ned"
-            ):
-                values = from_ned(values)
             columns[name] = values
+        if f"{stream}.axes" in SETTINGS:
+            columns = _turned(given, stream, columns, made.notes)
         whole = ~np.all([np.isnan(c).reshape(len(time), -1).all(axis=1) for c in columns.values()], axis=0)
         kept = np.flatnonzero(whole)  # a row of another sensor is no gap of this one
         if len(kept) < len(time):
@@ -154,6 +158,9 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     if "imu" in made.streams:
         made.info["imu_noise"] = imu_noise(given, "csv", made.notes)
     measured_noise(given, "csv", made.info)
+    baseline = three_numbers(given, "heading.baseline", "csv")
+    if baseline is not None:
+        made.info["heading_baseline"] = baseline
     return made.flight()
 
 
@@ -212,17 +219,18 @@ def _mapped(given: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
                 )
             mapped.setdefault(stream, {})[field] = columns
     for stream, found in mapped.items():
-        ways = [f for f in found if f in TURNS]
-        kinds = frozenset("attitude" if f in TURNS else f for f in found)
-        needed = {f for f in STREAMS[stream] if f not in ("angles", "matrix")}
-        if len(ways) > 1 or kinds not in (_TRUTHS if stream == "truth" else [needed]):
+        kinds = [WAYS.get(f, f) for f in found]
+        twice = next((kind for kind in kinds if kinds.count(kind) > 1), None)
+        needed = {WAYS.get(f, f) for f in STREAMS[stream]}
+        if twice or set(kinds) not in (_TRUTHS if stream == "truth" else [needed, needed - OPTIONAL]):
+            others = [f for f in STREAMS[stream] if f not in needed]
             raise DeclarationError(
-                f"{stream} lacks a field" if len(ways) < 2 else f"{stream} has its attitude twice",
+                f"{stream} has its {twice} twice" if twice else f"{stream} lacks a field",
                 path=f"csv.{stream}",
                 expected=", ".join(f"{stream}.{f}" for f in STREAMS[stream] if f in needed)
-                + (" (or angles, or matrix)" if "attitude" in needed else ""),
+                + (f" ({', '.join(f'or {f}' for f in others)})" if others else ""),
                 got=", ".join(f"{stream}.{f}" for f in found),
-                fix="name the columns of the others too" if len(ways) < 2 else "leave one of them out",
+                fix="leave one of them out" if twice else "name the columns of the others too",
             )
     return mapped
 
@@ -373,8 +381,11 @@ def _converted(
     if field == "matrix":
         return "attitude", from_matrices(values, sheet.where, by_rows=unit == "rows")
     said = _units(sheet, given, key, places, units, notes)
-    if field in ("latitude", "longitude") and not said and key not in given:
+    if field in ("latitude", "longitude", "angle", "pressure") and not said and key not in given:
         notes.append(note("assumed", f"{stream}.{field} is in {unit}; {key} says it"))
+    if field == "pressure":
+        where = lambda k: f"{sheet.where(k)}, column {sheet.names[places[0]] if sheet.names else places[0]}"
+        return "height", height_of_pressure(values[:, 0] * units[said or unit], where)
     if field != "angles":
         values = values * units[said or unit]
         return field, values[:, 0] if width == 1 else values
@@ -385,3 +396,23 @@ def _converted(
     if f"{stream}.angles.order" not in given:
         notes.append(note("assumed", f"{stream}.angles are roll, pitch, yaw, turned in the order {order}"))
     return "attitude", from_angles(values * units[said or unit], order)
+
+
+def _turned(
+    given: Mapping[str, str], stream: str, columns: dict[str, np.ndarray], notes: list[str]
+) -> dict[str, np.ndarray]:
+    """A velocity or a heading in a world of east, north, up, with the deviation that a heading has."""
+    ned = chosen(given, f"{stream}.axes", ("enu", "ned"), "csv") == "ned"
+    if stream != "heading":
+        return {"velocity": from_ned(columns["velocity"])} if ned else columns
+    angle = 0.5 * np.pi - columns["angle"] if ned else columns["angle"]
+    deviation = columns.get("deviation")
+    if deviation is None:
+        if "heading.noise" not in given:
+            said = (
+                f"heading: its deviation is {_HEADING_NOISE} rad; heading.noise or heading.deviation says it"
+            )
+            notes.append(note("assumed", said))
+        noise = number(given, "heading.noise", _HEADING_NOISE, "csv", positive=True)
+        deviation = np.where(np.isnan(angle), np.nan, noise)
+    return {"angle": angle, "deviation": deviation}

@@ -29,6 +29,7 @@ from flowgraph.blocks.datasets.cells import numbers, stamps
 from flowgraph.blocks.datasets.dialect import read_sheet
 from flowgraph.blocks.datasets.places import (
     GPS_EPOCH,
+    NAVIGATION_SETTINGS,
     add_fixes,
     add_solution,
     add_velocities,
@@ -37,26 +38,19 @@ from flowgraph.blocks.datasets.places import (
     from_ned,
 )
 from flowgraph.blocks.datasets.shape import (
-    NOISE_SETTINGS,
     Recording,
     imu_noise,
     known,
     policy,
     split_argument,
-    stream_settings,
 )
-from flowgraph.blocks.datasets.stamps import POLICIES
 from flowgraph.blocks.signals import Imu
 from flowgraph.data.notes import note
 from flowgraph.errors import DataError
 
 __all__ = ["SETTINGS", "load"]
 
-SETTINGS: Mapping[str, str] = {
-    **NOISE_SETTINGS,
-    **stream_settings("imu", "gps", "gps_velocity", "truth"),
-    "bad_time": "rows out of order: " + ", ".join(POLICIES),
-}
+SETTINGS = NAVIGATION_SETTINGS
 """The settings of `load` and what they mean."""
 
 _WEEK = 604_800 * 10**9

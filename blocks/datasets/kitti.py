@@ -21,16 +21,13 @@ import numpy as np
 
 from flowgraph import Flight
 from flowgraph.blocks.datasets.cells import stamps
-from flowgraph.blocks.datasets.places import add_fixes, add_velocities, diagonal
+from flowgraph.blocks.datasets.places import NAVIGATION_SETTINGS, add_fixes, add_velocities, diagonal
 from flowgraph.blocks.datasets.shape import (
-    NOISE_SETTINGS,
     Recording,
     imu_noise,
     known,
     policy,
-    stream_settings,
 )
-from flowgraph.blocks.datasets.stamps import POLICIES
 from flowgraph.blocks.geometry.euler import quaternion_from_angles
 from flowgraph.blocks.geometry.geodetic import to_enu
 from flowgraph.blocks.signals import Imu, Pose
@@ -39,11 +36,7 @@ from flowgraph.errors import DataError
 
 __all__ = ["SETTINGS", "load"]
 
-SETTINGS: Mapping[str, str] = {
-    **NOISE_SETTINGS,
-    **stream_settings("imu", "gps", "gps_velocity", "truth"),
-    "bad_time": "rows out of order: " + ", ".join(POLICIES),
-}
+SETTINGS = NAVIGATION_SETTINGS
 """The settings of `load` and what they mean."""
 
 _NUMBERS = 30

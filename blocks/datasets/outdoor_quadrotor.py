@@ -100,6 +100,12 @@ def load(argument: str, *, seed: int = 0, settings: Mapping[str, str | float] | 
     place = {"position": columns * (1.0, 1.0, -1.0)}
     made.add("truth", str(satellites), time, place, Position, row=where)
     made.add("rtk", str(satellites), time, place, Position, row=where)
+    steps = np.diff(np.unique(np.round(columns[:, 2], 3)))
+    if len(steps) and steps.min() > 2.0 * RTK_NOISE:
+        said = (
+            f"Down is written in steps of {steps.min():g} m, more than a position is off by ({RTK_NOISE:g} m)"
+        )
+        made.notes.append(note("info", f"{satellites.name}: {said}"))
     made.notes.append(note("skipped", f"{inertial.name}, {satellites.name}: the columns of angles"))
     made.info["imu_noise"] = imu_noise(given, "outdoor_quadrotor", made.notes, NOISE)
     made.info["position_noise"] = RTK_NOISE
@@ -117,11 +123,14 @@ def _files(folder: Path, unit: str) -> tuple[Path, Path]:
     for file in found:
         if not file.is_file():
             units = sorted(f.stem.removeprefix("IMU_") for f in folder.glob("IMU_*.csv"))
+            flights = sorted(f.parent.name for f in folder.glob("*/GT.csv"))
             raise DataError(
                 "this is no flight of the outdoor quadrotor",
                 path=str(file),
                 expected="a folder with GT.csv and IMU_1.csv",
-                got="no such file" + (f"; there are units {', '.join(units)}" if units else ""),
+                got="no such file"
+                + (f"; there are units {', '.join(units)}" if units else "")
+                + (f"; there are flights {', '.join(flights)}" if flights else ""),
                 fix="name the folder of one flight, outdoor_quadrotor:DIR:IMU",
             )
     return found

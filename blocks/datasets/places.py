@@ -8,13 +8,16 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flowgraph import Series
-from flowgraph.blocks.datasets.shape import Recording
+from flowgraph.blocks.datasets.shape import NOISE_SETTINGS, Recording, stream_settings
+from flowgraph.blocks.datasets.stamps import POLICIES
 from flowgraph.blocks.datasets.turns import from_angles, from_ned_attitude
 from flowgraph.blocks.geometry.geodetic import to_enu
 from flowgraph.blocks.signals import GnssFix, GnssVelocity, Pose
+from flowgraph.errors import DataError
 
 __all__ = [
     "GPS_EPOCH",
+    "NAVIGATION_SETTINGS",
     "QUALITY",
     "add_fixes",
     "add_solution",
@@ -22,10 +25,18 @@ __all__ = [
     "diagonal",
     "from_frd",
     "from_ned",
+    "height_of_pressure",
 ]
 
 GPS_EPOCH = 315_964_800 * 10**9
 """ns, of 1970 to 1980-01-06, where the weeks of GPS begin."""
+
+NAVIGATION_SETTINGS: Mapping[str, str] = {
+    **NOISE_SETTINGS,
+    **stream_settings("imu", "gps", "gps_velocity", "truth"),
+    "bad_time": "rows out of order: " + ", ".join(POLICIES),
+}
+"""Of a recording of a unit and satellites with a solution, and what they mean."""
 
 QUALITY: Mapping[int, float] = {1: 2.5, 2: 1.0, 3: 2.5, 4: 0.02, 5: 0.3}
 """m, an axis, by the quality of NMEA: alone, differential, PPS, RTK fixed, RTK float."""
@@ -39,6 +50,35 @@ def from_frd(v: np.ndarray) -> np.ndarray:
 def from_ned(v: np.ndarray) -> np.ndarray:
     """Vectors (n, 3) of north, east, down as east, north, up."""
     return np.asarray(v)[:, [1, 0, 2]] * (1.0, 1.0, -1.0)
+
+
+def height_of_pressure(pressure: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
+    """Heights (n,) m of pressures (n,) Pa in the standard atmosphere, above where it is 101,325 Pa:
+
+        h = T0/L (1 - (p/p0)^(R L/(g M)))      T0 = 288.15 K, L = 6.5 K/km, R L/(g M) = 0.190263
+
+    which holds up to 11 km. The weather moves that level by some hundred metres, so that differences count;
+    as far as the air is warmer than the standard's, by 1 % in 3 K, they are too small.
+
+    Args:
+        where: what to call row k in a message.
+
+    Raises:
+        DataError: for a pressure that is none of that air.
+
+    Source: ISO 2533:1975, Standard atmosphere, eq. 12 (ICAO Doc 7488/3).
+    """
+    off = np.flatnonzero((pressure < 22_632.0) | (pressure > 120_000.0))
+    if len(off):
+        value = float(pressure[off[0]])
+        raise DataError(
+            "this is no pressure of the air up to 11 km",
+            path=where(int(off[0])),
+            expected="from 22,632 to 120,000 Pa",
+            got=f"{value:.6g} Pa",
+            fix="say its unit with barometer.pressure.unit=hPa, or check the column",
+        )
+    return np.asarray(288.15 / 0.0065 * (1.0 - (pressure / 101_325.0) ** 0.190263))
 
 
 def diagonal(deviations: np.ndarray) -> np.ndarray:

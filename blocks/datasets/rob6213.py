@@ -26,8 +26,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import savgol_filter
-from scipy.spatial.transform import Rotation, Slerp
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
@@ -232,6 +230,10 @@ def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
     `window` seconds around each time (Savitzky and Golay, Analytical Chemistry 36, 1964). Where the motion
     capture has no finite row for longer than that, and half a window on either side, there is none.
     """
+    # scipy's rotations take half a second, which only a derived unit pays.
+    from scipy.signal import savgol_filter
+    from scipy.spatial.transform import Rotation, Slerp
+
     truth = truth[np.isfinite(truth["position"]).all(axis=1)]
     step = round(1e9 / rate)
     time = np.arange(truth.time[0], truth.time[-1] + 1, step)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from flowgraph.blocks.datasets.settings import NOISE_SETTINGS, imu_noise, number
 from flowgraph.blocks.inertial.imu import ImuNoise
@@ -206,6 +205,9 @@ def rigid(transform: Any, file: Path) -> tuple[tuple[float, ...], tuple[float, .
             raise ValueError("its 3 x 3 part mirrors, and is no rotation")
         if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
             raise ValueError("its last row is not 0, 0, 0, 1")
+        # scipy's rotations take half a second, which only a mounted sensor pays.
+        from scipy.spatial.transform import Rotation
+
         w, x, y, z = Rotation.from_matrix(R).as_quat(canonical=True)[[3, 0, 1, 2]].tolist()
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(

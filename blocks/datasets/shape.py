@@ -335,6 +335,7 @@ class Recording:
                     and len(time) >= 10
                     and (np.diff(time) == 10**9).all()
                     and time[0] in (0, 10**9)
+                    and not any((s.time % 10**9).any() for s in self.streams.values())  # of the same clock
                 ):
                     first = ", ".join(str(k // 10**9) for k in time[:3].tolist())
                     sentence = f"{name}: its stamps are {first}, ... s, as an index of rows is"

@@ -11,7 +11,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["ANGLE", "FIELD", "FORCE", "KINDS", "LENGTH", "RATE", "SPEED", "TIME", "split_unit", "unit_of"]
+__all__ = [
+    "ANGLE",
+    "FIELD",
+    "FORCE",
+    "KINDS",
+    "LENGTH",
+    "PRESSURE",
+    "RATE",
+    "SPEED",
+    "TIME",
+    "split_unit",
+    "unit_of",
+]
 
 _DEGREE = np.pi / 180.0
 LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
@@ -20,6 +32,7 @@ FORCE = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
 FIELD = {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4, "mG": 1e-7}
 ANGLE = {"rad": 1.0, "deg": _DEGREE, "1e-7 deg": 1e-7 * _DEGREE}
 SPEED = {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1.0 / 3.6}
+PRESSURE = {"Pa": 1.0, "hPa": 100.0, "kPa": 1e3, "mbar": 100.0, "bar": 1e5}
 TIME = {
     "s": 10**9,
     "ms": 10**6,
@@ -31,7 +44,7 @@ TIME = {
 }
 """Of a unit of time, in ns; the first of each kind is what is taken where nothing is said."""
 
-KINDS = (LENGTH, RATE, FORCE, FIELD, ANGLE, SPEED)
+KINDS = (LENGTH, RATE, FORCE, FIELD, ANGLE, SPEED, PRESSURE)
 _NONE = "none"
 _SPELLINGS: Mapping[str, str] = {
     **{u: u for kind in (*KINDS, TIME) for u in kind},
@@ -57,6 +70,8 @@ _SPELLINGS: Mapping[str, str] = {
     **dict.fromkeys(("tesla",), "T"),
     **dict.fromkeys(("gauss", "Gauss"), "G"),
     **dict.fromkeys(("mgauss", "mGauss"), "mG"),
+    **dict.fromkeys(("pascal", "pascals"), "Pa"),
+    **dict.fromkeys(("millibar", "millibars"), "mbar"),
     **dict.fromkeys(("-", "1", "[]", "none", "unitless", "quaternion"), _NONE),
 }
 

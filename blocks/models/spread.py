@@ -62,7 +62,9 @@ def spread_outdoor(  # type: ignore[no-untyped-def]
     parts[1, 0, 1:3] = parts[1, 1:3, 0] = held.force**2
     parts[2, 1:3, 1:3] = held.force**2
     parts[3, 3, 3] = held.rate**2
-    v, vp, pp, turn = (xp.asarray(np.kron(p, np.eye(3))[:, :, None], dtype=kind) for p in parts)
+    biases = cloud.covariance.shape[0] - 12  # which stay
+    tables = [np.pad(np.kron(p, np.eye(3)), (0, biases))[:, :, None] for p in parts]
+    v, vp, pp, turn = (xp.asarray(table, dtype=kind) for table in tables)
     more = v * w + vp * (0.5 * part * w) + pp * (part * part * w / 3.0) + turn * w
     return rest, cloud.replace(covariance=cloud.covariance + more)
 

@@ -9,6 +9,7 @@ sensor does to it. `errors` judges navigation by the path of an antenna, and by 
 from __future__ import annotations
 
 from flowgraph.blocks.outdoor.belief import (
+    BIASED,
     FLOW,
     OUTDOOR,
     FieldObserver,
@@ -19,7 +20,9 @@ from flowgraph.blocks.outdoor.belief import (
     new_picture,
     observe_distance,
     observe_flow,
+    outdoor_navigation,
     outdoor_pose,
+    outdoor_space,
     outdoor_steps,
     picture_cross,
     picture_taken,
@@ -27,13 +30,17 @@ from flowgraph.blocks.outdoor.belief import (
     start_outdoor,
 )
 from flowgraph.blocks.outdoor.cloud import (
+    ACCELEROMETER_BIAS,
+    GYRO_BIAS,
     MOVED,
     POSITION,
     TURN,
     VELOCITY,
     as_cloud,
+    cloud_biases,
     outdoor_belief,
     predict_outdoor,
+    shifted,
     start_outdoor_cloud,
     take_outdoor_ancestors,
     take_picture,
@@ -59,6 +66,13 @@ from flowgraph.blocks.outdoor.recording import outdoor_recording
 from flowgraph.blocks.outdoor.tracks import as_geojson, as_gpx, as_kml, as_table, track_files
 
 __all__ = [
+    "ACCELEROMETER_BIAS",
+    "BIASED",
+    "GYRO_BIAS",
+    "cloud_biases",
+    "outdoor_navigation",
+    "outdoor_space",
+    "shifted",
     "track_files",
     "as_table",
     "as_kml",

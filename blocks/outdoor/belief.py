@@ -1,9 +1,10 @@
 """The outdoor sensors in an error-state Kalman filter: one Gaussian over now and the last picture.
 
 State x = (position, velocity, attitude, position at the last picture, attitude at the last picture): 17
-numbers, on a space of 15 dimensions. The last two are clones, which optical flow is measured from. A sensor
-is a function of the state; `update_extended` derives its Jacobian and does the rest. Attitude errors are
-right (body) rotation vectors.
+numbers, on a space of 15 dimensions. The last two are clones, which optical flow is measured from. Where the
+unit has biases that are worth estimating, those of gyroscope and accelerometer follow: 23 numbers, 21
+dimensions. A sensor is a function of the state; `update_extended` derives its Jacobian and does the rest.
+Attitude errors are right (body) rotation vectors.
 
 Sources: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017; clones:
 S. I. Roumeliotis and J. W. Burdick, "Stochastic cloning: a generalized framework for processing relative
@@ -30,9 +31,10 @@ from flowgraph.blocks.geometry.rotations import (
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.outdoor.flight import OutdoorStart
-from flowgraph.blocks.signals import Gaussian, Imu, OpticalFlow, PoseBelief
+from flowgraph.blocks.signals import Belief, Gaussian, Imu, OpticalFlow, PoseBelief
 
 __all__ = [
+    "BIASED",
     "FLOW",
     "FieldObserver",
     "OUTDOOR",
@@ -43,7 +45,9 @@ __all__ = [
     "new_picture",
     "observe_distance",
     "observe_flow",
+    "outdoor_navigation",
     "outdoor_pose",
+    "outdoor_space",
     "outdoor_steps",
     "picture_cross",
     "picture_taken",
@@ -54,14 +58,28 @@ __all__ = [
 OUTDOOR = StateSpace(euclidean(3), euclidean(3), quaternion(), euclidean(3), quaternion())
 """The state: position, velocity, attitude; position and attitude at the last picture."""
 
+BIASED = StateSpace(*OUTDOOR.parts, euclidean(3), euclidean(3))
+"""The state with the biases of gyroscope (rad/s) and accelerometer (m/s^2)."""
+
 FLOW = StateSpace(euclidean(3), quaternion())
 """What optical flow measures: displacement (m) and turn."""
 
 _CLONES = np.eye(15, 6, -9)  # they stay
-_TAKEN = np.zeros((15, 15))  # a new picture: the errors of now become those of the clone
-_TAKEN[:9, :9] = np.eye(9)
-_TAKEN[9:12, :3] = np.eye(3)
-_TAKEN[12:, 6:9] = np.eye(3)
+_STAY = np.eye(12, 21, 9)  # clones and biases
+_POSE = [*range(9), *range(15, 21)]  # of the errors, those of now
+
+
+def _taken(size: int) -> np.ndarray:
+    """T (size, size) of a new picture: the errors of now become those of the clone."""
+    T = np.eye(size)
+    T[9:15] = 0.0
+    T[9:12, :3] = T[12:15, 6:9] = np.eye(3)
+    return T
+
+
+def outdoor_space(mean: Array) -> StateSpace:
+    """That of a state (17 or 23)."""
+    return OUTDOOR if mean.shape[-1] == 17 else BIASED
 
 
 def _parts(x: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -82,30 +100,37 @@ def predict_clone(
     dt: float,
     xp: Any,
 ) -> Gaussian:
-    """Predict a belief over `OUTDOOR` by `dt` seconds, with an IMU reading held over the step.
+    """Predict a belief over `OUTDOOR` or `BIASED` by `dt` seconds, with an IMU reading held over the step.
 
         a = R(q Exp(w dt/2)) f + gravity
         p' = p + v dt + a dt^2/2      v' = v + a dt      q' = q * Exp(w dt)      P' = F (P + Q/2) F^T + Q/2
 
     The clones stay. F is the Jacobian of this step (Solà eqs. 269-270, to second order in w dt); Q is the
-    spectral density times dt. With dt = 0, as at the first firing, this is the identity.
+    spectral density times dt. With dt = 0, as at the first firing, this is the identity. Biases are taken off
+    the reading, and walk.
 
     Args:
-        belief: mean (17) and covariance (15, 15).
+        belief: mean (17) and covariance (15, 15), or 23 and (21, 21).
         imu: rad/s and m/s^2, body.
-        noise: densities; there are no biases.
+        noise: densities; of the walks only where there are biases.
     """
-    p, v, q, p0, q0 = _parts(belief.mean)
+    x = belief.mean
+    p, v, q, p0, q0 = _parts(x)
     kind = q.dtype
+    imu = _unbiased(x, imu)
     half, middle, R, back = _half_way(q, imu, dt, xp)
     step = (_times(R, imu.specific_force) + xp.asarray(gravity, dtype=kind)) * dt
-    F = _clone_jacobian(R, back, imu, dt, xp)
+    F = _clone_jacobian(x, R, back, imu, dt, xp)
     power = np.repeat([0.0, noise.accelerometer**2, noise.gyro**2, 0.0, 0.0], 3)
+    stays = [p0, q0]
+    if x.shape[-1] > 17:
+        power = np.append(power, np.repeat([noise.gyro_bias**2, noise.accelerometer_bias**2], 3))
+        stays = [x[..., 10:]]
     Q = xp.asarray(np.diag(power), dtype=kind) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
     turned = normalize(multiply(middle, half, xp=xp), xp=xp)
     return Gaussian(
-        mean=xp.concat([p + (v + 0.5 * step) * dt, v + step, turned, p0, q0], axis=-1),
+        mean=xp.concat([p + (v + 0.5 * step) * dt, v + step, turned, *stays], axis=-1),
         covariance=0.5 * (P + P.mT),
     )
 
@@ -116,9 +141,17 @@ def clone_crossing(belief: Gaussian, imu: Imu, dt: Any, xp: Any) -> Array:
 
 
 def clone_transition(x: Array, imu: Imu, dt: Any, xp: Any) -> Array:
-    """F (15, 15) of `predict_clone` at the state x (17)."""
+    """F (15, 15) of `predict_clone` at the state x (17), or (21, 21) at one of 23."""
+    imu = _unbiased(x, imu)
     _, _, R, back = _half_way(_parts(x)[2], imu, dt, xp)
-    return _clone_jacobian(R, back, imu, dt, xp)
+    return _clone_jacobian(x, R, back, imu, dt, xp)
+
+
+def _unbiased(x: Array, imu: Imu) -> Imu:
+    """The reading less the biases of the state, where it has any."""
+    if x.shape[-1] == 17:
+        return imu
+    return Imu(gyro=imu.gyro - x[..., 17:20], specific_force=imu.specific_force - x[..., 20:23])
 
 
 def _half_way(q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array, Array]:
@@ -128,11 +161,20 @@ def _half_way(q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array
     return half, middle, to_matrix(middle, xp=xp), to_matrix(half, xp=xp).mT
 
 
-def _clone_jacobian(R: Array, back: Array, imu: Imu, dt: Any, xp: Any) -> Array:
-    """F (15, 15) of `predict_clone`."""
+def _clone_jacobian(x: Array, R: Array, back: Array, imu: Imu, dt: Any, xp: Any) -> Array:
+    """F (15, 15) of `predict_clone`, or (21, 21), by a reading less its biases."""
     pull = R @ skew(imu.specific_force * -dt, xp=xp) @ back
     one, zero = 0.0 * R + xp.eye(3, dtype=R.dtype), 0.0 * R
     wide = xp.concat([zero, zero], axis=-1)
+    if x.shape[-1] > 17:  # a turn loses half of a bias's by the middle of the step
+        pushed = xp.concat([wide, pull * (-0.5 * dt), R * -dt], axis=-1)
+        rows = [
+            xp.concat([one, one * dt, pull * (0.5 * dt), pushed * (0.5 * dt)], axis=-1),
+            xp.concat([zero, one, pull, pushed], axis=-1),
+            xp.concat([zero, zero, back @ back, wide, back * -dt, zero], axis=-1),
+        ]
+        stay = xp.asarray(_STAY, dtype=R.dtype)
+        return xp.concat([*rows, xp.broadcast_to(stay, (*R.shape[:-2], 12, 21))], axis=-2)
     rows = [
         xp.concat([one, one * dt, pull * (0.5 * dt), wide], axis=-1),
         xp.concat([zero, one, pull, wide], axis=-1),
@@ -202,9 +244,10 @@ def new_picture(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gauss
 
 
 def picture_taken(x: Array, xp: Any) -> tuple[Array, Array]:
-    """The state (17) whose clone is its own pose, and T (15, 15)."""
+    """The state whose clone is its own pose, and T (15, 15), or (21, 21)."""
     p, v, q, _, _ = _parts(x)
-    return xp.concat([p, v, q, p, q], axis=-1), xp.asarray(_TAKEN, dtype=x.dtype)
+    biases, size = ([], 15) if x.shape[-1] == 17 else ([x[..., 17:]], 21)
+    return xp.concat([p, v, q, p, q, *biases], axis=-1), xp.asarray(_taken(size), dtype=x.dtype)
 
 
 @block
@@ -219,26 +262,50 @@ def picture_cross(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gau
 
 @block
 def outdoor_pose(belief: Gaussian) -> PoseBelief:
-    """What is believed of now, without the clones."""
+    """What is believed of now, without the clones and biases."""
     p, v, q, _, _ = _parts(belief.mean)
     return PoseBelief(position=p, velocity=v, attitude=q, covariance=belief.covariance[..., :9, :9])
 
 
+@block
+def outdoor_navigation(belief: Gaussian, *, xp: Any) -> Belief:
+    """What is believed of now and of the biases, without the clones."""
+    x, P = belief.mean, belief.covariance
+    p, v, q, _, _ = _parts(x)
+    pick = xp.asarray(np.eye(21)[_POSE], dtype=P.dtype)
+    return Belief(
+        position=p,
+        velocity=v,
+        attitude=q,
+        gyro_bias=x[..., 17:20],
+        accelerometer_bias=x[..., 20:23],
+        covariance=pick @ P @ pick.mT,
+    )
+
+
 def outdoor_steps(result: Result) -> Steps:
     """Those of a run of `outdoor_eskf` that was wired for a smoother."""
+    space = outdoor_space(result["posterior"]["mean"])
 
     def named(smoothed: Series) -> Series:
         belief = Gaussian(mean=smoothed["mean"], covariance=smoothed["covariance"])
-        return Series(smoothed.time, outdoor_pose.step(belief), name=smoothed.name)
+        made = outdoor_pose.step(belief) if space is OUTDOOR else outdoor_navigation.step(belief, xp=np)
+        return Series(smoothed.time, made, name=smoothed.name)
 
-    return steps_of(result, OUTDOOR)._replace(named=named)
+    return steps_of(result, space)._replace(named=named)
 
 
-def start_outdoor(start: OutdoorStart) -> Gaussian:
-    """A belief to start from, at rest, with a picture taken. Tilt and heading are about world axes."""
-    R = np.asarray(to_matrix(start.attitude, xp=np))
-    P = np.zeros((15, 15))
-    P[:3, :3], P[3:6, 3:6] = np.eye(3) * start.spread.position**2, np.eye(3) * start.spread.velocity**2
-    P[6:9, 6:9] = R.T @ np.diag(np.square([start.spread.tilt, start.spread.tilt, start.spread.heading])) @ R
+def start_outdoor(start: OutdoorStart, *, biases: bool = False) -> Gaussian:
+    """A belief to start from, at rest, with a picture taken. Tilt and heading are about world axes.
+
+    biases: whether there are any; they are zero, as far as the start's spread says.
+    """
+    R, spread, size = np.asarray(to_matrix(start.attitude, xp=np)), start.spread, 21 if biases else 15
+    P = np.zeros((size, size))
+    P[:3, :3], P[3:6, 3:6] = np.eye(3) * spread.position**2, np.eye(3) * spread.velocity**2
+    P[6:9, 6:9] = R.T @ np.diag(np.square([spread.tilt, spread.tilt, spread.heading])) @ R
     pose = [start.position, np.zeros(3), start.attitude, start.position, start.attitude]
-    return Gaussian(mean=np.concatenate(pose), covariance=_TAKEN @ P @ _TAKEN.T)
+    if biases:
+        P[15:, 15:] = np.diag(np.repeat(np.square([spread.gyro_bias, spread.accelerometer_bias]), 3))
+        pose.append(np.zeros(6))
+    return Gaussian(mean=np.concatenate(pose), covariance=_taken(size) @ P @ _taken(size).T)

@@ -9,6 +9,9 @@ in it. Each reading is then a Kalman update of each particle, and weighs it by h
 When a picture is taken, e is drawn from what all readings since the last one have left of it, and the motion
 is conditioned on the draw: the proposal that looks at the readings first, and the least uneven weights.
 
+Biases of the unit, where they are estimated, are linear in all of this as well: they stay in the Kalman
+filter of each particle, which needs no more particles for them.
+
 Optical flow measures from one picture to the next. Each particle keeps its attitude at the last picture and,
 in its Kalman state, how far it has moved since, which is zero and certain when a picture is taken.
 
@@ -34,6 +37,7 @@ from flowgraph.blocks.particles.cloud import cloud_belief, start_cloud
 from flowgraph.blocks.signals import (
     Ancestors,
     Cloud,
+    Gaussian,
     Imu,
     OutdoorCloud,
     PoseBelief,
@@ -42,13 +46,17 @@ from flowgraph.blocks.signals import (
 )
 
 __all__ = [
+    "ACCELEROMETER_BIAS",
+    "GYRO_BIAS",
     "MOVED",
     "POSITION",
     "TURN",
     "VELOCITY",
     "as_cloud",
+    "cloud_biases",
     "outdoor_belief",
     "predict_outdoor",
+    "shifted",
     "start_outdoor_cloud",
     "take_outdoor_ancestors",
     "take_picture",
@@ -56,6 +64,8 @@ __all__ = [
 ]
 
 VELOCITY, POSITION, MOVED, TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+GYRO_BIAS, ACCELEROMETER_BIAS = slice(12, 15), slice(15, 18)
+"""Where each stands in a covariance. The means have no turn, which is zero: biases come three before."""
 
 
 def _blocks(entries: dict[tuple[int, int], float]) -> np.ndarray:
@@ -76,7 +86,7 @@ _WHITE = (
 _WHITE_TURN = _blocks({(3, 3): 1.0})
 """What white noise on the rate leaves: the coefficient of dt."""
 
-_KEPT = np.repeat([1.0, 1.0, 0.0, 0.0], 3)
+_KEPT = np.repeat([1.0, 1.0, 0.0, 0.0, 1.0, 1.0], 3)
 """What of the state outlives a picture."""
 
 _MOTION_OF_POSE = np.eye(9, 12, 0)[[3, 4, 5, 0, 1, 2, 6, 7, 8]] * (np.arange(9) < 6)[:, None]
@@ -111,12 +121,17 @@ def predict_outdoor(
     dt^3/3] on v and on p and s, which move alike. Fires when its inputs do; with dt = 0, as at the first
     firing, this is the identity.
 
+    Where particles have biases, these are taken off their reading, and walk. What is unknown of that of the
+    gyroscope turns e by -R b dt, and what is unknown of the accelerometer's pushes the velocity by -R b dt.
+
     Args:
         cloud: the belief at the last firing.
         imu: the reading that held since then: rad/s and m/s^2, body.
-        noise: densities.
+        noise: densities; of the walks only where there are biases.
     """
     kind = cloud.motion.dtype
+    if cloud.covariance.shape[0] > 12:
+        return _predict_biased(cloud, imu, noise, gravity, dt, xp)
     half = lanes.exponential((0.5 * dt) * imu.gyro[:, None], xp=xp)
     middle = lanes.multiply(cloud.attitude, half, xp=xp)
     attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
@@ -136,12 +151,48 @@ def predict_outdoor(
     )
 
 
-def _advanced(A: Array, push: Array, dt: Array, xp: Any) -> Array:
-    """F A for each particle: A (12, 12, n), and push (3, n) the force times dt."""
+def _predict_biased(
+    cloud: OutdoorCloud, imu: Imu, noise: ImuNoise, gravity: tuple[float, float, float], dt: Any, xp: Any
+) -> OutdoorCloud:
+    """`predict_outdoor` of particles with biases."""
+    kind = cloud.motion.dtype
+    rate = imu.gyro[:, None] - cloud.motion[9:12, :]
+    half = lanes.exponential((0.5 * dt) * rate, xp=xp)
+    middle = lanes.multiply(cloud.attitude, half, xp=xp)
+    R = lanes.rotation_matrices(middle, xp=xp)
+    force = xp.sum(R * (imu.specific_force[:, None] - cloud.motion[12:15, :])[None, :, :], axis=1)
+    step = (force + xp.asarray(gravity, dtype=kind)[:, None]) * dt
+    path = (cloud.motion[VELOCITY, :] + 0.5 * step) * dt
+    white = [np.pad(table, (0, 6)) * noise.accelerometer**2 for table in _WHITE]
+    walks = np.repeat([0.0, 0.0, 0.0, 0.0, noise.gyro_bias**2, noise.accelerometer_bias**2], 3)
+    W, W2, W3 = (xp.asarray(t, dtype=kind) for t in (white[0] + np.diag(walks), white[1], white[2]))
+    Q = (W + (W2 + W3 * dt) * dt) * dt
+    N = xp.asarray(np.pad(_WHITE_TURN, (0, 6)) * (0.5 * noise.gyro**2), dtype=kind) * dt
+    wide = cloud.covariance + N[:, :, None]
+    for _ in range(2):
+        wide = lanes.transpose(_advanced(wide, force * dt, dt, xp, R * dt), xp=xp)
+    return cloud.replace(
+        attitude=lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp),
+        motion=xp.concat([cloud.motion[:9, :] + xp.concat([step, path, path], axis=0), cloud.motion[9:, :]]),
+        covariance=wide + (N + Q)[:, :, None],
+    )
+
+
+def _advanced(A: Array, push: Array, dt: Array, xp: Any, turn: Array | None = None) -> Array:
+    """F A for each particle: A (12, 12, n), and push (3, n) the force times dt; with biases A is (18, 18, n),
+    and turn (3, 3, n) the rotation times dt."""
     v, p, s, e = (A[part, :, :] for part in (VELOCITY, POSITION, MOVED, TURN))
-    step = -lanes.cross(push, e, xp=xp)
+    if turn is None:
+        step = -lanes.cross(push, e, xp=xp)
+        path = (v + 0.5 * step) * dt
+        return xp.concat([v + step, p + path, s + path, e], axis=0)
+    by_rate, by_force = (
+        sum(turn[:, k, None, :] * A[part, :, :][None, k, :, :] for k in range(3))
+        for part in (GYRO_BIAS, ACCELEROMETER_BIAS)
+    )
+    step = -lanes.cross(push, e - 0.5 * by_rate, xp=xp) - by_force
     path = (v + 0.5 * step) * dt
-    return xp.concat([v + step, p + path, s + path, e], axis=0)
+    return xp.concat([v + step, p + path, s + path, e - by_rate, A[12:, :, :]], axis=0)
 
 
 @block
@@ -167,14 +218,24 @@ def take_picture(cloud: OutdoorCloud, when: Any | None, *, draw: Any, xp: Any) -
         c = with_k / xp.sqrt(xp.maximum(with_k[9 + k, :], _LEAST_VARIANCE))
         state = state + c * deviations[k, :]
         P = P - c[:, None, :] * c[None, :, :]
-    kept = xp.asarray(_KEPT, dtype=P.dtype)
+    kept = xp.asarray(_KEPT[: P.shape[0]], dtype=P.dtype)
     attitude = turned(cloud.attitude, state[TURN, :], xp)
     return cloud.replace(
         attitude=attitude,
         picture=attitude,
-        motion=(cloud.motion + state[:9, :]) * kept[:9, None],
+        motion=shifted(cloud.motion, state, xp) * _moving(kept, xp)[:, None],
         covariance=P * (kept[:, None] * kept[None, :])[:, :, None],
     )
+
+
+def shifted(motion: Array, state: Array, xp: Any) -> Array:
+    """The means (9 or 15, n) after a change of the state (12 or 18, n), but for its turn."""
+    return motion + _moving(state, xp)
+
+
+def _moving(state: Array, xp: Any) -> Array:
+    """Of the state (12 or 18, ...) all but the turn."""
+    return state[:9, ...] if state.shape[0] == 12 else xp.concat([state[:9, ...], state[12:, ...]], axis=0)
 
 
 def turned(q: Array, e: Array, xp: Any) -> Array:
@@ -213,6 +274,7 @@ def outdoor_belief(
     found = cloud_belief.step(plain, weights, pose, xp=xp)
     kind = pose.attitude.dtype
     own = xp.sum(cloud.covariance * weights.weight, axis=-1)
+    own = own if own.shape[0] == 12 else own[:12, :12]
     R = to_matrix(pose.attitude, xp=xp)
     lift = xp.asarray(_TURN_OF_POSE, dtype=kind)
     turn = lift @ R.mT @ xp.asarray(np.eye(3, 12, 9), dtype=kind)  # (9, 12)
@@ -220,6 +282,16 @@ def outdoor_belief(
     across = turn @ own @ motion.mT
     total = found.covariance + turn @ own @ turn.mT + across + across.mT
     return found.replace(covariance=0.5 * (total + total.mT))
+
+
+@block
+def cloud_biases(cloud: OutdoorCloud, weights: Weights, *, xp: Any) -> Gaussian:
+    """The biases of a cloud that has them: rad/s and m/s^2, (6), and their covariance (6, 6)."""
+    own = cloud.motion[9:, :]
+    mean = own @ weights.weight
+    apart = own - mean[:, None]
+    P = xp.sum(cloud.covariance[12:, 12:, :] * weights.weight, axis=-1)
+    return Gaussian(mean=mean, covariance=P + (apart * weights.weight) @ apart.mT)
 
 
 @block
@@ -236,16 +308,25 @@ def take_outdoor_ancestors(cloud: OutdoorCloud, ancestors: Ancestors, *, xp: Any
     )
 
 
-def start_outdoor_cloud(particles: int, start: OutdoorStart, *, seed: int = 0) -> OutdoorCloud:
-    """A cloud to start from, equally weighted and at rest, with a picture taken."""
+def start_outdoor_cloud(
+    particles: int, start: OutdoorStart, *, seed: int = 0, biases: bool = False
+) -> OutdoorCloud:
+    """A cloud to start from, equally weighted and at rest, with a picture taken.
+
+    biases: whether there are any; they are zero, as far as the start's spread says.
+    """
     plain = start_cloud(
         particles, seed=seed, position=start.position, attitude=start.attitude, spread=start.spread
     )
     variance = np.repeat([start.spread.velocity**2, start.spread.position**2, 0.0, 0.0], 3)
+    if biases:
+        known = np.square([start.spread.gyro_bias, start.spread.accelerometer_bias])
+        variance = np.append(variance, np.repeat(known, 3))
+    still = np.zeros((len(variance) - 9, particles))
     return OutdoorCloud(
         log_weight=plain.log_weight,
         attitude=plain.attitude,
         picture=plain.attitude,
-        motion=np.concatenate([plain.velocity, plain.position, np.zeros((3, particles))]),
+        motion=np.concatenate([plain.velocity, plain.position, still]),
         covariance=np.repeat(np.diag(variance)[:, :, None], particles, axis=2),
     )

@@ -20,7 +20,7 @@ from flowgraph import Array, block
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.kalman.lost import PATIENCE, lost_variances
-from flowgraph.blocks.outdoor.cloud import MOVED, POSITION, TURN, as_cloud, turned
+from flowgraph.blocks.outdoor.cloud import MOVED, POSITION, TURN, as_cloud, shifted, turned
 from flowgraph.blocks.particles.cloud import average_attitude, log_sum_exp
 from flowgraph.blocks.particles.lost import judged, mixture, within_reach
 from flowgraph.blocks.signals import (
@@ -256,9 +256,10 @@ def _widened(cloud: OutdoorCloud, weight: Array, grow: Array, gated: _Gated, xp:
     kind = cloud.motion.dtype
     q = average_attitude.step(as_cloud.step(cloud), Weights(weight=weight), xp=xp).attitude
     turn = -lanes.rotation_vectors_to(cloud.attitude, q, xp=xp)  # in the body of the mean
-    apart = xp.concat([cloud.motion, to_matrix(q, xp=xp) @ turn], axis=0)
+    n, turn = cloud.covariance.shape[0], to_matrix(q, xp=xp) @ turn
+    apart = xp.concat([cloud.motion, turn] if n == 12 else [cloud.motion[:9, :], turn, cloud.motion[9:, :]])
     apart = apart - (apart @ weight)[:, None]
-    one = xp.asarray(np.eye(12), dtype=kind)
+    one = xp.asarray(np.eye(n), dtype=kind)
     own = xp.sum(cloud.covariance * one[:, :, None], axis=1)
     variance = (apart * apart + own) @ weight
     wide = lost_variances(
@@ -297,11 +298,11 @@ def _corrected(
 def _moved(
     cloud: OutdoorCloud, state: Array, covariance: Array, log_likelihood: Array, xp: Any
 ) -> OutdoorCloud:
-    """The cloud with its means moved by `state` (12, n), of which the turn goes into the attitude."""
+    """The cloud with its means moved by `state` (12 or 18, n), of which the turn goes into the attitude."""
     both = cloud.log_weight + log_likelihood
     return cloud.replace(
         log_weight=both - log_sum_exp(both, xp=xp),
         attitude=turned(cloud.attitude, state[TURN, :], xp),
-        motion=cloud.motion + state[:9, :],
+        motion=shifted(cloud.motion, state, xp),
         covariance=0.5 * (covariance + lanes.transpose(covariance, xp=xp)),
     )

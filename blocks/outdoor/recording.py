@@ -14,16 +14,17 @@ import numpy as np
 
 from flowgraph import Array, Series
 from flowgraph.blocks.filtering.batch import Aged, Derived, Recording
+from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.lost import Held
 from flowgraph.blocks.models.recordings import drive_at
 from flowgraph.blocks.outdoor.belief import (
     FLOW,
-    OUTDOOR,
     FieldObserver,
     PositionObserver,
     clone_transition,
     observe_distance,
     observe_flow,
+    outdoor_space,
     picture_taken,
     predict_clone,
 )
@@ -38,7 +39,8 @@ def outdoor_recording(
     inputs: Mapping[str, Series], *, start: Gaussian, sensors: OutdoorSensors, reading: str,
     held: Held | None = None,
 ) -> Recording:  # fmt: skip
-    """What `outdoor_eskf` is given: `imu`, and any of the sensors; over `OUTDOOR`."""
+    """What `outdoor_eskf` is given: `imu`, and any of the sensors; over the space of the start."""
+    space, size = outdoor_space(start.mean), start.covariance.shape[-1]
     imu, flow = inputs["imu"], inputs.get("optical_flow")
 
     def drive(time: np.ndarray) -> Series:
@@ -50,35 +52,35 @@ def outdoor_recording(
     def linearised(x: Array, drive: CloneDrive, dt: Any, xp: Any) -> tuple[Array, Array, Array]:
         taken = drive.picture > 0.5
         cloned, T = picture_taken(x, xp)
-        x, T = xp.where(taken, cloned, x), xp.where(taken, T, xp.eye(15, dtype=x.dtype))
+        x, T = xp.where(taken, cloned, x), xp.where(taken, T, xp.eye(size, dtype=x.dtype))
         step = Imu(gyro=drive.gyro, specific_force=drive.specific_force)
-        exactly = Gaussian(mean=x, covariance=xp.zeros((15, 15), dtype=x.dtype))
+        exactly = Gaussian(mean=x, covariance=xp.zeros((size, size), dtype=x.dtype))
         after = predict_clone.step(exactly, step, noise=sensors.imu, dt=dt, xp=xp)
         return after.mean, clone_transition(x, step, dt, xp) @ T, after.covariance
 
     places = {"position": 0, "velocity": 3, "attitude": 6}
     aged = None if held is None else Aged(imu, held, places)
-    seen = {model: inputs[name] for name, model in _models(sensors).items() if name in inputs}
+    seen = {model: inputs[name] for name, model in _models(sensors, space).items() if name in inputs}
     longest = None if held is None else held.longest
-    return Recording(Derived(OUTDOOR, linearised), seen, start, drive, longest, aged)
+    return Recording(Derived(space, linearised), seen, start, drive, longest, aged)
 
 
-def _models(s: OutdoorSensors) -> dict[str, Measurement]:
+def _models(s: OutdoorSensors, space: StateSpace) -> dict[str, Measurement]:
     """What each sensor that is there sees, as the filter takes it."""
     found: dict[str, Measurement] = {}
     for name, noise, lever in (("gps", s.gps, s.gps_lever), ("gps2", s.gps2, s.gps2_lever)):
         if noise is not None:
             place = PositionObserver(lever)
-            found[name] = MeasurementModel(OUTDOOR, place, np.repeat(noise**2, 3))
+            found[name] = MeasurementModel(space, place, np.repeat(noise**2, 3))
     if s.magnetometer is not None:
         field, tesla = FieldObserver(s.field, s.magnetometer), s.magnetometer
-        found["magnetometer"] = MeasurementModel(OUTDOOR, field, np.ones(3), read=lambda z: z.field / tesla)
+        found["magnetometer"] = MeasurementModel(space, field, np.ones(3), read=lambda z: z.field / tesla)
     if s.altimeter is not None:
         read = lambda z: z.distance[..., None]
-        found["altimeter"] = MeasurementModel(OUTDOOR, observe_distance, [s.altimeter**2], read=read)
+        found["altimeter"] = MeasurementModel(space, observe_distance, [s.altimeter**2], read=read)
     if s.displacement is not None and s.turn is not None:
         found["optical_flow"] = MeasurementModel(
-            OUTDOOR, observe_flow, np.repeat(np.square([s.displacement, s.turn]), 3),
+            space, observe_flow, np.repeat(np.square([s.displacement, s.turn]), 3),
             measured_space=FLOW, read=lambda z: (z.displacement, z.turn),
         )  # fmt: skip
     return found

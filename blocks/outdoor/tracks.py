@@ -123,14 +123,17 @@ _HEAD = (
 )  # fmt: skip
 
 
-def as_table(estimate: Series, origin: Origin) -> str:
-    """Every tick as a row of csv: geodetic, north-east-down about the origin, and Earth-centred."""
+def as_table(estimate: Series, origin: Origin | None = None) -> str:
+    """Every tick as a row of csv: geodetic, north-east-down about the origin, and Earth-centred; without an
+    origin north-east-down alone."""
     enu = estimate["position"]
-    geodetic = from_enu(enu, origin)
-    degrees = np.concatenate([np.degrees(geodetic[:, :2]), geodetic[:, 2:]], axis=1)
-    ned = np.stack([enu[:, 1], enu[:, 0], -enu[:, 2]], axis=-1)
-    numbers = np.concatenate([degrees, ned, to_earth(geodetic)], axis=1)
-    lines = [",".join(_HEAD)]
+    numbers = np.stack([enu[:, 1], enu[:, 0], -enu[:, 2]], axis=-1)
+    head: tuple[str, ...] = (_HEAD[0], *_HEAD[4:7])
+    if origin is not None:
+        geodetic, head = from_enu(enu, origin), _HEAD
+        degrees = np.concatenate([np.degrees(geodetic[:, :2]), geodetic[:, 2:]], axis=1)
+        numbers = np.concatenate([degrees, numbers, to_earth(geodetic)], axis=1)
+    lines = [",".join(head)]
     for time, row in zip(estimate.time.tolist(), numbers.tolist(), strict=True):
         lines.append(f"{time // 10**9}.{time % 10**9:09d}," + ",".join(map(repr, row)))
     return "\n".join(lines) + "\n"
@@ -147,16 +150,16 @@ def _drawn(result: Result, file: Path, *, truth: Series | None, stream: str) -> 
 def track_files(
     origin: Origin | None, name: str, truth: Series | None, stream: str = "belief"
 ) -> Mapping[str, Callable[[Result, Path], None]]:
-    """What `--out` writes of a run outdoors, by the name of the file: the tracks where the world has a place
-    on the Earth, and the map."""
+    """What `--out` writes of a run outdoors, by the name of the file: the table, the map, and where the world
+    has a place on the Earth the tracks."""
 
     found: dict[str, Callable[[Result, Path], None]] = {
-        "map.png": partial(_drawn, truth=truth, stream=stream)
+        "map.png": partial(_drawn, truth=truth, stream=stream),
+        "track.csv": partial(_put, write=partial(as_table, origin=origin), stream=stream),
     }
     if origin is not None:
         for ending, write in (("geojson", as_geojson), ("kml", as_kml), ("gpx", as_gpx)):
             found[f"track.{ending}"] = partial(
                 _put, write=partial(write, origin=origin, name=name), stream=stream
             )
-        found["track.csv"] = partial(_put, write=partial(as_table, origin=origin), stream=stream)
     return found

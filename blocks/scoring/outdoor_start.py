@@ -13,8 +13,10 @@ from flowgraph import Series
 from flowgraph.blocks.inertial.alignment import StartSpread, rest_seconds
 from flowgraph.blocks.outdoor.flight import OutdoorSensors, OutdoorStart, outdoor_flight, without_gaps
 from flowgraph.blocks.scoring.cases import OnFlight
+from flowgraph.blocks.scoring.settings import Positive
 from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started
-from flowgraph.errors import DataError
+from flowgraph.blocks.scoring.tuning import given
+from flowgraph.errors import DataError, DeclarationError
 
 __all__ = ["StartedOutdoor"]
 
@@ -26,7 +28,40 @@ class StartedOutdoor(Started):
     Args:
         start: truth, file (the first force and field) or unknown_yaw (nothing is known of the heading); file
             if left out.
+        biases: whether those of the unit are estimated; if left out, where the flight says that it has any.
+        gyro_bias, accelerometer_bias: rad/s and m/s^2, deviations of the biases at the start; the flight's if
+            left out, or 0.1.
     """
+
+    biases: bool | None = None
+    gyro_bias: Positive | None = None
+    accelerometer_bias: Positive | None = None
+
+    def estimates(self, on: OnFlight) -> bool:
+        """Whether biases are estimated.
+
+        Raises:
+            DeclarationError: where a bias is told to a filter that has none.
+        """
+        told = [name for name in ("gyro_bias", "accelerometer_bias") if getattr(self, name) is not None]
+        if self.biases is False and told:
+            raise DeclarationError(
+                "this filter is to estimate no biases",
+                path=f"{on.name}.{told[0]}",
+                expected="biases=true",
+                got="biases=false",
+                fix=f"leave {told[0]} out, or write biases=true",
+            )
+        return self.biases if self.biases is not None else bool(told or any(_biases(on)))
+
+    def _unsure(self, on: OnFlight, spread: StartSpread) -> StartSpread:
+        """The spread of a start, with that of the biases."""
+        of_flight = (b or usual for b, usual in zip(_biases(on), (0.1, 0.1), strict=True))
+        told = (
+            given(s, b) for s, b in zip((self.gyro_bias, self.accelerometer_bias), of_flight, strict=True)
+        )
+        gyro, force = told
+        return replace(spread, gyro_bias=gyro, accelerometer_bias=force)
 
     def begin(self, on: OnFlight) -> tuple[dict[str, Series], OutdoorSensors, OutdoorStart]:
         """The inputs, what is known of the sensors, and the start, which a note names.
@@ -36,6 +71,7 @@ class StartedOutdoor(Started):
                 flow a gap.
         """
         inputs, sensors, first, notes = outdoor_flight(on.flight, on.name)
+        first = replace(first, spread=self._unsure(on, first.spread))
         on.first_up("imu", inputs["imu"]["specific_force"])  # says what was passed over
         shows = "magnetometer" in inputs
         if not shows and self.start is None and self.start_heading is None:
@@ -64,3 +100,10 @@ class StartedOutdoor(Started):
         heading = UNKNOWN_HEADING if pose.unknown else known
         spread = replace(first.spread, heading=heading)
         return pose.inputs, sensors, OutdoorStart(here, pose.attitude, spread)
+
+
+def _biases(on: OnFlight) -> tuple[float, float]:
+    """Deviations of the constant biases that the flight says of its unit, rad/s and m/s^2; 0 where none."""
+    noise = on.flight.info.get("noise", {})
+    gyro, force = (float(noise.get(part, {}).get("bias", 0.0)) for part in ("gyro", "accelerometer"))
+    return gyro, force

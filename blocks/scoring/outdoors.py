@@ -25,7 +25,7 @@ from flowgraph.blocks.inertial.navigation import PARAMETERS, Earth, earth_at, ex
 from flowgraph.blocks.inertial.outdoors import Antenna, Resting
 from flowgraph.blocks.scoring.cases import Adapted, Factors, HeldControl, OnFlight, Smoothed
 from flowgraph.blocks.scoring.settings import Positive
-from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started
+from flowgraph.blocks.scoring.start import UNKNOWN_HEADING, Started, turned
 from flowgraph.blocks.scoring.tuning import given
 from flowgraph.blocks.signals import GnssPosition, GnssVelocity, WheelSpeed
 from flowgraph.errors import DataError, DeclarationError, MissingDependencyError, UnknownNameError
@@ -40,6 +40,8 @@ USUAL = {"position": 2.5, "velocity": 0.2}
 
 _LONGEST_REST = 120.0  # s, that are looked at for north
 _COMPASSED = 0.1  # rad, of a heading by the Earth's turn that is good enough
+
+_FIRST_HEADING = 2_000_000_000  # ns, within which two antennas tell that of the start
 
 _RIDE = 100_000_000  # ns, between two looks at how a vehicle rolls, where no wheel tells its speed
 
@@ -61,7 +63,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         position_noise, velocity_noise: m and m/s, standard deviations of fixes that bring no covariance; the
             flight's own if left out.
         estimate: what is estimated beside pose, velocity and biases, of lever, gyro_scale,
-            accelerometer_scale, time_offset and height_offset, joined by +, or none. If left out, the lever
+            accelerometer_scale, time_offset and height_offset, joined by +, or none. With auto the lever
             and the time offset where fixes are good to half a metre and nobody says the lever; and the level
             of a barometer.
         compass_noise: rad, of the heading by a magnetometer.
@@ -77,7 +79,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
 
     position_noise: Positive | None = None
     velocity_noise: Positive | None = None
-    estimate: str | None = None
+    estimate: str = "auto"
     compass_noise: Positive = 0.1
     declination: float | None = None
     date: str | None = None
@@ -199,7 +201,7 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         Raises:
             UnknownNameError: for what cannot be.
         """
-        if self.estimate is not None:
+        if self.estimate != "auto":
             names = [n.strip() for n in self.estimate.split("+") if n.strip() not in ("", "none")]
             for name in names:
                 if name not in PARAMETERS:
@@ -208,8 +210,9 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         found = []
         if "gnss" in inputs and not lever and _good(inputs["gnss"]):
             if f"{name}.time_offset" in on.flight.info.get("sought", ()):
-                found.append("lever")
-                on.note("assumed", "nobody says where the antenna sits: it is estimated")
+                # a lever along the way is a delay: which of the two it is, straight flights do not tell
+                said = "it is taken for the unit's place, while its clock is sought"
+                on.note("assumed", f"nobody says where the antenna sits: {said}")
             else:
                 found += ["lever", "time_offset"]
                 said = "nobody says where the antenna sits and how late it is: both are estimated"
@@ -237,8 +240,8 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
         heading.
 
         The truth's, or what the file shows at rest; else, of a unit that is good enough and rests, what the
-        Earth's turn shows; else that of an alignment in motion, of which the
-        heading is as sure as the motion makes it; else a level body with a heading of which nothing is known.
+        Earth's turn shows; else that of an alignment in motion, of which the heading is as sure as the motion
+        makes it; else a level body with the heading that two antennas tell, or one of which nothing is known.
         """
         begin = self.pose(on, inputs, position=inputs.get("gnss"))
         kept = begin.inputs
@@ -271,7 +274,19 @@ class Outdoors(Factors, Smoothed, Started, HeldControl, Adapted):
                 self._said(on, float(deviations[6:9].max()), float(deviations[3:6].max()))
                 start = extended(at, estimated, lever=antenna.lever)
                 return start, kept, False
-            on.note("warning", "the motion does not tell the heading at the start: it is unknown")
+            if "heading" not in kept:
+                on.note("warning", "the motion does not tell the heading at the start: it is unknown")
+        antennas = _by_antennas(imu, kept.get("heading")) if begin.unknown else None
+        if antennas is not None:
+            angle, unsure = antennas
+            ahead = on.flight.info.get("heading_baseline", (1.0, 0.0, 0.0))
+            angle -= math.atan2(ahead[1], ahead[0])
+            begin, spread = (
+                begin._replace(attitude=turned(begin.attitude, angle)),
+                replace(spread, heading=unsure),
+            )
+            told = f"known to {math.degrees(unsure):.2g} degrees"
+            on.note("info", f"the heading at the start is that of two antennas: {told}")
         force = None
         if not on.weightless:
             push = imu["specific_force"]
@@ -387,6 +402,22 @@ def _simulated(on: OnFlight, name: str) -> float | None:
     """The noise of a simulated sensor of that name."""
     own = on.flight.info.get("noise", {}).get(name, {}).get("noise")
     return None if own is None or not own > 0.0 else float(own)
+
+
+def _by_antennas(imu: Series, heading: Series | None) -> tuple[float, float] | None:
+    """The angle (rad) that the first reading of two antennas tells, and its deviation, of which what the unit
+    has turned since the start is a part; None where nothing comes in the first seconds."""
+    if heading is None:
+        return None
+    whole = np.flatnonzero(np.isfinite(heading["angle"]) & np.isfinite(heading["deviation"]))
+    if not len(whole) or heading.time[whole[0]] - imu.time[0] > _FIRST_HEADING:
+        return None
+    first = int(whole[0])
+    before = imu.time <= heading.time[first]
+    rate = np.nan_to_num(np.linalg.norm(imu["gyro"][before], axis=-1))
+    apart = float(np.sum(rate * np.diff(imu.time[before], append=imu.time[before][-1:]) * 1e-9))
+    unsure = math.hypot(float(heading["deviation"][first]), apart)
+    return (float(heading["angle"][first]), unsure) if unsure < UNKNOWN_HEADING else None
 
 
 def _unmeasured(imu: Series) -> Series:

@@ -100,15 +100,16 @@ class OutdoorCloud(Signal):
 
     log_weight: natural logarithm of the weights, which add up to 1. attitude: the mean of now, so that the
     true one is Exp(e) * attitude; picture: at the last picture, exactly. motion: the mean of (velocity in
-    m/s, position in m, displacement since the last picture in m), world; covariance: of it and of e (rad,
-    world), the mean of which is zero.
+    m/s, position in m, displacement since the last picture in m), world, and of the biases (rad/s, m/s^2,
+    body) where they are estimated; covariance: of the first three, of e (rad, world), the mean of which is
+    zero, and of the biases.
     """
 
     log_weight: Array = real("particles")
     attitude: Array = real(4, "particles", unit="1", frame="world<-body")
     picture: Array = real(4, "particles", unit="1", frame="world<-body")
-    motion: Array = real(9, "particles", frame="world")
-    covariance: Array = real(12, 12, "particles")
+    motion: Array = real("numbers", "particles")
+    covariance: Array = real("errors", "errors", "particles")
 
 
 class PlaneCloud(Signal):

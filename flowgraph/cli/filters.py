@@ -45,7 +45,6 @@ from flowgraph.cli.terminal import (
     reports_errors,
     runs_table,
     table,
-    without_font_warnings,
     writing,
 )
 from flowgraph.data.export.text import write_tum
@@ -95,16 +94,16 @@ def show(
     from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
     from flowgraph.pipeline.costs.places import costs_by_path
 
-    built, _ = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
+    built, inputs = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
     if output is None:
         width = out_console.width if out_console.is_terminal else None
-        print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width))))
+        print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width, inputs=inputs))))
         return
-    with writing(output), without_font_warnings():
+    with writing(output):
         if output.suffix.lower() == ".html":
-            diagram_page(built, output, fold=fold, costs=costs_by_path(built))
+            diagram_page(built, output, fold=fold, costs=costs_by_path(built), inputs=inputs)
         else:
-            built.draw(str(output), fold=fold)
+            built.draw(str(output), fold=fold, inputs=inputs)
 
 
 @app.command()
@@ -295,7 +294,7 @@ def _write_report(
 def _draw(file: Path, draw: Callable[[Path], object]) -> str | None:
     """Make a picture, or return a note that says why there is none: it must not take the results with it."""
     try:
-        with writing(file), without_font_warnings():
+        with writing(file):
             draw(file)
     except Exception as error:
         why = str(error) if isinstance(error, FlowgraphError) else f"{type(error).__name__}: {error}"

@@ -130,25 +130,6 @@ def make_ready(folder: Path) -> None:
 
 
 @contextmanager
-def without_font_warnings() -> Iterator[None]:
-    """Keep what Fontconfig says of the system's own files, in C, out of standard error; nothing else."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    with tempfile.TemporaryFile() as said:
-        os.dup2(said.fileno(), 2)
-        try:
-            yield
-        finally:
-            sys.stderr.flush()
-            os.dup2(kept, 2)
-            os.close(kept)
-            said.seek(0)
-            for line in said:
-                if not line.startswith(b"Fontconfig "):
-                    os.write(2, line)
-
-
-@contextmanager
 def writing(file: Path) -> Iterator[Path]:
     """Say what is written, and whether something was there before."""
     before = file.exists()

@@ -27,6 +27,7 @@ __all__ = [
     "batched",
     "delayed",
     "delayed_flight",
+    "lateness_words",
     "reorder",
     "replayed",
     "stamp_events",
@@ -125,6 +126,22 @@ def delayed_flight(flight: Flight, settings: Mapping[str, Any], *, seed: int = 0
         text = " to ".join(f"{b * 1e-9:g}" for b in bounds)
         said.append(note("info", f"{name}: each value arrives {text} s after it was true"))
     return replace(flight, streams=streams, notes=(*flight.notes, *said), experiment=None)
+
+
+def lateness_words(inputs: Flight | Mapping[str, Any] | None) -> dict[str, str]:
+    """How late the values of a stream arrive, in words, by name; of those that do."""
+    streams = inputs.streams if isinstance(inputs, Flight) else inputs or {}
+    words = {}
+    for name, series in streams.items():
+        if isinstance(series, Series) and len(series):
+            least, most = (
+                (series.time - series.stamp).min() * 1e-9,
+                (series.time - series.stamp).max() * 1e-9,
+            )
+            if most > 0.0:
+                span = f"{most:.3g}" if most - least < 0.01 * most else f"{least:.3g} to {most:.3g}"
+                words[name] = f"{span} s late"
+    return words
 
 
 def _seconds(key: str, given: Any) -> tuple[int, ...]:

@@ -15,10 +15,10 @@ from flowgraph.data.series import Series
 
 __all__ = ["suspect_readings"]
 
-STUCK, STUCK_S, OFTEN, STEP = 5, 0.2, 0.05, 0.2
-"""How many times in a row, and for how many seconds, a reading is repeated by a sensor that is stuck; what
-part of the others may be repeated where that is not the usual way; and by how much of a usual step it jumps
-into that and out of it, which one that is at rest does not."""
+STUCK, STUCK_S, AXIS, OFTEN, STEP = 5, 0.2, 4, 0.05, 0.2
+"""How many times in a row, and for how many seconds, a reading is repeated by a sensor that is stuck, and how
+many times as long by one axis of it; what part of the others may be repeated where that is not the usual way;
+and by how much of a usual step it jumps into that and out of it, which one that is at rest does not."""
 
 BLOCK, ALONE, ASIDE = 32, 40.0, 0.2
 """Over how many readings a usual difference is told; how many times that a spike is off from the mean of
@@ -60,27 +60,39 @@ def suspect_readings(series: Series) -> tuple[str, ...]:
 
 
 def _stuck(name: str, leaf: str, values: np.ndarray, t: np.ndarray) -> tuple[str, ...]:
+    told, which, why = _still(values, t, STUCK, STUCK_S), leaf, "a sensor that is stuck"
+    if told is None and not leaf.endswith("attitude"):  # of a body that turns about one axis, others rest
+        for axis, column in enumerate(values.T[..., None]):
+            found = _still(column, t, AXIS * STUCK, AXIS * STUCK_S)
+            if found is not None and found[0] > 0.0:  # what rests from the start on has not begun to move
+                told, which, why = found, f"{leaf}[{axis}]", "an axis that is stuck or at its limit"
+                break
+    if told is None:
+        return ()
+    begins, lasts, count = told
+    often = "" if count == 1 else f", {count} times in all"
+    when = f"from {begins:.3g} s after the first on{often}"
+    said = f"{name}: the same {which} for {lasts:.3g} s, {when}, which its other readings never have: {why}"
+    return (note("warning", said),)
+
+
+def _still(values: np.ndarray, t: np.ndarray, least: int, seconds: float) -> tuple[float, float, int] | None:
+    """When the longest of the rows of repeated readings begins, how long it lasts, and how many there are."""
     again = np.all(values[1:] == values[:-1], axis=-1) & (np.diff(t) > 0.0)
     steps = np.linalg.norm(np.diff(values, axis=0), axis=-1)
     moving = steps[np.isfinite(steps) & (steps > 0.0)]
     edges = np.diff(np.concatenate([[0], again, [0]]).astype(int))
     first, last = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     if not len(first) or len(moving) < STUCK:
-        return ()
+        return None
     around = np.concatenate([[np.inf], steps, [np.inf]])  # the steps into a row and out of it
     jumps = np.fmin(around[first], around[last + 1]) >= STEP * np.median(moving)
-    long = (last - first >= STUCK) & (t[last] - t[first] >= STUCK_S) & jumps
+    long = (last - first >= least) & (t[last] - t[first] >= seconds) & jumps
     others = len(again) - int((last - first)[long].sum())
     if not long.any() or int((last - first)[~long].sum()) > OFTEN * others:
-        return ()
+        return None
     longest = int(np.argmax(np.where(long, t[last] - t[first], 0.0)))
-    begins, lasts = t[first[longest]], t[last[longest]] - t[first[longest]]
-    often = "" if long.sum() == 1 else f", {long.sum()} times in all"
-    when = f"from {begins:.3g} s after the first on{often}"
-    return (
-        note("warning", f"{name}: the same {leaf} for {lasts:.3g} s, {when}, which its other readings never"
-             " have: a sensor that is stuck"),
-    )  # fmt: skip
+    return float(t[first[longest]]), float(t[last[longest]] - t[first[longest]]), int(long.sum())
 
 
 def _spikes(name: str, leaf: str, values: np.ndarray, t: np.ndarray) -> tuple[str, ...]:

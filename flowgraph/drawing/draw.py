@@ -12,9 +12,14 @@ import html
 import re
 import shutil
 import struct
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from flowgraph.data.arrival import lateness_words
 from flowgraph.data.files import put
+from flowgraph.data.series import Flight
+from flowgraph.drawing.fonts import without_font_warnings
 from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.text import (
     Link,
@@ -63,6 +68,7 @@ def draw(
     rankdir: str = "LR",
     fold: int | None = None,
     legend: bool = True,
+    inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str | Path:
     """Draw the block diagram.
 
@@ -72,6 +78,7 @@ def draw(
         rankdir: which way values flow: "LR" left to right, "TB" top to bottom, "RL" or "BT".
         fold: graphs nested deeper than this are drawn as one box: 0 folds all of them, None none.
         legend: whether to say below the title what the kinds of arrow mean.
+        inputs: what the sources are fed; of one whose values arrive late the diagram says so.
 
     Raises:
         UnknownNameError: for another ending or direction.
@@ -83,9 +90,9 @@ def draw(
     ending = ".svg" if path is None else path.suffix.lower()
     if ending not in ENDINGS:
         raise UnknownNameError("file ending", ending, ENDINGS, path=str(file))
-    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend)
+    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend, inputs=inputs)
     if ending == ".html":
-        return diagram_page(graph, file, fold=fold, rankdir=rankdir)
+        return diagram_page(graph, file, fold=fold, rankdir=rankdir, inputs=inputs)
     if path is None:
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
@@ -120,7 +127,8 @@ def _render(source: str, kind: str) -> bytes:
             got=f"{failed}, and no pygraphviz",
             fix="pip install pygraphviz, or install Graphviz; graph.text() needs neither",
         ) from None
-    return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
+    with without_font_warnings():
+        return bytes(pygraphviz.AGraph(string=source).draw(format=kind, prog="dot"))
 
 
 def _whole_png(made: bytes) -> bytes:
@@ -134,11 +142,18 @@ def _whole_png(made: bytes) -> bytes:
     return made
 
 
-def dot_source(graph: Graph, *, rankdir: str = "LR", fold: int | None = None, legend: bool = True) -> str:
+def dot_source(
+    graph: Graph,
+    *,
+    rankdir: str = "LR",
+    fold: int | None = None,
+    legend: bool = True,
+    inputs: Flight | Mapping[str, Any] | None = None,
+) -> str:
     """The diagram in the DOT language; the arguments are those of `draw`."""
     if rankdir not in COMPASS:
         raise UnknownNameError("rankdir", rankdir, COMPASS, path=graph.name)
-    return _Diagram(graph, rankdir, fold).source(legend)
+    return _Diagram(graph, rankdir, fold, lateness_words(inputs)).source(legend)
 
 
 def _plain(text: str) -> str:
@@ -172,8 +187,8 @@ def _attributes(label: str = "", **attributes: object) -> str:
 class _Diagram:
     """One drawing of one graph: who is visible after folding, and the DOT statements for it."""
 
-    def __init__(self, graph: Graph, rankdir: str, fold: int | None) -> None:
-        self.graph, self.rankdir = graph, rankdir
+    def __init__(self, graph: Graph, rankdir: str, fold: int | None, lateness: Mapping[str, str]) -> None:
+        self.graph, self.rankdir, self.lateness = graph, rankdir, lateness
         self.folded = folded_scopes(graph, fold)
         self.open = [s for s in graph.scopes if fold is None or scope_depth(graph, s) < fold]
         self.links = list(links(graph))
@@ -253,7 +268,12 @@ class _Diagram:
         if node.path != node.clock.name:
             tip = f"when the values of {node.clock.name} were true: {node.type}, with each of them"
         shape = {"TB": "invhouse", "BT": "house"}.get(self.rankdir, "cds")
-        return self.node(node.path, "source", f"<b>{_escaped(node.path)}</b>", shape, tip, margin="0.14,0.08")
+        label = f"<b>{_escaped(node.path)}</b>"
+        if late := self.lateness.get(node.path):
+            label += f"<br/>{_font(late)}"
+            tip += f", {late}"
+        margin = "0.14,0.12" if late else "0.14,0.08"
+        return self.node(node.path, "source", label, shape, tip, margin=margin)
 
     def register_node(self, node: RegisterNode, scope: str) -> str:
         name = name_in(scope, node.path)

@@ -327,7 +327,7 @@ class LiveView(Sender):
 
 def live_page(graph: Graph, inputs: Inputs | None, title: str) -> Callable[[str], str]:
     """The page of a run that goes on, for the address that sends it."""
-    data = {"graph": describe(graph), "parts": Recorder(graph, inputs).parts()}
+    data = {"graph": describe(graph, inputs=inputs), "parts": Recorder(graph, inputs).parts()}
     words = title or doc_words(graph.doc)
     return lambda host: page("live", graph.name, words, data, ("diagram", "live"), asks=f"ws://{host}")
 

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.arrival import lateness_words
+from flowgraph.data.series import Flight
 from flowgraph.drawing.text import (
     block_words,
     clock_words,
@@ -40,19 +42,26 @@ LONGEST = 400
 """Characters of a setting or an initial value that are shown."""
 
 
-def describe(graph: Graph, costs: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
+def describe(
+    graph: Graph,
+    costs: Mapping[str, Mapping[str, Any]] | None = None,
+    inputs: Flight | Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """The graph in plain lists and texts, as `front/src/model.ts` declares them.
 
     Args:
         costs: of the lowered graph, by path of a block or register, what is to be shown there; under "" that
             of the whole.
+        inputs: what the sources are fed, which may arrive late.
     """
-    return _Description(graph, costs or {}).whole()
+    return _Description(graph, costs or {}, lateness_words(inputs)).whole()
 
 
 class _Description:
-    def __init__(self, graph: Graph, costs: Mapping[str, Mapping[str, Any]]) -> None:
-        self.graph, self.costs = graph, costs
+    def __init__(
+        self, graph: Graph, costs: Mapping[str, Mapping[str, Any]], lateness: Mapping[str, str]
+    ) -> None:
+        self.graph, self.costs, self.lateness = graph, costs, lateness
         self.types: dict[str, int] = {}
         self.type_list: list[dict[str, Any]] = []
         self.clocks: dict[Clock | frozenset[Clock], int] = {}
@@ -105,8 +114,9 @@ class _Description:
         made: dict[str, Any] = {"path": node.path, "name": name_in(scope, node.path), "scope": scope}
         if isinstance(node, SourceNode):
             out = {"name": "", **self.port(Wire(index, 0))}
-            return {**made, "kind": "source", "rate": clock_words(self.graph, Wire(index, 0)), "ins": [],
-                    "outs": [out]}  # fmt: skip
+            rate = clock_words(self.graph, Wire(index, 0))
+            rate = ", ".join(filter(None, [rate, self.lateness.get(node.path)]))
+            return {**made, "kind": "source", "rate": rate, "ins": [], "outs": [out]}
         if isinstance(node, RegisterNode):
             if node.role not in ("latest", "delay"):
                 return None

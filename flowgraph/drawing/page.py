@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph.data.files import put
+from flowgraph.data.series import Flight
 from flowgraph.drawing.model import describe
 from flowgraph.drawing.text import doc_words, folded_scopes
 from flowgraph.errors import writes
@@ -35,6 +36,7 @@ def diagram_page(
     fold: int | None = None,
     rankdir: str | None = None,
     costs: Mapping[str, Mapping[str, Any]] | None = None,
+    inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str | Path:
     """The block diagram as a page in which graphs unfold, wires and ports tell what they carry, and blocks
     what they are; written to `file`, or returned as text.
@@ -43,6 +45,7 @@ def diagram_page(
         fold: graphs nested deeper than this are folded at first; None: none, or all where blocks are many.
         rankdir: which way values flow at first, "LR" or "TB"; None: that in which more can be read.
         costs: of the lowered graph, by path of a block or register; under "" those of the whole.
+        inputs: what the sources are fed; of one whose values arrive late the page says so.
 
     Raises:
         DeclarationError: for a depth that is not a whole number from 0.
@@ -50,7 +53,7 @@ def diagram_page(
     """
     begin: dict[str, Any] = {} if fold is None else {"folded": folded_scopes(graph, fold)}
     begin |= {"down": rankdir in ("TB", "BT")} if rankdir else {}
-    data = {"graph": describe(graph, costs), "begin": begin}
+    data = {"graph": describe(graph, costs, inputs), "begin": begin}
     made = page("diagram", graph.name, doc_words(graph.doc), data, ("diagram",))
     return written(made, file)
 

@@ -67,7 +67,7 @@ def describe_run(
     blocks = {path: [1e6 * seconds / max(times, 1), times] for path, (seconds, times) in took.items()}
     return {
         "title": title,
-        "graph": describe(graph),
+        "graph": describe(graph, inputs=known),
         "engine": result.engine,
         "ticks": result.ticks,
         "end": max(

@@ -11,11 +11,13 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from flowgraph.data.arrival import lateness_words
+from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError
 from flowgraph.language.clock import Condition, Counted, atoms, either
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
@@ -212,16 +214,26 @@ def name_in(scope: str, path: str) -> str:
     return path.removeprefix(scope + "/") if scope else path
 
 
-def draw_text(graph: Graph, *, fold: int | None = None, width: int | None = None) -> str:
+def draw_text(
+    graph: Graph,
+    *,
+    fold: int | None = None,
+    width: int | None = None,
+    inputs: Flight | Mapping[str, Any] | None = None,
+) -> str:
     """The graph as plain text of about 100 columns: sources, blocks in firing order, registers, outputs.
 
     Args:
         fold: graphs nested deeper than this are one line: 0 folds all of them, None none.
         width: the columns of a narrower page, on which long lines go on in the next; names are not cut.
+        inputs: what the sources are fed; of one whose values arrive late the text says so.
     """
     doc = doc_words(graph.doc)
     text = textwrap.wrap(f"{graph.name}: {doc}" if doc else graph.name, WIDTH, subsequent_indent="  ")
-    parts = [("sources", _sources(graph)), ("blocks, in firing order", _blocks(graph, fold))]
+    parts = [
+        ("sources", _sources(graph, lateness_words(inputs))),
+        ("blocks, in firing order", _blocks(graph, fold)),
+    ]
     parts += [("registers", _registers(graph)), ("outputs", _outputs(graph))]
     parts = [(heading, lines) for heading, lines in parts if lines]
     for k, (heading, lines) in enumerate(parts):
@@ -255,13 +267,15 @@ def _columns(rows: Sequence[tuple[str, ...]], most: int = 32) -> list[str]:
     return ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _sources(graph: Graph) -> list[str]:
+def _sources(graph: Graph, lateness: Mapping[str, str]) -> list[str]:
     rows = []
     for index, node in enumerate(graph.nodes):
         if isinstance(node, SourceNode):
             timing = clock_words(graph, Wire(index, 0))
             if node.clock.timing.jitter:
                 timing += f", jitter {duration_words(node.clock.timing.jitter)}"
+            if late := lateness.get(node.path):
+                timing += f", {late}"
             rows.append((f"▷ {node.path}", type_words(node.type), timing))
     return _columns(rows)
 

@@ -68,7 +68,7 @@ def plot_map(estimate: Series, truth: Series | None = None, file: str | Path | N
     )
     axis.annotate(
         "N", (0.95, 0.97), (0.95, 0.86), xycoords="axes fraction", ha="center", fontsize="large",
-        arrowprops={"arrowstyle": "<-", "color": "black"},
+        arrowprops={"arrowstyle": "->", "color": "black"},
     )  # fmt: skip
     axis.legend(loc="upper left")
     return canvas.save(figure, file)

@@ -1,20 +1,21 @@
 """A graph that runs while its events come in: from threads, from an event loop, from packets.
 
 Whoever has an event pushes it, from any thread, and goes on; one thread of the run puts what came in order of
-its stamps and makes the ticks. Events wait in bounded queues with a declared policy. Each that came is in one
-of the counts in the end: in a tick, too late, come twice, dropped or refused at a full queue, refused by the
-clock, or no event because it was not finite. What was in ticks is kept as `arrived`; the same engine run over
-it gives the same result to the bit.
+its stamps and makes the ticks, or those who push do so in turn. Events wait in bounded queues with a declared
+policy. Each that came is in one of the counts in the end: in a tick, too late, come twice, dropped or refused
+at a full queue, refused by the clock, or no event because it was not finite. What was in ticks is kept as
+`arrived`; the same engine run over it gives the same result to the bit.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
-from threading import RLock, Thread
+from threading import Lock, RLock, Thread
 from time import perf_counter, perf_counter_ns, sleep
 from types import TracebackType
 from typing import Any
@@ -78,9 +79,12 @@ class Live:
             counted), or data ("keep").
         record: what is kept of the run: what arrived and the outputs ("all"), the one ("arrived"), or
             neither ("nothing"), so that memory stays flat.
-        on_output: called in the thread of the run with name, time and value of each output as it is made.
-        watcher: who is shown what is on the wires (`flowgraph.LiveView` for a browser), in the thread of the
-            run; of an engine other than Python's the events and the outputs.
+        on_output: called in the thread that makes the ticks with name, time and value of each output.
+        thread: whether a thread of its own makes the ticks. If not, whoever pushes makes those that his
+            events complete before `push` returns: nothing is handed over, so that no wake-up is waited for;
+            a tick that is complete only since nothing comes any more waits for the next push, or `close`.
+        watcher: who is shown what is on the wires (`flowgraph.LiveView` for a browser), in the same thread;
+            of an engine other than Python's the events and the outputs.
 
     Raises:
         DeclarationError: for an engine that makes no single ticks; UnknownNameError: for another policy.
@@ -102,6 +106,7 @@ class Live:
         not_finite: str = "raise",
         record: str = "all",
         on_output: OnOutput | None = None,
+        thread: bool = True,
         watcher: Watcher | None = None,
     ) -> None:
         self.graph, self._engine = graph, engine
@@ -144,10 +149,13 @@ class Live:
         if watcher is not None and hasattr(watcher, "facts"):
             watcher.facts = self._facts
         self._error: BaseException | None = None
+        self._ended = False
         self._notes: dict[str, str] = {}
         self._wall, self._alone = 0.0, RLock()
-        self._thread = Thread(target=self._run, name=f"live {graph.name}", daemon=True)
-        self._thread.start()
+        self._turn, self._queued = Lock(), asyncio.Lock()
+        self._thread = Thread(target=self._run, name=f"live {graph.name}", daemon=True) if thread else None
+        if self._thread is not None:
+            self._thread.start()
 
     # -- what comes in -----------------------------------------------------------------------------------
 
@@ -168,12 +176,14 @@ class Live:
         return self._put(checked, arrived, timeout)
 
     async def push_async(self, time: int, /, **values: Any) -> bool:
-        """As `push`, from an event loop, which goes on while a full queue blocks."""
+        """As `push`, from an event loop, which goes on while a full queue blocks; none overtakes another."""
         arrived = perf_counter_ns()
         checked = [(name, *self._entrance.value(name, time, value)) for name, value in values.items()]
-        if self._boxes.have_room([self._names.index(name) for name, _, _ in checked]):
+        places = [self._names.index(name) for name, _, _ in checked]
+        if not self._queued.locked() and self._boxes.have_room(places):
             return self._put(checked, arrived, None)
-        return await asyncio.to_thread(self._put, checked, arrived, None)
+        async with self._queued:
+            return await asyncio.to_thread(self._put, checked, arrived, None)
 
     def play(self, inputs: Inputs, *, speed: float = 1.0) -> int:
         """Push a recording at the pace of its stamps, or `speed` times as fast.
@@ -208,12 +218,15 @@ class Live:
     def _put(self, checked: list[tuple[str, int, Any]], arrived: int, timeout: float | None) -> bool:
         self._refuse_if_ended()
         events = [(self._names.index(name), stamp, value) for name, stamp, value in checked]
-        return self._boxes.put(events, arrived, timeout)
+        taken = self._boxes.put(events, arrived, timeout)
+        if self._thread is None:
+            self._make_ticks()
+        return taken
 
     def _refuse_if_ended(self) -> None:
         if self._error is not None:
             raise self._error
-        if not self._thread.is_alive():
+        if self._ended:
             raise DataError(
                 "this live run has ended",
                 path=self.graph.name,
@@ -222,23 +235,60 @@ class Live:
                 fix="start a new one: Live(graph, state=live.state)",
             )
 
-    # -- the thread of the run ---------------------------------------------------------------------------
+    # -- ticks -------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        try:
+        """What the thread of the run does."""
+        with self._failing():
             while (events := self._boxes.take(self._patience if self._order.waiting else None)) is not None:
-                for _, together in groupby(events, attrgetter("number")):
-                    held = [event for event in together if self._order.put(event)]
-                    if held:
-                        self._ticks(self._order.ready(), held[0].arrived)
+                self._take_in(events)
                 if not events:  # nothing has come for as long as anything may be late
                     self._ticks(self._order.ready(everything=True), perf_counter_ns())
-            self._ticks(self._order.ready(everything=True), perf_counter_ns())
-            if self._watch is not None:
-                self._watch.end()
+            self._end()
+
+    def _make_ticks(self) -> None:
+        """The ticks of what waits, in the thread that brought it; one at it takes what others bring."""
+        while self._boxes.waiting and self._turn.acquire(blocking=False):
+            try:
+                with self._failing():
+                    self._take_in(self._boxes.take(0.0) or [])
+            finally:
+                self._turn.release()
+            if self._error is not None:
+                raise self._error
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """What is raised here ends the run."""
+        try:
+            yield
         except BaseException as error:
-            self._error = error
+            self._error, self._ended = error, True
             self._boxes.close()
+
+    def _take_in(self, events: list[Event]) -> None:
+        for _, together in groupby(events, attrgetter("number")):
+            held = [event for event in together if self._order.put(event)]
+            if held:
+                self._ticks(self._order.ready(), held[0].arrived)
+
+    def _end(self) -> None:
+        self._ticks(self._order.ready(everything=True), perf_counter_ns())
+        if self._watch is not None:
+            self._watch.end()
+        self._ended = True
+
+    def _stop(self) -> None:
+        """Take nothing in any more, and make the ticks of all that waits."""
+        self._boxes.close()
+        if self._thread is not None:
+            self._thread.join()
+            return
+        with self._turn:
+            if not self._ended:
+                with self._failing():
+                    self._take_in(self._boxes.take(0.0) or [])
+                    self._end()
 
     def _ticks(self, ticks: Any, complete: int) -> None:
         for stamp, events in ticks:
@@ -311,8 +361,7 @@ class Live:
         Raises:
             FlowgraphError: what ended the run before.
         """
-        self._boxes.close()
-        self._thread.join()
+        self._stop()
         if self._error is not None:
             raise self._error
         return self.result()
@@ -393,7 +442,6 @@ class Live:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._boxes.close()
-        self._thread.join()
+        self._stop()
         if kind is None and self._error is not None:
             raise self._error

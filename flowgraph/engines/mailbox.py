@@ -92,6 +92,11 @@ class Mailboxes:
         """Whether none of these queues is full now."""
         return all(len(self._queues[k]) < self._size for k in sources)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether any queue holds an event."""
+        return any(self._queues)
+
     def take(self, timeout: float | None) -> list[Event] | None:
         """All waiting events in the order in which they came; none after `timeout` s, None once closed."""
         with self._changed:

@@ -175,10 +175,10 @@ class Graph:
         """Draw the block diagram: to a file (.svg, .png, .pdf, .dot), or as SVG text without one."""
         return verb("Graph.draw")(self, file, **options)
 
-    def text(self, *, fold: int | None = None, width: int | None = None) -> str:
-        """The diagram as plain text; what is nested deeper than `fold` is one line, and lines of more than
-        `width` columns go on in the next."""
-        return str(verb("Graph.text")(self, fold=fold, width=width))
+    def text(self, *, fold: int | None = None, width: int | None = None, inputs: Any = None) -> str:
+        """The diagram as plain text; what is nested deeper than `fold` is one line, lines of more than
+        `width` columns go on in the next, and the inputs tell which sources are late."""
+        return str(verb("Graph.text")(self, fold=fold, width=width, inputs=inputs))
 
     def to_networkx(self) -> networkx.MultiDiGraph:
         """The graph as a `networkx.MultiDiGraph`: nodes by path, edges with type, clock and `feedback`."""

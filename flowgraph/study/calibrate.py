@@ -21,12 +21,14 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.notes import note
+from flowgraph.data.series import Flight
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.pipeline.digests import digest
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter
 from flowgraph.study.guess import Guess, guess_offset
 from flowgraph.study.search import Search
 from flowgraph.study.spec import Value
+from flowgraph.study.tasks import loaded
 from flowgraph.study.trials import Recording, Trials
 from flowgraph.study.tune import MEASURES, check_fits, placed, start_of_fit
 
@@ -102,20 +104,27 @@ def calibrate(
     tried = _Tried(problem.by("error") if of_truth else problem, watch)
     notes: list[str] = []
     guesses: dict[str, Guess] = {}
+    left: set[int] = set()
+    begun: dict[str, float] = {}
+    whole = _unthinned(problem, settings) if offsets else []
     for f in offsets:
         stream = f.name.rpartition(".")[0]
-        told = [guess_offset(flight, stream, f.low, f.high) for flight in problem.flights]
+        told = [guess_offset(flight, stream, f.low, f.high) for flight in whole]
         known = [g for g in told if g is not None and g.sure]
         if known:
             guesses[f.name] = known[0]
-            begun = float(np.median([g.offset for g in known]))  # one of another clock moves it least
-            found[f.name] = begun
-            said = f"{f.name}: begun at {begun:.4g} s, by {known[0].by}"
+            begin = float(np.median([g.offset for g in known]))  # one of another clock moves it least
+            found[f.name] = begun[f.name] = begin
+            said = f"{f.name}: begun at {begin:.4g} s, by {known[0].by}"
             notes.append(note("info", f"{said}, whose correlation is {known[0].correlation:.3f} there"))
-            notes += _apart(f.name, recordings, told, begun)
+            said_of, apart = _apart(f.name, recordings, told, begin)
+            notes += said_of
+            left |= apart
         else:
             grid = np.linspace(f.low, f.high, _GRID)
             found[f.name] = float(grid[int(tried.along(f.name, grid, found).argmin())])
+    places = [k for k in range(len(recordings)) if k not in left] or list(range(len(recordings)))
+    tried.places = places
     deviations: dict[str, Any] = {}
     widths = _WIDTHS if offsets else (0.0,)
     for width in widths:
@@ -126,15 +135,17 @@ def calibrate(
             if side is not None and width == widths[-1]:
                 notes.append(note("warning", f"{f.name} ended at its {side} bound: widen it"))
             elif not inside and width == widths[-1]:
-                notes.append(
-                    note("warning", f"{f.name}: the {tried.measure} says no place near {value:.4g} s: it is a guess")
-                )
+                kept = "it is a guess"
+                if f.name in begun:
+                    found[f.name], kept = begun[f.name], f"it stays at {begun[f.name]:.4g} s"
+                said = f"{f.name}: the {tried.measure} says no place near {value:.4g} s: {kept}"
+                notes.append(note("warning", said))
         if others:
             fixed = {f.name: found[f.name] for f in offsets}
             held = problem.at(fixed)
             search = Search(
                 held, Coordinates(others, {f.name: found[f.name] for f in others}),
-                range(len(recordings)), forward=True,
+                places, forward=True,
             )  # fmt: skip
             ended = search.run("L-BFGS-B", most, watch)
             found |= ended.parameters
@@ -146,9 +157,18 @@ def calibrate(
     count = tried.count
     if of_truth:
         likely = _Tried(problem, watch)
+        likely.places = places
         notes += [w for f in offsets for w in _other_clock(f, found, deviations[f.name], likely)]
         count += likely.count
     return Calibrated(graph, found, deviations, count, guesses, tuple(dict.fromkeys(notes)))
+
+
+def _unthinned(problem: Trials, settings: Mapping[str, Value]) -> list[Flight]:
+    """The flights with all their rows: what streams tell of one motion needs more than an aid may be."""
+    kept = {name: value for name, value in settings.items() if name.rpartition(".")[2] != "every"}
+    if len(kept) == len(settings):
+        return problem.flights
+    return [loaded(one.data, one.seed, kept) for one in problem.recordings]
 
 
 def _truth_stays(problem: Trials, offsets: Sequence[Fit]) -> bool:
@@ -178,13 +198,18 @@ def _other_clock(
 
 def _apart(
     name: str, recordings: Sequence[Recording], told: Sequence[Guess | None], here: float
-) -> list[str]:
-    """Notes on recordings whose clocks are others than those of most."""
-    return [
-        note("warning", f"{name}: {one.data} says {g.offset:.4g} s, and is of another clock: leave it out")
-        for one, g in zip(recordings, told, strict=True)
-        if g is not None and g.sure and abs(g.offset - here) > _APART
+) -> tuple[list[str], set[int]]:
+    """Notes on recordings whose clocks are others than those of most, and the places of those to leave out:
+    all of them, where most are of one."""
+    known = {k: g.offset for k, g in enumerate(told) if g is not None and g.sure}
+    off = {k for k, offset in known.items() if abs(offset - here) > _APART}
+    most = 2 * len(off) < len(known)
+    fix = "it is left out" if most else "leave one of them out"
+    notes = [
+        note("warning", f"{name}: {recordings[k].data} says {known[k]:.4g} s, and is of another clock: {fix}")
+        for k in sorted(off)
     ]
+    return notes, off if most else set()
 
 
 class _Tried:
@@ -192,7 +217,7 @@ class _Tried:
 
     def __init__(self, problem: Trials, watch: Any) -> None:
         self.problem, self.count, self._watch = problem, 0, watch
-        self._places = range(len(problem.recordings))
+        self.places: Sequence[int] = range(len(problem.recordings))
         self.measure = problem.measure
 
     def along(self, name: str, values: np.ndarray, rest: Mapping[str, Parameter]) -> np.ndarray:
@@ -200,7 +225,7 @@ class _Tried:
         found = []
         for value in values:
             point = {**rest, name: float(value)}
-            found.append(float(self.problem.measured([point], self._places).mean()))
+            found.append(float(self.problem.measured([point], self.places).mean()))
             self.count += 1
             if self._watch is not None:
                 self._watch(self.count, point, found[-1])
@@ -208,7 +233,7 @@ class _Tried:
 
     def counted(self, point: Mapping[str, Parameter]) -> float:
         """How many numbers were measured."""
-        return sum(self.problem.values_at(place, point) for place in self._places)
+        return sum(self.problem.values_at(place, point) for place in self.places)
 
 
 def _vertex(

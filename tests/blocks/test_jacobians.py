@@ -188,6 +188,24 @@ def test_of_an_outdoor_step(seed):
     np.testing.assert_allclose(found.covariance, F @ F.mT, atol=1e-9)
 
 
+@SEEDS
+def test_of_an_outdoor_step_with_biases(seed):
+    """To second order in the turn of a step, which is what F is."""
+    rng = np.random.default_rng(seed)
+    x, imu, dt = np.append(outdoor_state(rng), 0.1 * rng.normal(size=6)), reading(rng), 0.005
+    moved = navigated(imu, dt)
+
+    def step(x: Any, xp: Any) -> Any:
+        after = moved(xp.concat([x[..., :10], x[..., 17:]], axis=-1), xp)
+        return xp.concat([after[..., :10], x[..., 10:]], axis=-1)
+
+    _, F = linearised(step, x, outdoor.BIASED, np, seen=outdoor.BIASED)
+    start = Gaussian(mean=x, covariance=np.eye(21))
+    found = outdoor.predict_clone.step(start, imu, noise=SILENT, dt=dt, xp=np)
+    np.testing.assert_allclose(found.covariance, F @ F.mT, atol=1e-6)
+    np.testing.assert_allclose(found.mean, step(x, np), atol=1e-12)
+
+
 def test_of_the_error_after_a_correction_to_first_order():
     """`StateSpace.reset` is I - skew(d)/2: the derivative of the new error by the old leaves terms of d^2."""
     rng = np.random.default_rng(5)

@@ -268,7 +268,7 @@ def test_json_is_all_there_is_on_standard_output(tmp_path):
 
 def test_other_words_on_standard_error_pass():
     program = (
-        "import os; from flowgraph.cli.terminal import without_font_warnings as quiet\n"
+        "import os; from flowgraph.drawing.fonts import without_font_warnings as quiet\n"
         "with quiet(): os.write(2, b'Fontconfig warning: x\\nother\\n')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -9,13 +9,16 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flowgraph import (
     DeclarationError,
+    Flight,
     FlowgraphError,
     Graph,
     MissingDependencyError,
+    Series,
     Stream,
     UnknownNameError,
     aperiodic,
@@ -27,7 +30,9 @@ from flowgraph import (
     periodic,
     sink,
 )
+from flowgraph.data.arrival import delayed
 from flowgraph.drawing.draw import dot_source, draw, to_networkx
+from flowgraph.drawing.page import diagram_page
 from flowgraph.types import Scalar
 from tests.drawn import Fix, Imu, core
 
@@ -338,3 +343,30 @@ def test_importing_flowgraph_and_describing_a_graph_load_no_drawing_library():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_source_whose_values_arrive_late_says_so_in_every_drawing():
+    @graph
+    def read(early: Stream[Scalar], fixed: Stream[Scalar], loose: Stream[Scalar]):
+        return {"early": early, "fixed": fixed, "loose": loose}
+
+    made, times = read.build(), np.arange(3) * 10**9
+    late = {
+        "early": Series(times, np.zeros(3)),
+        "fixed": delayed(Series(times, np.zeros(3)), "135ms"),
+        "loose": delayed(Series(times, np.zeros(3)), np.array([0, 10**8, 2 * 10**8])),
+    }
+    said = {"fixed": "0.135 s late", "loose": "0 to 0.2 s late"}
+    nodes = groups(svg_of(made, inputs=late), "node")
+    assert {n: words(nodes[n])[1:] for n in late} == {
+        "early": [],
+        "fixed": [said["fixed"]],
+        "loose": [said["loose"]],
+    }
+    lines = made.text(inputs=late).splitlines()
+    assert [next(line for line in lines if f"▷ {n} " in line).split("aperiodic")[1] for n in late] == [
+        "", ", 0.135 s late", ", 0 to 0.2 s late",
+    ]  # fmt: skip
+    page = str(diagram_page(made, inputs=Flight("f", late)))
+    assert all(f"aperiodic, {words}" in page for words in said.values())
+    assert "late" not in made.text()

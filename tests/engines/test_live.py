@@ -73,9 +73,10 @@ def known(live: Live, name: str) -> int:
     return sum(live.counts[f"{name}.{kind}"] for kind in kinds) + len(live.arrived[name])
 
 
+@pytest.mark.parametrize("thread", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_threads_that_push_without_a_lock_lose_nothing(engine):
-    live, each = Live(SUMMED, engine=engine, queue=16, lateness="10s"), 400
+def test_threads_that_push_without_a_lock_lose_nothing(engine, thread):
+    live, each = Live(SUMMED, engine=engine, queue=16, lateness="10s", thread=thread), 400
 
     def pushes(source: str, first: int) -> None:
         for k in range(first, first + each):
@@ -322,11 +323,12 @@ def two(a: Stream[Scalar], b: Stream[Scalar]):
     return {"a": a, "b": b}
 
 
+@pytest.mark.parametrize("thread", [True, False])
 @pytest.mark.parametrize("engine", ["python", "c"])
 @pytest.mark.parametrize("lateness", [0, "1ms"])
-def test_events_of_one_push_are_one_tick(engine, lateness):
+def test_events_of_one_push_are_one_tick(engine, lateness, thread):
     built = two.build(a=aperiodic(), b=aperiodic())
-    with Live(built, engine=engine, lateness=lateness) as live:
+    with Live(built, engine=engine, lateness=lateness, thread=thread) as live:
         for k in range(1, 201):
             live.push(k * MS, a=1.0 * k, b=2.0 * k)
     assert not any(n for kind, n in live.counts.items() if "taken" not in kind), live.counts
@@ -380,3 +382,53 @@ def test_a_queue_that_is_too_small_for_the_lateness_is_a_note(queue):
     crowded = [n for n in live.result().notes if "a larger queue holds them" in n]
     assert len(crowded) == (queue == 2)
     assert len(live.result()["a"]) == 40
+
+
+def test_who_pushes_makes_the_ticks_where_the_run_has_no_thread():
+    seen: list[tuple[int, int]] = []
+
+    def more(name: str, stamp: int, value: Any) -> None:
+        seen.append((stamp, threading.get_ident()))
+        if stamp < 3 * MS:
+            live.push(stamp + MS, a=1.0)  # made when this tick is
+
+    live = Live(SUMMED, on_output=more, thread=False)
+    live.push(MS, a=1.0)
+    assert seen == [(k * MS, threading.get_ident()) for k in (1, 2, 3)]
+    assert live.close().ticks == 3
+    with pytest.raises(DataError, match="this live run has ended"):
+        live.push(9 * MS, a=1.0)
+
+
+def test_what_goes_wrong_in_a_tick_is_raised_to_who_made_it():
+    def wrong(name: str, stamp: int, value: Any) -> None:
+        raise RuntimeError("no more")
+
+    live = Live(SUMMED, on_output=wrong, thread=False)
+    for act in (lambda: live.push(1, a=1.0), lambda: live.push(2, a=1.0), live.close):
+        with pytest.raises(RuntimeError, match="no more"):
+            act()
+
+
+@pytest.mark.parametrize("thread", [True, False])
+def test_what_is_late_at_the_end_of_a_run_without_a_thread_is_made_by_close(thread):
+    live = Live(SUMMED, lateness="1000s", thread=thread)
+    live.push(2, a=1.0)
+    live.push(1, b=2.0)
+    assert live.close().now["value"].tolist() == [2.0, 3.0]
+
+
+def test_no_push_of_an_event_loop_overtakes_another():
+    order: list[int] = []
+
+    def slow(name: str, stamp: int, value: Any) -> None:
+        time.sleep(0.001)
+        order.append(stamp)
+
+    async def pushes() -> None:
+        await asyncio.gather(*(live.push_async(k, a=1.0) for k in range(1, 41)))
+
+    with Live(SUMMED, queue=1, on_output=slow) as live:
+        asyncio.run(pushes())
+    assert order == list(range(1, 41))
+    assert live.counts["a.late"] == 0

@@ -268,24 +268,33 @@ SUBSETS = [
 
 
 @pytest.mark.parametrize(
-    ("graph", "subsets"),
+    ("graph", "subsets", "biases"),
     [
-        (rbpf_outdoor, [s for s in SUBSETS if len(s) == 1]),
-        (outdoor_eskf, [s for s in SUBSETS if len(s) in (1, 4)]),
-        pytest.param(rbpf_outdoor, SUBSETS, marks=pytest.mark.slow),
-        pytest.param(outdoor_eskf, SUBSETS, marks=pytest.mark.slow),
+        (rbpf_outdoor, [s for s in SUBSETS if len(s) == 1], False),
+        (outdoor_eskf, [s for s in SUBSETS if len(s) in (1, 4)], False),
+        (rbpf_outdoor, [s for s in SUBSETS if len(s) == 1], True),
+        (outdoor_eskf, [s for s in SUBSETS if len(s) == 1], True),
+        *(
+            pytest.param(graph, SUBSETS, biases, marks=pytest.mark.slow)
+            for graph in (rbpf_outdoor, outdoor_eskf)
+            for biases in (False, True)
+        ),
     ],
 )
-def test_any_subset_of_the_sensors_will_do(graph, subsets):
+def test_any_subset_of_the_sensors_will_do(graph, subsets, biases):
     """It builds and runs, finite and, where a receiver is there, near where it should be; slowly, all 31."""
     f = flight(1, 0.7)
-    few = {"settle": 0.2} | ({"particles": 40} if graph is rbpf_outdoor else {})
+    few: dict[str, Any] = {"settle": 0.2, "biases": biases}
+    few |= {"particles": 40} if graph is rbpf_outdoor else {}
     for subset in subsets:
         case = graph.case(dataclasses.replace(f, streams={n: f.streams[n] for n in ("imu", *subset)}), **few)
         result = simulate(case.graph, case.inputs)
         assert {n for n in AIDS if f"{n}_innovation" in result.series} == set(subset)
         belief = result["belief"]
         assert np.isfinite(belief["covariance"]).all(), subset
+        found = result["biases"]["mean"] if "biases" in result.series else belief.leaves.get("gyro_bias")
+        assert (found is not None) == biases, subset
+        assert found is None or np.isfinite(found).all(), subset
         score = case.score(result)
         assert score["position_rmse_m"] < (1.5 if {"gps", "gps2"} & set(subset) else 3.0), subset
         told = " ".join(case.notes)
@@ -304,6 +313,103 @@ def test_a_start_that_nobody_tells_says_how_little_it_knows():
     )
     assert start.spread.position == 100.0
     assert start.spread.heading == np.pi
+
+
+# Biases.
+
+BIASED = {"gyro__bias": 0.05, "accelerometer__bias": 0.3}
+
+
+def found_biases(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The last estimate (6), and its deviations."""
+    if "biases" in result.series:
+        last = result["biases"][-1:]
+        return last["mean"][0], np.sqrt(np.diag(last["covariance"][0]))
+    last = result["belief"][-1:]
+    mean = np.concatenate([last["gyro_bias"][0], last["accelerometer_bias"][0]])
+    return mean, np.sqrt(np.diag(last["covariance"][0])[9:])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "seconds"), [((0, 1), 6.0), pytest.param(range(6), 8.0, marks=pytest.mark.slow)]
+)
+def test_biases_of_several_flights_are_found(seeds, seconds):
+    """Told of them, as the flights say, the filter is as honest as without any; else it is several times as
+    far off, and sure of it."""
+    off, ours, theirs = [], [], []
+    for seed in seeds:
+        f = flight(seed, seconds, **BIASED)
+        cases = [outdoor_eskf.case(f), outdoor_eskf.case(f, biases=False)]
+        runs = [simulate(case.graph, case.inputs) for case in cases]
+        told, untold = (case.score(run) for case, run in zip(cases, runs, strict=True))
+        ours.append(told)
+        theirs.append(untold)
+        assert f.truth is not None
+        true = np.concatenate([f.truth["gyro_bias"][-1], f.truth["accelerometer_bias"][-1]])
+        mean, deviations = found_biases(runs[0])
+        assert (deviations[:3] < 0.015).all()
+        off.append((mean - true) / deviations)
+    assert np.sqrt(np.mean(np.square(off))) < 1.3
+    rms = lambda scores, name: np.sqrt(np.mean([score[name] ** 2 for score in scores]))
+    for name, least in (("position_rmse_m", 1.8), ("velocity_rmse_mps", 2.5), ("attitude_rmse_deg", 1.7)):
+        assert rms(theirs, name) > least * rms(ours, name), name
+    assert np.mean([score["nees_mean"] for score in ours]) < 12.0
+    assert all(score["position_3sigma"] > 0.99 for score in ours)
+
+
+@pytest.mark.slow
+def test_particles_find_biases_too():
+    cases, runs = [], []
+    for seed in range(2):
+        f = flight(seed, 4.0, **BIASED)
+        cases += [rbpf_outdoor.case(f, particles=200, seed=seed), outdoor_eskf.case(f)]
+        runs += [simulate(case.graph, case.inputs, seed=seed) for case in cases[-2:]]
+    scores = [case.score(run) for case, run in zip(cases, runs, strict=True)]
+    for ratio in ratios(scores[::2], scores[1::2]).values():
+        assert ratio < 1.4
+    for seed in range(2):
+        truth = flight(seed, 4.0, **BIASED).truth
+        assert truth is not None
+        gyro = found_biases(runs[2 * seed])[0][:3]
+        np.testing.assert_allclose(gyro, truth["gyro_bias"][-1], atol=0.04)
+
+
+def test_biases_are_estimated_where_a_flight_says_that_there_are_any():
+    plain, biased = flight(), flight(**BIASED)
+    assert "gyro_bias" not in simulated(outdoor_eskf.case(plain)).leaves
+    assert "gyro_bias" not in simulated(outdoor_eskf.case(biased, biases=False)).leaves
+    for case in (
+        outdoor_eskf.case(biased),
+        outdoor_eskf.case(plain, biases=True),
+        outdoor_eskf.case(plain, gyro_bias=0.02),
+    ):
+        assert "gyro_bias" in simulated(case).leaves
+    with pytest.raises(DeclarationError, match=r"gyro_bias[\s\S]*estimate no biases"):
+        outdoor_eskf.case(biased, biases=False, gyro_bias=0.02)
+
+
+def simulated(case: Any) -> Series:
+    """The belief of the first tenth of a second."""
+    inputs = {name: s[s.time < 100_000_000] for name, s in case.inputs.items()}
+    belief = simulate(case.graph, inputs)["belief"]
+    assert isinstance(belief, Series)
+    return belief
+
+
+@pytest.mark.parametrize("way", ["rts", pytest.param("batch", marks=pytest.mark.slow)])
+def test_with_biases_it_is_smoothed(way):
+    case = outdoor_eskf.case(flight(0, 2.0, **BIASED), smooth=way)
+    score = case.score(simulate(case.graph, case.inputs))
+    assert score["smoothed_position_rmse_m"] < 0.8 * score["position_rmse_m"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("graph", [rbpf_outdoor, outdoor_eskf])
+def test_with_biases_the_engines_agree(graph):
+    pytest.importorskip("jax")
+    few: dict[str, Any] = {"particles": 30} if graph is rbpf_outdoor else {}
+    case = graph.case(flight(0, 0.6, **BIASED), gate=0.99, **few)
+    engines_agree(case.graph, case.inputs)
 
 
 @pytest.mark.slow

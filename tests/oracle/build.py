@@ -130,7 +130,7 @@ BUILD: dict[str, Callable[..., Any]] = {
     "zip_latest_right": lambda n, a, b: zip_latest_right(a, b, init=n["init"]).map(PAIR),
     "zip_last": lambda n, a, b: zip_last(a, b).map(PAIR),
     "match": lambda n, a, b: match(
-        a, b, tolerance=n["tolerance"] * MS, size=n["size"], full="drop_oldest"
+        a, b, tolerance=n["tolerance"] * MS, size=n["size"], full=n.get("full", "drop_oldest")
     ).map(PAIR),
     "merge": lambda n, a, b: merge(a, b, tie=n["tie"] if n["tie"] != "mean" else lambda x, y: 0.5 * (x + y)),
     "optional": _optional,

@@ -54,6 +54,10 @@ class Meaning:
             rule: Callable[..., Events] = getattr(self, f"do_{node['op']}")
             self.streams.append(rule(node, *given))
 
+    def is_full(self, n, t):
+        if n.get("full") == "error" and (self.full is None or t < self.full):
+            self.full = t
+
     # -- joins of one clock, registers -------------------------------------------------------------------
 
     def do_map(self, n, a):
@@ -151,6 +155,7 @@ class Meaning:
                 waiting[mine].append((t, value))
                 if len(waiting[mine]) > n["size"]:
                     expire(mine, waiting[mine][:1])
+                    self.is_full(n, t)
         return made
 
     def do_merge(self, n, a, b):
@@ -299,8 +304,7 @@ class Meaning:
             if len(waits) > n["size"]:
                 waits.pop(0)
                 self.counts["expired"] += 1
-                if n["full"] == "error" and (self.full is None or t < self.full):
-                    self.full = t
+                self.is_full(n, t)
         return made
 
     def do_stamp(self, n, a):

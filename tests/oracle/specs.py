@@ -161,6 +161,10 @@ def _stamp(d: Draw, name: str) -> None:
     d.add("stamp", [d.streams[source]], d.streams[source].clock)
 
 
+def _full(d: Draw) -> str:
+    return d.random.choice(("error", "drop_oldest", "drop_oldest"))
+
+
 def _tau(d: Draw) -> int | None:
     return d.random.choice((None, 7))
 
@@ -186,7 +190,12 @@ KINDS: dict[str, Callable[[Draw, str], None]] = {
     "zip_latest": _two("zip_latest", inits=lambda d: [d.quarter(), d.quarter()]),
     "zip_latest_right": _held,
     "zip_last": _two("zip_last"),
-    "match": _two("match", tolerance=lambda d: d.random.randint(0, 7), size=lambda d: d.random.randint(1, 4)),
+    "match": _two(
+        "match",
+        tolerance=lambda d: d.random.randint(0, 7),
+        size=lambda d: d.random.randint(1, 4),
+        full=_full,
+    ),
     "merge": _two("merge", tie=lambda d: d.random.choice(("left", "right", "mean"))),
     "optional": _optional,
     "running": _running,
@@ -202,7 +211,7 @@ KINDS: dict[str, Callable[[Draw, str], None]] = {
         "resample",
         how=lambda d: d.random.choice(("linear", "hold")),
         size=lambda d: d.random.randint(1, 6),
-        full=lambda d: d.random.choice(("error", "drop_oldest", "drop_oldest")),
+        full=_full,
     ),
     "absent": _window,
     "label": _one("label"),

@@ -14,8 +14,10 @@ from flowgraph.blocks.signals import Position
 from flowgraph.cli import app
 from flowgraph.errors import DeclarationError
 from flowgraph.graphs.gnss_ins import gnss_ins
-from flowgraph.study.calibrate import _apart, calibrate
+from flowgraph.study.calibrate import _apart, _truth_stays, _unthinned, calibrate
 from flowgraph.study.guess import Guess, _by_vectors, guess_offset
+from flowgraph.study.tasks import prepared
+from flowgraph.study.trials import Trials
 from flowgraph.study.tune import Fit, Recording
 from tests.calibration import off, recorded
 from tests.recordings import recordings
@@ -87,16 +89,69 @@ def test_where_sizes_do_not_agree_vectors_do(flown, seconds):
     assert found.offset == pytest.approx(seconds, abs=0.02)
 
 
+def test_a_thinned_aid_is_begun_with_by_all_its_rows():
+    folder = recordings("outdoor_quadrotor") / "path_21"
+    told = {"rtk.every": "1", "bad_time": "drop"}
+    ours = Trials("gnss_ins", [Recording(f"outdoor_quadrotor:{folder}")], told, "likelihood", None, "c")
+    (thinned,), (whole,) = ours.flights, _unthinned(ours, told)
+    assert len(whole.streams["rtk"]) > 9 * len(thinned.streams["rtk"])
+    assert guess_offset(thinned, "rtk", -1.0, 1.0) is None
+    found = guess_offset(whole, "rtk", -1.0, 1.0)
+    assert found is not None
+    assert found.offset == pytest.approx(-0.34, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("flown", "seconds"), [((17, 21), -0.34), ((23,), -0.61)])
+def test_the_likelihood_of_a_session_finds_its_clock(flown, seconds):
+    """The antenna is taken for the place of the unit, which must foretell the way from one fix of a second to
+    the next."""
+    folder = recordings("outdoor_quadrotor")
+    found = calibrate(
+        "gnss_ins", [Fit("rtk.time_offset", -1.0, 1.0)],
+        [Recording(f"outdoor_quadrotor:{folder}/path_{k}") for k in flown], measure="likelihood",
+        settings={"rtk.every": "1", "bad_time": "drop"}, engine="c",
+    )  # fmt: skip
+    assert found.parameters["rtk.time_offset"] == pytest.approx(seconds, abs=0.02)
+    assert found.deviations["rtk.time_offset"] < 0.01
+    assert not any("says no place" in said for said in found.notes)
+
+
+@pytest.mark.slow
+def test_where_the_likelihood_says_no_place_an_offset_stays_where_it_began():
+    """With ten fixes a second the alignment in motion of this flight leaps at some offsets, and with it the
+    likelihood."""
+    folder = recordings("outdoor_quadrotor")
+    found = calibrate(
+        "gnss_ins", [Fit("rtk.time_offset", -1.0, 1.0)],
+        [Recording(f"outdoor_quadrotor:{folder}/path_23")], engine="c",
+    )  # fmt: skip
+    assert any("says no place near" in said and "it stays at -0.6142 s" in said for said in found.notes)
+    assert found.parameters["rtk.time_offset"] == pytest.approx(-0.6142, abs=1e-3)
+    assert found.deviations["rtk.time_offset"] is None
+
+
 def test_what_is_sought_is_not_estimated_by_the_filter_as_well():
     flight = driven(0.0)
     flight = replace(flight, info={**flight.info, "position_noise": 0.02})
     within = gnss_ins.case(flight).graph.settings["estimated"]
     sought = replace(flight, info={**flight.info, "sought": ("rtk.time_offset",)})
-    assert "time_offset" in within
-    assert set(within) - set(gnss_ins.case(sought).graph.settings["estimated"]) == {"time_offset"}
+    assert set(within) == {"lever", "time_offset"}
+    case = gnss_ins.case(sought)
+    assert not case.graph.settings["estimated"]
+    assert any("taken for the unit's place, while its clock is sought" in n for n in case.notes)
+    with_lever = gnss_ins.case(sought, estimate="lever")
+    assert with_lever.graph.settings["estimated"] == ("lever",)
 
 
-def test_recordings_of_another_clock_are_named():
+def test_nothing_is_estimated_beside_the_fifteen_where_that_is_asked_for():
+    told = {"sensors": "gps,barometer", "duration": "3"}
+    for more, estimated in (({}, ("height_offset",)), ({"estimate": "none"}, ())):
+        case, _ = prepared("gnss_ins", "sim:drive", 1, {**told, **more})
+        assert case.graph.settings["estimated"] == estimated
+
+
+def test_recordings_of_another_clock_are_named_and_left_out():
     told = [
         Guess(0.12, 0.95, "x"),
         Guess(0.13, 0.95, "x"),
@@ -104,8 +159,14 @@ def test_recordings_of_another_clock_are_named():
         Guess(0.9, 0.1, "x"),
         None,
     ]
-    (said,) = _apart("rtk.time_offset", [Recording(f"csv:{k}") for k in range(5)], told, 0.12)
+    names = [Recording(f"csv:{k}") for k in range(5)]
+    (said,), left = _apart("rtk.time_offset", names, told, 0.12)
     assert "csv:2 says 0.24 s" in said
+    assert said.endswith("it is left out")
+    assert left == {2}
+    notes, left = _apart("rtk.time_offset", names[:2], [told[0], told[2]], 0.18)
+    assert len(notes) == 2
+    assert not left, "of two nobody knows which"
 
 
 def test_what_cannot_be_calibrated_is_refused():
@@ -196,3 +257,38 @@ def test_what_calibrate_refuses_is_said_in_its_name():
     with pytest.raises(DeclarationError, match=r"vicon.lever: these are no bounds") as refused:
         calibrate("ekf", [Fit("vicon.lever", 0.2, -0.2)], [Recording("sim")])
     assert refused.value.fix == "swap the bounds: low -0.2, high 0.2"
+
+
+SHORT = {"duration": 2.0, "imu.rate": 50.0, "vicon.rate": 25.0}
+
+
+@pytest.mark.slow
+def test_a_clock_is_that_of_the_truth_where_there_is_one_of_its_own():
+    """A unit whose stamps are 20 ms off: the innovations follow it, the truth does not."""
+    fits = [Fit("vicon.time_offset", -0.1, 0.1)]
+    settings = {**SHORT, "duration": 8.0, "imu.time_offset": 0.02}
+    found = {
+        m: calibrate("ekf", fits, [Recording("sim")], engine="c", settings=settings, measure=m)
+        for m in (None, "error", "likelihood")
+    }
+    clocks = {m: float(f.parameters["vicon.time_offset"]) for m, f in found.items()}
+    assert clocks[None] == clocks["error"]
+    assert clocks["likelihood"] == pytest.approx(0.02, abs=0.006)
+    assert abs(clocks["error"]) < 0.012
+
+
+@pytest.mark.parametrize(("truth", "stays"), [("sim", True), ("moved", False), ("none", False)])
+def test_a_truth_that_an_offset_moves_or_that_is_none_judges_no_clock(truth, stays, monkeypatch):
+    import flowgraph.study.trials as trials
+
+    def flight(data, seed, settings):
+        made = load_flight("sim", settings={n: str(v) for n, v in SHORT.items()})
+        assert made.truth is not None
+        late = round(float(settings.get("vicon.time_offset", 0.0)) * 1e9)
+        known = made.truth if truth == "sim" else Series(made.truth.time + late, made.truth.values)
+        return replace(made, truth=None if truth == "none" else known)
+
+    monkeypatch.setattr(trials, "loaded", flight)
+    monkeypatch.setattr(trials, "prepared", lambda g, data, seed, settings: (None, flight(data, seed, {})))
+    problem = Trials("ekf", [Recording("sim")], SHORT, "likelihood", None, "reference")
+    assert _truth_stays(problem, [Fit("vicon.time_offset", -0.1, 0.1)]) is stays

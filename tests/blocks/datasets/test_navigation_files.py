@@ -13,8 +13,8 @@ from scipy.io import savemat
 
 from flowgraph import DataError, load_flight, simulate
 from flowgraph.blocks.datasets.turns import from_angles, from_ned_attitude
-from flowgraph.blocks.geometry.rotations import rotate
-from flowgraph.errors import UnknownNameError
+from flowgraph.blocks.geometry.rotations import rotate, to_matrix
+from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.graphs.gnss_ins import gnss_ins
 from tests.blocks.datasets.test_satellites import S, deviations, inspected, refused
 
@@ -343,3 +343,96 @@ def test_a_table_has_velocities_heights_and_wheels_in_units_of_its_own(tmp_path)
         load_flight(f"csv:{file}", settings={**names, "gps_velocity.axes": "nwu"})
     with pytest.raises(DataError, match="cannot be those of wheels.speed"):
         load_flight(f"csv:{file}", settings={**names, "wheels.speed": "baro"})
+
+
+def a_table(file, head, row, count=50):
+    """A table with a unit at rest and more columns."""
+    rows = [f"t,wx,wy,wz,ax,ay,az,{head}"]
+    rows += [f"{0.02 * k:.2f},0,0,0.1,0,0,9.8,{row}" for k in range(count)]
+    file.write_text("\n".join(rows) + "\n")
+    return {"imu.gyro": "wx,wy,wz", "imu.specific_force": "ax,ay,az"}
+
+
+@pytest.mark.parametrize(
+    ("pressure", "unit", "height"),
+    [  # of the tables of ISO 2533
+        (101325.0, "Pa", 0.0),
+        (898.746, "hPa", 1000.0),
+        (54.0199, "kPa", 5000.0),
+        (264.363, "mbar", 10000.0),
+        (1.07478, "bar", -500.0),
+    ],
+)
+def test_a_pressure_is_a_height_of_the_standard_atmosphere(tmp_path, pressure, unit, height):
+    file = tmp_path / "log.csv"
+    names = {**a_table(file, "p", pressure), "barometer.pressure": "p"}
+    flight = load_flight(f"csv:{file}", settings={**names, "barometer.pressure.unit": unit})
+    assert set(flight.streams["barometer"].leaves) == {"height"}
+    np.testing.assert_allclose(flight.streams["barometer"]["height"], height, atol=1.2)
+    assert "barometer" in gnss_ins.case(flight).recorded
+
+
+def test_a_pressure_in_another_unit_is_refused(tmp_path):
+    file = tmp_path / "log.csv"
+    names = {**a_table(file, "p,h,b [hPa]", "1013.25,3,1000"), "barometer.pressure": "p"}
+    with pytest.raises(DataError, match=r"line 2, column p[\s\S]*no pressure of the air[\s\S]*unit=hPa"):
+        load_flight(f"csv:{file}", settings=names)
+    with pytest.raises(DeclarationError, match="barometer has its height twice"):
+        load_flight(f"csv:{file}", settings={**names, "barometer.height": "h"})
+    told = load_flight(f"csv:{file}", settings={**names, "barometer.pressure": "b"})
+    assert any("barometer.pressure.unit: hPa, as line 1" in n for n in told.notes)
+    np.testing.assert_allclose(told.streams["barometer"]["height"], 110.9, atol=0.1)
+    less = {k: v for k, v in names.items() if k != "barometer.pressure"}
+    with pytest.raises(DataError, match="cannot be those of barometer.height"):
+        load_flight(f"csv:{file}", settings={**less, "barometer.height": "b"})
+
+
+def test_two_antennas_tell_a_heading_in_a_table(tmp_path):
+    """As a compass has it or as the world does; with a deviation of each, of all, or one that is assumed."""
+    file = tmp_path / "log.csv"
+    names = {**a_table(file, "yaw,sd", "30,0.5"), "heading.angle": "yaw", "heading.angle.unit": "deg"}
+    read = lambda **more: load_flight(
+        f"csv:{file}", settings={**names, **{k.replace("__", "."): v for k, v in more.items()}}
+    )
+    plain = read()
+    np.testing.assert_allclose(plain.streams["heading"]["angle"], np.radians(30.0))
+    np.testing.assert_allclose(plain.streams["heading"]["deviation"], 0.02)
+    assert any("heading: its deviation is 0.02 rad" in n for n in plain.notes)
+    compass = read(heading__axes="ned", heading__noise="0.01")
+    np.testing.assert_allclose(compass.streams["heading"]["angle"], np.radians(60.0))
+    np.testing.assert_allclose(compass.streams["heading"]["deviation"], 0.01)
+    assert not any("heading:" in n for n in compass.notes)
+    across = gnss_ins.case(read(heading__axes="ned", heading__baseline="0,1,0"))  # the second one to the left
+    R = to_matrix(simulate(across.graph, across.inputs)["belief"]["attitude"][-1], xp=np)
+    # the body has turned by 0.1 rad/s for a second, and its antennas say that it stands
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(np.radians(-30.0), abs=0.02)
+    with pytest.raises(DeclarationError, match=r"heading\.baseline"):
+        read(heading__baseline="0,1")
+    each = read(heading__deviation="sd", heading__deviation__unit="deg")
+    np.testing.assert_allclose(each.streams["heading"]["deviation"], np.radians(0.5))
+    assert "heading" in gnss_ins.case(each).recorded
+    alone = {k: v for k, v in names.items() if not k.startswith("heading")}
+    case = gnss_ins.case(compass)
+    assert any(
+        n.startswith("info: the heading at the start is that of two antennas: known to") for n in case.notes
+    )
+    R = to_matrix(simulate(case.graph, case.inputs)["belief"]["attitude"][0], xp=np)
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(np.radians(60.0), abs=0.01)
+    with pytest.raises(DeclarationError, match=r"heading lacks a field[\s\S]*heading.angle"):
+        load_flight(f"csv:{file}", settings={**alone, "heading.deviation": "sd"})
+    with pytest.raises(UnknownNameError, match="heading.axes"):
+        read(heading__axes="nwu")
+    with pytest.raises(DeclarationError, match=r"heading\.noise"):
+        read(heading__noise="0")
+
+
+def test_a_slow_stream_of_a_table_with_a_fast_one_is_no_index_of_rows(tmp_path):
+    """Positions at whole seconds, in a table whose other rows tell its clock; alone they are doubtful."""
+    file = tmp_path / "log.csv"
+    rows = [f"{0.5 * k},0,0,0.1,0,0,9.8," + ("1,2,3" if k % 2 == 0 else ",,") for k in range(40)]
+    file.write_text("\n".join(["t,wx,wy,wz,ax,ay,az,x,y,z", *rows]) + "\n")
+    place = {"leica.position": "x,y,z"}
+    names = {**place, "imu.gyro": "wx,wy,wz", "imu.specific_force": "ax,ay,az"}
+    doubted = lambda flight: any("as an index of rows is" in n for n in flight.notes)
+    assert not doubted(load_flight(f"csv:{file}", settings=names))
+    assert doubted(load_flight(f"csv:{file}", settings=place))

@@ -85,10 +85,10 @@ def test_a_repeated_row_is_left_out_on_request(tmp_path):
 
 def test_what_is_missing_is_named(tmp_path):
     where = folder(tmp_path / "path_1")
+    with pytest.raises(DataError, match="no such file; there are flights path_1"):
+        load_flight(f"outdoor_quadrotor:{tmp_path}")
     with pytest.raises(DataError, match="there are units 1, 2"):
         load_flight(f"outdoor_quadrotor:{where}:7")
-    with pytest.raises(DataError, match="no such file"):
-        load_flight(f"outdoor_quadrotor:{tmp_path}")
     with pytest.raises(UnknownNameError, match="Gyr_Z"):
         load_flight(f"outdoor_quadrotor:{folder(tmp_path / 'other', imu=IMU.replace('Gyr_Z', 'W'))}")
     with pytest.raises(UnknownNameError, match=r"rtk\.sometimes"):
@@ -100,3 +100,15 @@ def test_a_recorded_flight_is_read():
     assert len(flight.streams["imu"]) == 5281
     assert len(flight.streams["rtk"]) == 441
     assert 9.0 < float(np.median(np.linalg.norm(flight.streams["imu"]["specific_force"], axis=1))) < 13.0
+
+
+def test_heights_in_coarse_steps_are_a_note(tmp_path):
+    """As the heights of these recordings are; what is written finely is none."""
+    where = folder(tmp_path / "path_1")
+    table = where / "GT.csv"
+    head, *rows = table.read_text().splitlines()
+    coarse = lambda step: [f"{r.rpartition(',')[0]},{-step * (k // 4)!r}" for k, r in enumerate(rows)]
+    for step, said in ((0.1, True), (0.25, True), (0.01, False)):
+        table.write_text("\n".join([head, *coarse(step)]) + "\n")
+        notes = load_flight(f"outdoor_quadrotor:{where}").notes
+        assert any(f"Down is written in steps of {step:g} m" in n for n in notes) == said

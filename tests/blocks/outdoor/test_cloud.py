@@ -4,6 +4,7 @@ draw against the Gaussian that it is drawn from."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.stats import multivariate_normal
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.inertial import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor import (
+    cloud_biases,
     correct_distance,
     correct_field,
     correct_flow,
@@ -19,7 +21,7 @@ from flowgraph.blocks.outdoor import (
     predict_outdoor,
     take_picture,
 )
-from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range
+from flowgraph.blocks.signals import Imu, MagneticField, OpticalFlow, OutdoorCloud, Position, Range, Weights
 from flowgraph.recorder.random import NumpyDraw, seed_words
 
 N = 4
@@ -58,9 +60,9 @@ def shifted(state: State, d: np.ndarray) -> State:
     return motion + d[:9], g.multiply(g.from_rotation_vector(d[9:], xp=np), attitude, xp=np), picture
 
 
-def jacobian(f: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def jacobian(f: Callable[[np.ndarray], np.ndarray], size: int = 12) -> np.ndarray:
     step = 1e-5
-    return np.stack([(f(d) - f(-d)) / (2.0 * step) for d in np.eye(12) * step], axis=1)
+    return np.stack([(f(d) - f(-d)) / (2.0 * step) for d in np.eye(size) * step], axis=1)
 
 
 def turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -68,11 +70,11 @@ def turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return g.to_rotation_vector(g.multiply(b, g.conjugate(a, xp=np), xp=np), xp=np)
 
 
-def carried(state: State, dt: float) -> State:
+def carried(state: State, dt: float, reading: Imu = READING) -> State:
     motion, q, picture = state
-    half = g.from_rotation_vector(READING.gyro * (0.5 * dt), xp=np)
+    half = g.from_rotation_vector(reading.gyro * (0.5 * dt), xp=np)
     middle = g.multiply(q, half, xp=np)
-    a = g.rotate(middle, READING.specific_force, xp=np) + GRAVITY
+    a = g.rotate(middle, reading.specific_force, xp=np) + GRAVITY
     path = motion[:3] * dt + 0.5 * a * dt**2
     return motion + np.concatenate([a * dt, path, path]), g.multiply(middle, half, xp=np), picture
 
@@ -98,6 +100,64 @@ def test_prediction_is_that_of_one_kalman_filter_a_particle():
         np.testing.assert_allclose(after.attitude[:, i], attitude, atol=1e-13)
         found = F @ (cloud.covariance[..., i] + half) @ F.T + half + Q * noise.accelerometer**2
         np.testing.assert_allclose(after.covariance[..., i], found, atol=1e-8)
+
+
+def test_with_biases_the_prediction_is_that_of_one_kalman_filter_a_particle():
+    noise, dt, rng = ImuNoise(0.3, 0.7, 0.02, 0.05), 0.02, np.random.default_rng(4)
+    root = rng.normal(size=(N, 18, 18)) * np.repeat([0.2, 0.01, 0.02, 0.2], [9, 3, 3, 3])[:, None]
+    biases, plain = rng.normal(size=(6, N)) * 0.3, a_cloud()
+    cloud = plain.replace(
+        motion=np.concatenate([plain.motion, biases]), covariance=np.moveaxis(root @ root.mT, 0, -1)
+    )
+    after = predict_outdoor.step(cloud, READING, noise=noise, dt=dt, xp=np)
+    still = plain.replace(covariance=0.0 * plain.covariance)
+    Q = np.pad(
+        predict_outdoor.step(still, READING, noise=ImuNoise(0.0, 0.7, 0.0, 0.0), dt=dt, xp=np).covariance,
+        ((0, 6), (0, 6), (0, 0)),
+    )
+    walk = np.diag(np.repeat([0.0, 0.02**2, 0.05**2], [12, 3, 3])) * dt
+    half = np.diag(np.repeat([0.0, 0.5 * dt * noise.gyro**2, 0.0], [9, 3, 6]))
+    for i in range(N):
+        state, b = one(plain, i), biases[:, i]
+
+        def go(d: np.ndarray, state: State = state, b: np.ndarray = b) -> State:
+            gyro, force = READING.gyro - b[:3] - d[12:15], READING.specific_force - b[3:] - d[15:]
+            return carried(shifted(state, d[:12]), dt, Imu(gyro=gyro, specific_force=force))
+
+        motion, attitude, _ = go(np.zeros(18))
+        np.testing.assert_allclose(after.motion[:, i], np.concatenate([motion, b]), atol=1e-13)
+        np.testing.assert_allclose(after.attitude[:, i], attitude, atol=1e-13)
+
+        def off(
+            d: np.ndarray, go: Any = go, motion: np.ndarray = motion, q: np.ndarray = attitude
+        ) -> np.ndarray:
+            moved = go(d)
+            return np.concatenate([moved[0] - motion, turn_between(q, moved[1]), d[12:]])
+
+        F = jacobian(off, 18)
+        found = F @ (cloud.covariance[..., i] + half) @ F.T + half + Q[..., i] + walk
+        np.testing.assert_allclose(after.covariance[..., i], found, atol=1e-6)
+
+
+def test_a_draw_of_the_attitude_conditions_the_biases():
+    """What is left of them, and how far they moved, over many particles is what there was of them before."""
+    n, rng = 10_000, np.random.default_rng(1)
+    root = np.tril(rng.normal(size=(18, 18))) * 0.1
+    P = root @ root.T
+    cloud = OutdoorCloud(
+        log_weight=np.full(n, -np.log(n)),
+        attitude=np.repeat([[1.0], [0.0], [0.0], [0.0]], n, axis=1),
+        picture=np.repeat([[1.0], [0.0], [0.0], [0.0]], n, axis=1),
+        motion=np.zeros((15, n)),
+        covariance=np.repeat(P[:, :, None], n, axis=2),
+    )
+    after = take_picture.step(cloud, True, draw=NumpyDraw("test", seed_words(1), 0), xp=np)
+    left, moved = after.covariance[12:, 12:, 0], np.cov(after.motion[9:])
+    np.testing.assert_allclose(left + moved, P[12:, 12:], atol=0.04 * np.abs(P).max())
+    assert np.trace(left) < 0.9 * np.trace(P[12:, 12:])
+    weights = Weights(weight=np.exp(after.log_weight))
+    told = cloud_biases.step(after, weights, xp=np)
+    np.testing.assert_allclose(told.covariance, P[12:, 12:], atol=0.04 * np.abs(P).max())
 
 
 def test_the_first_firing_predicts_nothing():

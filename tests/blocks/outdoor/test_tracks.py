@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.patches import ArrowStyle
 
 from flowgraph import Series
 from flowgraph.blocks.geometry.geodetic import to_earth, to_enu
@@ -76,11 +77,17 @@ def test_a_map_has_a_scale_and_a_north(tmp_path: Path):
     figure = plot_map(walk(), None, tmp_path / "map.png")
     told = [text.get_text() for text in figure.axes[0].texts]
     assert told == ["1 m", "N"]
+    north: Any = figure.axes[0].texts[-1]
+    assert north.xy[1] > north.xyann[1]
+    assert isinstance(north.arrow_patch.get_arrowstyle(), ArrowStyle.CurveB), "its head is where it points"
     assert (tmp_path / "map.png").stat().st_size > 5_000
 
 
-def test_without_a_place_on_the_earth_there_is_the_map_alone():
-    assert set(track_files(None, "a", None)) == {"map.png"}
+def test_without_a_place_on_the_earth_there_are_a_map_and_a_table_of_metres():
+    assert set(track_files(None, "a", None)) == {"map.png", "track.csv"}
+    rows = list(csv.DictReader(io.StringIO(as_table(walk()))))
+    assert set(rows[0]) == {"time [s]", "north [m]", "east [m]", "down [m]"}
+    assert float(rows[-1]["east [m]"]) == pytest.approx(4.0)
     names = {"map.png", "track.geojson", "track.kml", "track.gpx", "track.csv"}
     assert set(track_files(ORIGIN, "a", None)) == names
 
