@@ -310,7 +310,7 @@ def _weighted(x: Any, y: Any) -> bool:
     """Whether x (m, 1) holds the elements of y (1, m), each times the same: sums of x y are symmetric."""
     if x.ndim != 2 or y.ndim != 2 or len(x) != y.shape[1]:
         return False
-    times = []
+    times: list[Node | None] = []
     for p, q in zip(x[:, 0], y[0], strict=True):
         if p is q:
             times.append(None)

@@ -83,8 +83,13 @@ def _matmul(w: Lines, m: Macro) -> None:
     def text(name: str, a: View, b: View, out: View) -> str:
         rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
         right = index(b.strides[-2:], ("k", "j"))
-        at = lambda r: index(a.strides[-2:], (f"(i + {r})" if r else "i", "k"))
-        to = lambda r: index(out.strides[-2:], (f"(i + {r})" if r else "i", "j"))
+
+        def at(r: int) -> str:
+            return index(a.strides[-2:], (f"(i + {r})" if r else "i", "k"))
+
+        def to(r: int) -> str:
+            return index(out.strides[-2:], (f"(i + {r})" if r else "i", "j"))
+
         packed = type_ == w.write.real and rows >= 4 and columns > 1
         w.write.packs |= packed
         kept, wide, one = ("fg_pack", f"FG_PACKS({columns})", type_) if packed else (type_, columns, type_)

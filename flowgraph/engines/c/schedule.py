@@ -145,7 +145,9 @@ def _write_state(made: Schedule, users: dict[Node, list[Group]]) -> None:
                 ends = users[item] if item.space else []
                 safe = all(g[0] < first or (at is not None and (g[0] < at[0] or g == at)) for g in ends)
                 safe = safe or not any(
-                    _overlap(_reach(*item.extra[1:], item.space), _reach(s.offset, s.strides, s.space))
+                    _overlap(
+                        _reach(item.extra[1], item.extra[2], item.space), _reach(s.offset, s.strides, s.space)
+                    )
                     for s in written
                 )
             else:
