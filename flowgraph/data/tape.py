@@ -89,7 +89,7 @@ def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
     """Where `some` times lie among all; counted where these are equally far apart, and else looked for."""
     if len(time) > 1 and len(some) and time[0] <= some[0] and some[-1] <= time[-1]:
         step = (int(time[-1]) - int(time[0])) // (len(time) - 1)
-        if 0 < step and int(time[-1]) - int(time[0]) < 2**63:
+        if step > 0 and int(time[-1]) - int(time[0]) < 2**63:
             rows = (some - time[0]) // step
             if rows[-1] < len(time) and np.array_equal(time.take(rows, mode="clip"), some):
                 return np.asarray(rows)
