@@ -2,8 +2,8 @@
 
 The figure of `sim`, flown by a vehicle whose inertial unit lies with its x axis upwards, in another corner
 of the hall each time, with the biases of a cheap unit and the jolts of a vehicle that is carried, started and
-set down. A laser tracker finds a prism late, loses it at times, and tells its position alone. Number formats
-for fixed point are found on such flights:
+set down. A laser tracker finds a prism late, loses it at times, tells its position alone, and is switched off
+after the unit. Number formats for fixed point are found on such flights:
 
     flowgraph quantise ins_eskf --data examples/mav_flight.py:mav --width 32 -o formats
 
@@ -61,10 +61,12 @@ def mav(*, seed: int = 0, duration: float = 40.0, jolt: float = 50.0) -> Flight:
     lost = after < draw.uniform(0.3, 1.0)  # the tracker finds the prism late, and loses it now and then
     for begin in draw.uniform(2.0, duration, 3):
         lost |= (after > begin) & (after < begin + draw.uniform(0.3, 1.0))
+    # the unit's recording ends first: then one reading holds from one sight of the prism to the next
+    ended = imu.time > truth.time[-1] - int(draw.uniform(1.0, 2.0) * 1e9)
     return Flight(
         f"mav-{seed}",
         {
-            "imu": Series(imu.time, Imu(gyro=gyro, specific_force=force), name="imu"),
+            "imu": Series(imu.time[~ended], Imu(gyro=gyro[~ended], specific_force=force[~ended]), name="imu"),
             "leica": Series(seen.time[~lost], Position(position=prism[~lost]), name="leica"),
         },
         truth=Series(truth.time, Pose(position=position, attitude=attitude), name="truth"),

@@ -131,13 +131,14 @@ class UnknownNameError(FlowgraphError):
     def __init__(self, kind: str, name: object, valid: Iterable[str], *, path: str | None = None) -> None:
         names = sorted(valid)
         said = str(name) if len(str(name)) <= 200 else f"{str(name)[:200]}..."
-        near = difflib.get_close_matches(said, names, n=1)
+        stream = said.rpartition(".")[0] or "STREAM"  # "STREAM.lever" is there for any stream
+        near = difflib.get_close_matches(said, [n.replace("STREAM.", f"{stream}.") for n in names], n=1)
         super().__init__(
             f"no {kind} is called {said!r}",
             path=path,
             expected="one of " + ", ".join(names) if names else f"no {kind} exists here",
             got=repr(said),
-            fix=f"did you mean {near[0]!r}?" if near else f"use one of the {kind} names above",
+            fix=f"did you mean {near[0]!r}?" if near else "use one of the names above",
         )
         self.valid = names
 

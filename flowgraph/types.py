@@ -364,9 +364,14 @@ def as_value(value: Any, type_: Type, *, path: str, real_dtype: Any = np.float64
     """A copy of `value` whose leaves are read-only NumPy arrays of `type_` (scalars: NumPy scalars).
 
     Raises:
-        TypeMismatchError: where the value is of another type or shape.
+        TypeMismatchError: where the value is of another type or shape. DeclarationError: where it is of a
+            kind that no signal carries.
     """
-    given = type_of(value)
+    try:
+        given = type_of(value)
+    except DeclarationError as error:
+        error.path = error.path or path
+        raise
     if isinstance(type_, ArrayType) and isinstance(given, ArrayType):
         if type_.dtype != given.dtype != "bool" and np.can_cast(
             np.asarray(value).dtype, DTYPES[type_.dtype], "same_kind"

@@ -25,6 +25,7 @@ from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.models.pose import (
     driving,
     in_tangent_space,
+    pose_at_start,
     pose_belief,
     pose_steps,
     predict_pose,
@@ -99,4 +100,7 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU. The filter knows no biases,
             so left out they are 20 for a unit whose biases walk, and 1 for one that has none.
     """
-    return on_capture(on, filter, start=start_pose, believed=in_tangent_space, steps=pose_steps)
+    return on_capture(
+        on, filter, start=start_pose, believed=in_tangent_space, steps=pose_steps,
+        at_start=("belief", pose_at_start),
+    )  # fmt: skip

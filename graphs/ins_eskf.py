@@ -6,6 +6,7 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from flowgraph import Case, Series, Stream, clocks_of, collect, delay, graph, latest, simulate
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, tilt_and_heading
 from flowgraph.blocks.inertial.aiding import aid_attitude, aid_position
-from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
+from flowgraph.blocks.inertial.alignment import StartSpread, belief_at_start, start_belief
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise, predict
 from flowgraph.blocks.kalman.backward import collect_steps
 from flowgraph.blocks.kalman.learned import feed_scale, scale_of
@@ -143,9 +144,14 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
     start = guess.belief(begin.position, force)
     known = {name: value for name, value in settings.items() if name not in filter.gating()}
     recording = inertial_recording(inputs, start=stacked(start), reading=reading_of(on.flight), **known)
+
+    def begun(first: Callable[[str], Any], at: Stream[Any]) -> dict[str, Stream[Any]]:
+        return {"belief": belief_at_start(first("truth"), first("imu"), levelled=force is not None, at=at)}
+
     return on.case(
         filter.score(on, pose_errors, steps=inertial_steps, recording=recording),
         inputs=inputs,
+        begin=begun if begin.told else None,
         start=start,
         invariant=guess.invariant,
         smoothing=filter.smoothed,

@@ -12,6 +12,7 @@ S. Russell, "Rao-Blackwellised particle filtering for dynamic Bayesian networks"
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,11 @@ from flowgraph.blocks.metrics.errors import pose_errors
 from flowgraph.blocks.models.pose import driving
 from flowgraph.blocks.models.spread import spread_cloud
 from flowgraph.blocks.particles.cloud import (
+    START_DRAWS,
     attitude_likelihood,
     average_attitude,
     average_pose,
+    cloud_at_start,
     cloud_belief,
     dominant_eigenvector,
     effective_sample_size,
@@ -245,9 +248,15 @@ def for_flight(
     start = start_cloud(
         cloud.particles, seed=cloud.seed, position=begin.position, attitude=attitude, spread=spread
     )
+
+    def begun(first: Callable[[str], Any], at: Stream[Any]) -> dict[str, Stream[Any]]:
+        drawn = cloud_at_start(first("vicon"), particles=cloud.particles, draws=START_DRAWS, at=at)
+        return {"cloud": drawn}
+
     return on.case(
         filter.score(on, pose_errors, estimate="belief" if covariance else "pose"),
         inputs=begin.inputs,
+        begin=begun if attitude is None else None,
         start=start,
         noise=filter.imu_noise(on, (3.0, 2.0) if simulated else (15.0, 20.0)),
         **filter.measured(on),

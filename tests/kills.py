@@ -95,10 +95,12 @@ def _whole_pipelines(folder: Path) -> None:
 
 
 def _whole_study(folder: Path) -> None:
-    from flowgraph.study.store import Store, read_trajectory
+    from flowgraph.study.store import RUNS, Store, read_trajectory
 
-    for file in folder.glob("runs/*/*.json"):
-        assert Store(folder).read(file.stem) is not None, f"{file} is half"
+    file = folder / RUNS
+    whole = file.read_bytes().rpartition(b"\n")[0].splitlines() if file.exists() else []
+    kept = Store(folder).read(json.loads(line)["key"] for line in whole)
+    assert len(kept) == len(whole), f"a line of {file} is half"
     for file in folder.glob("trajectories/*.npz"):
         read_trajectory(file)
 

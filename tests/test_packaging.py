@@ -54,6 +54,18 @@ def test_a_graph_brings_no_other_graph() -> None:
     assert loaded("from flowgraph.graphs import ukf", others) == ["flowgraph.graphs.ukf"]
 
 
+def test_a_study_starts_without_the_parts_of_scipy() -> None:
+    """Each worker of a study imports flights, filters and scores: SciPy's parts take a second."""
+    parts = ("scipy.spatial", "scipy.signal", "scipy.linalg", "scipy.special")
+    code = (
+        "import sys, flowgraph.study, flowgraph.blocks.flights, flowgraph.graphs.ekf;"
+        f" print(*[name for name in {parts!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
 def test_entry_points_exist() -> None:
     with open(ROOT / "pyproject.toml", "rb") as file:
         project = tomllib.load(file)["project"]

@@ -32,6 +32,7 @@ from flowgraph.blocks.geometry.rotations import (
     multiply,
     normalize,
     rotate,
+    sinc,
     skew,
     to_rotation_vector,
 )
@@ -107,9 +108,8 @@ def swept(theta: Array, v: Array, xp: Any) -> Array:
     square = theta * theta
     small = square < _SMALL
     safe = xp.where(small, 1.0, theta)
-    whole = 1.0 + square * (-1.0 / 6 + square * (1.0 / 120 + square * (-1.0 / 5040 + square / 362880)))
     half = 0.5 * theta * (1.0 - square / 12 * (1.0 - square / 30 * (1.0 - square / 56)))
-    a = xp.where(small, whole, xp.sin(safe) / safe)
+    a = sinc(theta, xp=xp)
     b = xp.where(small, half, (1.0 - xp.cos(safe)) / safe)
     x, y = v[..., :1], v[..., 1:]
     return xp.concat([a * x - b * y, b * x + a * y], axis=-1)
@@ -200,12 +200,11 @@ def _ratios(theta: Array, xp: Any) -> tuple[Array, Array]:
     square = xp.linalg.vecdot(theta, theta)[..., None]
     small = square < _SMALL
     t = xp.sqrt(xp.where(small, 1.0, square))
-    half = xp.sin(0.5 * t) / t
-    first = 0.5 - square / 24 * (1.0 - square / 30 * (1.0 - square / 56 * (1.0 - square / 90)))
+    half = sinc(0.5 * xp.sqrt(square), xp=xp)
     second = 1.0 / 6 - square / 120 * (1.0 - square / 42 * (1.0 - square / 72 * (1.0 - square / 110)))
     return (
-        xp.where(small, first, 2.0 * half * half),
-        xp.where(small, second, (1.0 - xp.sin(t) / t) / (t * t)),
+        0.5 * half * half,
+        xp.where(small, second, (1.0 - sinc(t, xp=xp)) / (t * t)),
     )
 
 

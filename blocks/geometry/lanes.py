@@ -32,25 +32,39 @@ __all__ = [
 ]
 
 
-def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The quaternion product (4, 16), rotation matrix (9, 16) and rotated vector (3, 48) of 16 products."""
+_FIRST, _SECOND = np.triu_indices(4)
+
+
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """The quaternion product (4, 16) of 16 products, and the rotation matrix (9, 10) of the 10 products of a
+    quaternion with itself."""
     units = np.eye(4)
     pairs = [(a, b) for a in units for b in units]
     product = np.stack([geometry.multiply(a, b, xp=np) for a, b in pairs], axis=1)
     # what is bilinear in (q, q) follows from its values on sums of units: B(a, b) = (Q(a + b) - Q(a - b)) / 4
     square = lambda q: geometry.to_matrix(q, xp=np).reshape(9)
-    matrix = np.stack([(square(a + b) - square(a - b)) / 4.0 for a, b in pairs], axis=1)
-    rotated = matrix.reshape(3, 3, 16).transpose(1, 0, 2).reshape(3, 48)
-    return product, matrix, rotated
+    matrix = np.stack(
+        [
+            (square(units[i] + units[j]) - square(units[i] - units[j])) / (4.0 if i == j else 2.0)
+            for i, j in zip(_FIRST, _SECOND, strict=True)
+        ],
+        axis=1,
+    )
+    return product, matrix
 
 
-_PRODUCT, _MATRIX, _ROTATED = _tables()
+_PRODUCT, _MATRIX = _tables()
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def products(a: Array, b: Array, *, xp: Any) -> Array:
     """The 16 products (16, n) of the parts of quaternions a and b (4, n)."""
     return xp.reshape(a[:, None, :] * b[None, :, :], (16, a.shape[-1]))
+
+
+def _squares(q: Array, xp: Any) -> Array:
+    """The 10 products (10, n) of the parts of quaternions q (4, n) with each other."""
+    return xp.concat([q[k : k + 1, :] * q[k:, :] for k in range(4)], axis=0)
 
 
 def multiply(a: Array, b: Array, *, xp: Any) -> Array:
@@ -66,23 +80,23 @@ def normalize(q: Array, *, xp: Any) -> Array:
 def exponential(v: Array, *, xp: Any) -> Array:
     """Exp: the quaternions (4, n) of rotation vectors (3, n) in rad (Solà eq. 101)."""
     u = 0.5 * v
-    half = xp.sqrt(xp.maximum(xp.sum(u * u, axis=0, keepdims=True), 1e-30))  # as in geometry: never 0/0
-    return xp.concat([xp.cos(half), xp.sin(half) / half * u], axis=0)
+    half = xp.sqrt(xp.sum(u * u, axis=0, keepdims=True))
+    return xp.concat([xp.cos(half), geometry.sinc(half, xp=xp) * u], axis=0)
 
 
 def rotation_matrices(q: Array, *, xp: Any) -> Array:
     """The rotation matrices (3, 3, n), body to world (Solà eq. 115)."""
-    return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ products(q, q, xp=xp), (3, 3, q.shape[-1]))
+    return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ _squares(q, xp), (3, 3, q.shape[-1]))
 
 
 def rotate(q: Array, v: Array, *, xp: Any) -> Array:
     """One body vector v (3) in world coordinates, for each attitude (4, n): (3, n).
 
-    R(q) v is linear in the products of q's parts, with a (3, 16) matrix that v alone makes: no rotation
-    matrices.
+    v + w t + u x t with t = 2 u x v, where q = (w, u): no rotation matrices, and no products of q's parts.
     """
-    by_products = xp.reshape(v @ xp.asarray(_ROTATED, dtype=q.dtype), (3, 16))
-    return by_products @ products(q, q, xp=xp)
+    u = q[1:, :]
+    t = 2.0 * cross(u, v[:, None, None], xp=xp)
+    return v[:, None] + q[:1, :] * t[:, 0, :] + cross(u, t, xp=xp)[:, 0, :]
 
 
 def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array
+from flowgraph.recorder.namespaces import unnormalized_sinc
 
 __all__ = [
     "multiply",
@@ -30,6 +31,7 @@ __all__ = [
     "to_rotation_vector",
     "to_matrix",
     "rotate",
+    "sinc",
     "skew",
     "between_vectors",
     "level",
@@ -104,12 +106,17 @@ def normalize(q: Array, *, xp: Any) -> Array:
     return q / xp.sqrt(xp.linalg.vecdot(q, q))[..., None]
 
 
+def sinc(x: Array, *, xp: Any) -> Array:
+    """sin(x) / x, and 1 at 0, element by element: one operation where `xp` has it."""
+    own = getattr(xp, "unnormalized_sinc", None)
+    return own(x) if own is not None else unnormalized_sinc(x, xp)
+
+
 def from_rotation_vector(v: Array, *, xp: Any) -> Array:
     """Exp: the quaternion (..., 4) of a rotation vector (..., 3) in rad (Solà eq. 101)."""
     u = 0.5 * v
-    # below 1e-15 rad the cosine and sin(half) / half are 1 to the last bit: no series, and never 0/0
-    half = xp.sqrt(xp.maximum(xp.linalg.vecdot(u, u)[..., None], 1e-30))
-    return xp.concat([xp.cos(half), xp.sin(half) / half * u], axis=-1)
+    half = xp.sqrt(xp.linalg.vecdot(u, u)[..., None])
+    return xp.concat([xp.cos(half), sinc(half, xp=xp) * u], axis=-1)
 
 
 def to_rotation_vector(q: Array, *, xp: Any) -> Array:

@@ -23,13 +23,22 @@ from flowgraph.blocks.geometry.rotations import (
     rotate,
     to_matrix,
 )
-from flowgraph.blocks.signals import Alignment, Attitude, Belief, Imu, MagneticField, SpecificForce
+from flowgraph.blocks.signals import (
+    Alignment,
+    Attitude,
+    Belief,
+    Imu,
+    MagneticField,
+    NavigationState,
+    SpecificForce,
+)
 from flowgraph.errors import DataError
 
 __all__ = [
     "Start",
     "StartSpread",
     "align_static",
+    "belief_at_start",
     "need_usable",
     "level_attitude",
     "orientation_start",
@@ -317,18 +326,35 @@ def start_belief(
     q = np.asarray(attitude, dtype=float)
     if specific_force is not None:
         q = np.asarray(level(q, np.asarray(specific_force, dtype=float), xp=np))
-    R = to_matrix(q, xp=np)
-    P = np.zeros((15, 15))
-    for place, deviation in ((0, spread.position), (3, spread.velocity)):
-        P[place : place + 3, place : place + 3] = np.eye(3) * deviation**2
-    P[6:9, 6:9] = R.T @ np.diag(np.square([spread.tilt, spread.tilt, spread.heading])) @ R
-    for place, deviation in ((9, spread.gyro_bias), (12, spread.accelerometer_bias)):
-        P[place : place + 3, place : place + 3] = np.eye(3) * deviation**2
+    return _belief(np.array(position, dtype=float), np.array(velocity, dtype=float), q, spread, np)
+
+
+@block
+def belief_at_start(
+    truth: NavigationState, imu: Imu, *, levelled: bool = True, spread: StartSpread = StartSpread(), xp: Any
+) -> Belief:
+    """`start_belief` at the truth's position and attitude, levelled by the specific force, and at rest."""
+    q = level(truth.attitude, imu.specific_force, xp=xp) if levelled else truth.attitude
+    return _belief(truth.position, 0.0 * truth.position, q, spread, xp)
+
+
+def _belief(position: Array, velocity: Array, q: Array, spread: StartSpread, xp: Any) -> Belief:
+    before = np.repeat([spread.position, spread.velocity], 3) ** 2
+    after = np.repeat([spread.gyro_bias, spread.accelerometer_bias], 3) ** 2
+    R = to_matrix(q, xp=xp)
+    about = xp.asarray(np.diag(np.square([spread.tilt, spread.tilt, spread.heading])), dtype=q.dtype)
+    rows = [
+        xp.asarray(np.diag(before) @ np.eye(6, 15), dtype=q.dtype),
+        xp.concat([xp.zeros((3, 6)), xp.matrix_transpose(R) @ about @ R, xp.zeros((3, 6))], axis=1),
+        xp.asarray(np.diag(after) @ np.eye(6, 15, k=9), dtype=q.dtype),
+    ]
+    P = xp.concat(rows, axis=0)
+    none = xp.zeros((3,), dtype=q.dtype)
     return Belief(
-        position=np.array(position, dtype=float),
-        velocity=np.array(velocity, dtype=float),
+        position=position,
+        velocity=velocity,
         attitude=q,
-        gyro_bias=np.zeros(3),
-        accelerometer_bias=np.zeros(3),
-        covariance=0.5 * (P + P.T),
+        gyro_bias=none,
+        accelerometer_bias=none,
+        covariance=0.5 * (P + xp.matrix_transpose(P)),
     )

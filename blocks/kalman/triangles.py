@@ -18,7 +18,7 @@ from flowgraph import Array
 __all__ = ["covariance_root", "lower_root", "semidefinite_root"]
 
 _FIRM = 1e-12
-"""The share of its diagonal from which a pivot is not made by rounding: Cholesky's signs are then sure."""
+"""The share of its diagonal from which a pivot is not made by rounding: Cholesky's digits are then taken."""
 
 
 def lower_root(wide: Array, *, xp: Any) -> Array:
@@ -47,7 +47,7 @@ def semidefinite_root(P: Array, *, xp: Any) -> Array:
 
     Cholesky's factorization by outer products; a pivot below 1e-15 of its own diagonal counts as zero.
     """
-    return _outer_root(P, xp)[0]
+    return _outer_root(P, xp)
 
 
 def covariance_root(P: Array, *, xp: Any) -> Array:
@@ -55,29 +55,30 @@ def covariance_root(P: Array, *, xp: Any) -> Array:
 
     So a filter whose start is known in some direction goes on, and others have the digits of Cholesky.
     """
-    if isinstance(P, np.ndarray):  # the same root, without computing what will not be taken
-        try:
-            root = np.linalg.cholesky(P)
-        except np.linalg.LinAlgError:
-            root = np.zeros_like(P)
-        pivots, variances = (np.diagonal(x, axis1=-2, axis2=-1) for x in (root, P))
-        if (pivots * pivots > 2.0 * _FIRM * variances).all():
-            return root
-    root, firm = _outer_root(P, xp)
-    firm = firm[..., None, None]
-    return xp.where(firm, xp.linalg.cholesky(xp.where(firm, P, xp.eye(P.shape[-1], dtype=P.dtype))), root)
+    root = _cholesky(P) if isinstance(P, np.ndarray) else xp.linalg.cholesky(P)
+    one = xp.eye(P.shape[-1], dtype=P.dtype)
+    pivots, variances = (xp.sum(x * one, axis=-1) for x in (root, P))
+    firm = xp.all(pivots * pivots > 2.0 * _FIRM * variances, axis=-1)
+    if isinstance(P, np.ndarray) and firm.all():  # without computing what will not be taken
+        return root
+    return xp.where(firm[..., None, None], root, _outer_root(P, xp))
 
 
-def _outer_root(P: Array, xp: Any) -> tuple[Array, Array]:
-    """The root, and whether (...) every pivot is well above the rounding of its diagonal."""
+def _cholesky(P: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return np.zeros_like(P)
+
+
+def _outer_root(P: Array, xp: Any) -> Array:
     n = P.shape[-1]
     variance = xp.sum(P * xp.eye(n, dtype=P.dtype), axis=-1)
-    columns, firm = [], variance[..., :1] > 0.0
+    columns = []
     for j in range(n):
         pivot, least = P[..., j, j : j + 1], variance[..., j : j + 1]
         solid = (pivot > least * 1e-15) & (pivot > 0.0)
-        firm = firm & (pivot > least * _FIRM)
         column = P[..., :, j] / xp.sqrt(xp.where(solid, pivot, 1.0)) * xp.astype(solid, P.dtype)
         columns.append(column)
         P = P - column[..., :, None] * column[..., None, :]
-    return xp.tril(xp.stack(columns, axis=-1)), firm[..., 0] & xp.all(variance > 0.0, axis=-1)
+    return xp.tril(xp.stack(columns, axis=-1))

@@ -10,6 +10,8 @@ secs. 1.4.17 (tables) and 5.4.2 (bands).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,6 +20,7 @@ from flowgraph.data.consistency import chi_square
 __all__ = ["chi_square", "chi_square_band", "chi_square_gate", "gate_table", "inside"]
 
 
+@lru_cache(maxsize=256)
 def chi_square_band(parts: int, *, runs: int = 1, probability: float = 0.95) -> tuple[float, float]:
     """The two-sided band of the mean over `runs` of a chi-square variable with `parts` degrees of freedom."""
     tail = 0.5 * (1.0 - probability)

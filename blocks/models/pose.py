@@ -41,6 +41,7 @@ __all__ = [
     "move",
     "move_jacobian",
     "observe_jacobian",
+    "pose_at_start",
     "pose_belief",
     "pose_steps",
     "predict_pose",
@@ -263,17 +264,26 @@ def start_pose(
     attitude_deviation: float = 0.3,
 ) -> QuaternionBelief:
     """A belief to start from, with standard deviations in m, m/s and rad (about each body axis)."""
-    q = np.asarray(attitude, dtype=float)
-    around = np.eye(4) - np.outer(q, q)
-    P = np.zeros((10, 10))
-    P[:3, :3], P[3:6, 3:6] = np.eye(3) * velocity_deviation**2, np.eye(3) * position_deviation**2
-    P[6:, 6:] = around * (0.5 * attitude_deviation) ** 2
-    return QuaternionBelief(
-        velocity=np.asarray(velocity, dtype=float),
-        position=np.asarray(position, dtype=float),
-        attitude=q,
-        covariance=P,
-    )
+    v, p, q = (np.asarray(x, dtype=float) for x in (velocity, position, attitude))
+    return _started(v, p, q, (velocity_deviation, position_deviation, attitude_deviation), np)
+
+
+@block
+def pose_at_start(
+    pose: Pose, *, deviations: tuple[float, float, float] = (0.7, 0.7, 0.3), xp: Any
+) -> QuaternionBelief:
+    """`start_pose` at a measured pose and at rest; deviations in m/s, m and rad."""
+    return _started(0.0 * pose.position, pose.position, pose.attitude, deviations, xp)
+
+
+def _started(
+    velocity: Array, position: Array, q: Array, deviations: tuple[float, float, float], xp: Any
+) -> QuaternionBelief:
+    moving = np.diag(np.repeat(deviations[:2], 3) ** 2) @ np.eye(6, 10)
+    around = (xp.eye(4, dtype=q.dtype) - q[:, None] * q[None, :]) * (0.5 * deviations[2]) ** 2
+    turning = xp.concat([xp.zeros((4, 6), dtype=q.dtype), around], axis=1)
+    P = xp.concat([xp.asarray(moving, dtype=q.dtype), turning], axis=0)
+    return QuaternionBelief(velocity=velocity, position=position, attitude=q, covariance=P)
 
 
 def pose_steps(result: Result) -> Steps:

@@ -36,6 +36,7 @@ __all__ = [
     "attitude_likelihood",
     "average_attitude",
     "average_pose",
+    "cloud_at_start",
     "dominant_eigenvector",
     "effective_sample_size",
     "log_sum_exp",
@@ -47,8 +48,13 @@ __all__ = [
     "within_depth",
 ]
 
+START_DRAWS = "start_cloud"
+"""What the draws of a cloud to start from are called."""
+
 DEPTH = 64.0
 """How far a particle falls behind the best in one reading at most: exp(-64) is nothing in a sum."""
+
+_BEYOND = 1.01  # times the distance at which a particle no longer matters: surely so
 
 _SQUARINGS = 5
 _ALONG = 1e-6  # squared cosine of the angle between the start and the answer, below which it will not do
@@ -89,9 +95,16 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
     error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
     error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
-    return LogLikelihood(
-        value=within_depth(xp.sum(error * error, axis=0) * (-0.5 / noise**2) - constant, xp=xp)
-    )
+    # who is too far to matter is put aside before the squares that tell: in words that hold the squares of
+    # half turns, the last bit is much beside those of a few degrees
+    squared = xp.sum(error * error, axis=0)
+    nearest = xp.min(squared)
+    near = squared <= nearest + _BEYOND * (2.0 * DEPTH * noise**2)
+    kept = xp.where(near[None, :], error, 0.0)
+    scaled = xp.sum(kept * kept, axis=0) * (-0.5 / noise**2)
+    least = xp.min(xp.where(near, scaled, 0.0))
+    value = xp.where(near, scaled, least - 2.0 * DEPTH)  # which `within_depth` brings up
+    return LogLikelihood(value=within_depth(value - constant, xp=xp))
 
 
 @block
@@ -217,31 +230,46 @@ def start_cloud(
             each of as many equal arcs.
         spread: standard deviations. A heading of infinity is uniform over the circle in the same way.
     """
-    draw = NumpyDraw("start_cloud", seed_words(seed), 0)
+    draw = NumpyDraw(START_DRAWS, seed_words(seed), 0)
     n = particles
     if attitude is None:
-        q = _about_the_vertical(n, draw)
+        q = _about_the_vertical(n, draw, np)
     else:
         sigma = np.array([[spread.tilt], [spread.tilt], [spread.heading]])  # about world axes: on the left
         even = math.isinf(spread.heading)
         sigma[2] = 0.0 if even else sigma[2]
         turn = lanes.exponential(sigma * draw.normal("attitude", (3, n)), xp=np)
         if even:
-            turn = lanes.multiply(_about_the_vertical(n, draw), turn, xp=np)
+            turn = lanes.multiply(_about_the_vertical(n, draw, np), turn, xp=np)
         q = lanes.multiply(turn, np.repeat(np.asarray(attitude, dtype=float)[:, None], n, axis=1), xp=np)
-    covariance = lambda deviation: np.repeat(np.eye(3)[:, :, None] * deviation**2, n, axis=2)
+    return _cloud(np.asarray(velocity, dtype=float), np.asarray(position, dtype=float), q, spread, np)
+
+
+@block
+def cloud_at_start(first: Pose, *, particles: int, draw: Any, xp: Any) -> Cloud:
+    """`start_cloud` at a measured position, with an unknown yaw and at rest: drawn as there, where its draws
+    are called `START_DRAWS` and it fires at time 0."""
+    q = _about_the_vertical(particles, draw, xp)
+    return _cloud(0.0 * first.position, first.position, q, _SPREAD, xp)
+
+
+def _cloud(velocity: Array, position: Array, q: Array, spread: StartSpread, xp: Any) -> Cloud:
+    n = q.shape[-1]
+    alike = xp.zeros((1, n), dtype=q.dtype)
+    covariance = lambda d: xp.asarray(np.repeat(np.eye(3)[:, :, None] * d**2, n, axis=2), dtype=q.dtype)
     return Cloud(
-        log_weight=np.full(n, -math.log(n)),
+        log_weight=xp.full((n,), -math.log(n), dtype=q.dtype),
         attitude=q,
-        velocity=np.repeat(np.asarray(velocity, dtype=float)[:, None], n, axis=1),
-        position=np.repeat(np.asarray(position, dtype=float)[:, None], n, axis=1),
+        velocity=velocity[:, None] + alike,
+        position=position[:, None] + alike,
         velocity_covariance=covariance(spread.velocity),
-        cross_covariance=np.zeros((3, 3, n)),
+        cross_covariance=xp.zeros((3, 3, n), dtype=q.dtype),
         position_covariance=covariance(spread.position),
     )
 
 
-def _about_the_vertical(n: int, draw: NumpyDraw) -> np.ndarray:
+def _about_the_vertical(n: int, draw: Any, xp: Any) -> Array:
     """Turns (4, n), one drawn in each of n equal arcs of the circle."""
-    half = math.pi * (np.arange(n) + draw.uniform("yaw", (n,))) / n
-    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)])
+    there = draw.uniform("yaw", (n,))
+    half = math.pi * (xp.asarray(np.arange(n), dtype=there.dtype) + there) / n
+    return xp.stack([xp.cos(half), 0.0 * half, 0.0 * half, xp.sin(half)])

@@ -151,6 +151,7 @@ class OnFlight:
         estimate: str | None = None,
         sizes: Mapping[str, int] | None = None,
         files: Mapping[str, Callable[[Result, Path], None]] | None = None,
+        begin: Callable[..., Mapping[str, Any]] | None = None,
         **settings: Any,
     ) -> Case:
         """The graph, built on the clocks of its inputs.
@@ -160,7 +161,7 @@ class OnFlight:
             inputs: by source; those that were needed if left out.
             estimate: the collected stream that it is of; the one that is scored if left out.
             sizes, settings: as for `build`.
-            files: as for `Case`.
+            files, begin: as for `Case`.
         """
         inputs = dict(self.inputs if inputs is None else inputs)
         noted = ["imu"] if "imu" in inputs else []
@@ -171,7 +172,7 @@ class OnFlight:
         built, said_of_late = built_for(self.graph, inputs, self.rewind, sizes, settings, smoothed=smoothed)
         self.notes.extend(said_of_late)
         named = given(estimate, getattr(score, "estimate", "belief"))
-        return Case(built, inputs, score, named, said(self.notes), given(files, {}))
+        return Case(built, inputs, score, named, said(self.notes), given(files, {}), begin)
 
 
 def on_flight(

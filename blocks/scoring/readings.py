@@ -60,6 +60,9 @@ AIDS = (*MEASURED, GnssFix, GnssPosition, GnssVelocity, GnssHeading, Height, Whe
 GAP, MEASURED_GAP = 4.0, 10.0
 """Of how many usual steps a gap is: of a control, and of a measurement, which must last a second, too."""
 
+FASTEST = 1e-5
+"""s, between readings of a control: less is of stamps that count something else than nanoseconds."""
+
 BURSTS = 0.02
 """The share of steps that must be waits for readings to come in bursts."""
 
@@ -199,13 +202,15 @@ def _within(name: str, series: Series, ranges: Ranges) -> tuple[Series, list[str
 
 
 def gap_notes(inputs: Mapping[str, Series], noted: Collection[str]) -> Iterator[str]:
-    """A note for each stream that has gaps; one for those of the same stamps.
+    """Notes on streams that have gaps, end early, or have stamps that no sensor has; once for equal stamps.
 
     Args:
         noted: streams whose gaps are noted already.
     """
-    seen = [inputs[name] for name in noted if name in inputs]
-    for name, series in inputs.items():
+    seen: list[Series] = []
+    one_time = pause(inputs) is None
+    last = max((int(s.stamp.max()) for s in inputs.values() if len(s)), default=0)
+    for name, series in sorted(inputs.items(), key=lambda item: item[0] not in noted):
         cls = _class(series)
         if (cls not in CONTROLS and cls not in AIDS) or any(
             np.array_equal(series.time, other.time) for other in seen
@@ -213,8 +218,27 @@ def gap_notes(inputs: Mapping[str, Series], noted: Collection[str]) -> Iterator[
             continue
         seen.append(series)
         wide, usual = gaps(series, control=cls in CONTROLS)
-        if len(wide):
+        if len(wide) and name not in noted:
             yield gap_note(name, wide, usual)
+        silent = (last - int(series.stamp.max())) * 1e-9 if len(series) else 0.0
+        if one_time and silent > max(MEASURED_GAP * usual, 1.0):
+            yield note(
+                "bridged", f"{name}: nothing of it in the last {silent:.3g} s (usual step {usual:.3g} s)"
+            )
+        if cls in CONTROLS:
+            yield from _stamp_notes(name, series, usual)
+
+
+def _stamp_notes(name: str, series: Series, usual: float) -> Iterator[str]:
+    """Notes on stamps of a control that are not those of its readings."""
+    if 0.0 < usual < FASTEST:
+        sentence = (
+            f"{name}: a reading each {usual:.3g} s: a stamp counts nanoseconds; do these count ms or us?"
+        )
+        yield note("warning", sentence)
+    elif not series.is_late and len(series) > 1 and usual > 2e-9 * float(np.median(np.diff(series.time))):
+        sentence = f"{name}: readings come in bursts, {usual:.3g} s apart: these stamps say when they arrived"
+        yield note("warning", f"{sentence}, not when they were read; stamp them at the sensor")
 
 
 def gaps(series: Series, *, control: bool = True) -> tuple[np.ndarray, float]:

@@ -128,18 +128,7 @@ class Scorer:
         for name, stream in streams.items():
             if self._sums_up(dict(leaves_of(stream.type))):
                 made[name] = nis_score(stream, end=end, name=f"{name}_score")
-        return made, self._read
-
-    def _read(self, result: Result) -> dict[str, float]:
-        found = {n: float(x[0]) for n, x in result[self.estimate].leaves.items()}
-        found["nees_low"], found["nees_high"] = chi_square_band(9)
-        for name, series in result.series.items():
-            if "nis_count" in series.leaves and series["nis_count"][0]:
-                front, said = name.removesuffix("innovation"), series[0]
-                found.update({front + n: float(x[0]) for n, x in series.leaves.items() if n != "nis_parts"})
-                band = chi_square_band(1, runs=max(round(float(said.nis_parts)), 1))
-                found[f"{front}nis_low"], found[f"{front}nis_high"] = band
-        return found
+        return made, Figures(self.estimate)
 
     def remarks(self, result: Result) -> tuple[str, ...]:
         """Notes on a run that the figures do not tell."""
@@ -168,6 +157,32 @@ class Scorer:
 
     def _compared(self, series: Series) -> dict[str, float]:
         return {} if self.truth is None else self.errors(series, self.truth, settle=self.settle)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Makes the figures of a run of what the blocks of its score give at its end.
+
+    Args:
+        estimate: the stream that was compared.
+    """
+
+    estimate: str
+
+    def __call__(self, result: Result) -> dict[str, float]:
+        return self.of({name: {n: x[-1] for n, x in s.leaves.items()} for name, s in result.series.items()})
+
+    def of(self, last: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+        """The figures, of the last values of each stream."""
+        found = {n: float(x) for n, x in last[self.estimate].items()}
+        found["nees_low"], found["nees_high"] = chi_square_band(9)
+        for name, sums in last.items():
+            if sums.get("nis_count"):
+                front = name.removesuffix("innovation")
+                found.update({front + n: float(x) for n, x in sums.items() if n != "nis_parts"})
+                band = chi_square_band(1, runs=max(round(float(sums["nis_parts"])), 1))
+                found[f"{front}nis_low"], found[f"{front}nis_high"] = band
+        return found
 
 
 def _whole(covariance: ArrayType | None) -> bool:

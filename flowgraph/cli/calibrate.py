@@ -12,7 +12,7 @@ from flowgraph.cli.app import app
 from flowgraph.cli.options import AsJson, Name, Settings, pairs
 from flowgraph.cli.terminal import err_console, out_console, print_json, reports_errors, writing
 from flowgraph.cli.tune import plain_parameters, said_of, shown, span
-from flowgraph.data.files import put
+from flowgraph.data.files import need_place, put
 
 
 @app.command()
@@ -49,6 +49,9 @@ def calibrate(
     # A fifth of a second, with worker pools, that `list` need not pay.
     from flowgraph.study.calibrate import calibrate as search
     from flowgraph.study.tune import Fit, Recording
+
+    if out is not None:
+        need_place(out)
 
     def watch(count: int, best: Any, value: float) -> None:
         err_console.print(f"{count} tried: {value:.6g} at {said_of(best)}", markup=False)

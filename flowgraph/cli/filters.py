@@ -48,7 +48,7 @@ from flowgraph.cli.terminal import (
     writing,
 )
 from flowgraph.data.export.text import write_tum
-from flowgraph.data.files import put
+from flowgraph.data.files import need_place, put
 from flowgraph.data.notes import note
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
@@ -84,6 +84,9 @@ def show(
     fold: Annotated[
         int | None, typer.Option(min=0, help="Draw graphs nested deeper than this as one box.")
     ] = None,
+    formats: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Number formats of `quantise`, to be drawn as well.")
+    ] = None,
     data: DataOrNone = None,
     truth: Truth = None,
     settings: Settings = None,
@@ -93,17 +96,30 @@ def show(
     """Draw a graph: in the terminal, or to a file; an .html is a page in which it unfolds."""
     from flowgraph.drawing.page import diagram_page  # only who draws needs what draws
     from flowgraph.pipeline.costs.places import costs_by_path
+    from flowgraph.pipeline.format_files import load_formats, with_formats
+    from flowgraph.pipeline.format_words import formats_by_path
+    from flowgraph.pipeline.lowering import lower
 
     built, inputs = graph_of(graph, one_flight(data), with_file(settings, settings_file), seed, truth)
+    words: dict[str, str] = {}
+    if formats is not None:
+        words = formats_by_path(with_formats(lower(built, dtype="fixed"), load_formats(formats)))
     if output is None:
         width = out_console.width if out_console.is_terminal else None
         print(in_characters_of(sys.stdout, plain(built.text(fold=fold, width=width, inputs=inputs))))
+        if words:
+            out_console.print(
+                table([{"path": path or built.name, "words": said} for path, said in words.items()])
+            )
         return
     with writing(output):
         if output.suffix.lower() == ".html":
-            diagram_page(built, output, fold=fold, costs=costs_by_path(built), inputs=inputs)
+            costs = costs_by_path(built)
+            for path, said in words.items():
+                costs.setdefault(path, {})["words"] = said
+            diagram_page(built, output, fold=fold, costs=costs, inputs=inputs)
         else:
-            built.draw(str(output), fold=fold, inputs=inputs)
+            built.draw(str(output), fold=fold, words=words, inputs=inputs)
 
 
 @app.command()
@@ -153,6 +169,8 @@ def run(
     forms = wanted_forms(export, out)
     if out is not None:
         make_ready(out)
+    if html is not None:
+        need_place(html)
     others = runs_before(html, beside)
     notes: dict[str, None] = {}
 

@@ -186,9 +186,12 @@ def with_file(settings: list[str] | None, file: Path | None) -> list[str]:
     for key, one in parameters.items():
         value = one.get("value") if isinstance(one, dict) else one
         try:
-            word = value if isinstance(value, str) else text(np.array(value, dtype=float))
+            numbers = value if isinstance(value, str) else np.array(value, dtype=float)  # NaN for None
+            if not isinstance(numbers, str) and not np.isfinite(numbers).all():
+                raise ValueError
         except (TypeError, ValueError):
-            raise wrong(got=f"{key}: {value!r}"[:200]) from None
+            raise wrong(got=f"{key}: {one!r}"[:200]) from None
+        word = text(numbers)
         if key not in named:
             given.append(f"{key}={word}")
     return given

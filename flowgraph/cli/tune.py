@@ -22,7 +22,7 @@ from flowgraph.cli.terminal import (
     table,
     writing,
 )
-from flowgraph.data.files import put
+from flowgraph.data.files import need_place, put
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError
 
@@ -76,6 +76,9 @@ def tune(
     later = [Recording(d, s) for d in data for s in range(seeds, seeds + held_out_seeds)]
     judges = later + [Recording(d) for d in held_out or []]
     hidden = quiet or as_json
+
+    if out is not None:
+        need_place(out)
 
     def watch(count: int, best: Any, value: float) -> None:
         err_console.print(f"{count} tried: {value:.6g} at {said_of(best)}", markup=False)
@@ -233,7 +236,7 @@ def span(given: str, option: str = "--fit") -> tuple[str, float, float, float | 
             path=option,
             expected="NAME=LOW:HIGH or NAME=LOW:HIGH:START",
             got=repr(given),
-            fix=f"write {option} position_noise=0.001:0.1",
+            fix=f"write {option} {name or 'position_noise'}=0.001:0.1",
         ) from None
     low, high, *start = numbers
     if not low < high or any(not low <= x <= high for x in start):

@@ -16,6 +16,7 @@ import numpy as np
 
 from flowgraph.data.notes import note
 from flowgraph.data.series import Flight, Series
+from flowgraph.data.tape import check_stamp
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.language.clock import nanoseconds
 from flowgraph.language.graph import NEVER
@@ -56,6 +57,7 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
         DeclarationError: for a latency below 0, a pair in the wrong order, an array of other than whole
             numbers, or an arrival beyond what int64 nanoseconds hold.
     """
+    _need_series("delayed", series)
     called = name or series.name
     if isinstance(latency, tuple) and len(latency) == 2:
         low, high = (nanoseconds(part, what="latency") for part in latency)
@@ -93,6 +95,18 @@ def delayed(series: Series, latency: Any, *, seed: int = 0, name: str | None = N
         count = np.arange(len(time))
         time = np.maximum.accumulate(time - count) + count
     return Series(time, moved.values, type=series.type, name=called, gaps=series.gaps, stamp=stamp)
+
+
+def _need_series(path: str, given: object) -> None:
+    """Refuse what is no recording of a stream."""
+    if not isinstance(given, Series):
+        raise DataError(
+            "this is no series",
+            path=path,
+            expected="a Series",
+            got=f"{type(given).__name__} {given!r}"[:80],
+            fix="write Series(time, values), or take flight.streams[name]",
+        )
 
 
 def _need_room(series: Series, by: int, path: str) -> None:
@@ -167,7 +181,7 @@ class Reordered(dict[str, Series]):
     late: dict[str, int]
 
 
-def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
+def reorder(inputs: Flight | Mapping[str, Any], max_lag: Any) -> Reordered:
     """Streams held back until they are in order: each value makes its tick `max_lag` after it was true.
 
     Ticks are as far apart as the stamps, so `dt` is right; what a graph then knows is `max_lag` old. A value
@@ -175,11 +189,12 @@ def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
     first that arrived is kept, and the other counted.
 
     Args:
-        inputs: series, or (times, values), by name; those that are not late are held back as well.
+        inputs: a flight; or series, or (times, values), by name. Those that are not late are held back too.
         max_lag: a duration such as "0.2s".
 
     Raises:
-        DeclarationError: for one below 0.
+        DeclarationError: for one below 0, or by which a time is beyond what int64 nanoseconds hold.
+        DataError: for what is no recording.
     """
     lag = nanoseconds(max_lag, what="max_lag")
     if lag < 0:
@@ -192,8 +207,20 @@ def reorder(inputs: Mapping[str, Any], max_lag: Any) -> Reordered:
         )
     made = Reordered()
     made.late = {}
-    for name, given in inputs.items():
-        series = given if isinstance(given, Series) else Series(*given, name=name)
+    streams = inputs.streams if isinstance(inputs, Flight) else inputs
+    if not isinstance(streams, Mapping):
+        raise DataError(
+            "these are no streams by name",
+            path="reorder",
+            expected="a Flight, or series by name",
+            got=f"{type(inputs).__name__} {inputs!r}"[:80],
+            fix='write reorder({"imu": series}, "0.2s")',
+        )
+    for name, given in streams.items():
+        pair = isinstance(given, tuple) and len(given) == 2
+        series = Series(*given, name=name) if pair else given
+        _need_series(f"reorder.{name}", series)
+        _need_room(series, lag, name)
         kept = series[series.time - series.stamp <= lag]
         kept = kept[np.argsort(kept.stamp, kind="stable")]
         kept = kept[np.concatenate([[True], np.diff(kept.stamp) > 0])[: len(kept)]]
@@ -228,6 +255,7 @@ def timeouts(
     Raises:
         DeclarationError: for an `after` of 0 or less.
     """
+    _need_series(name, series)
     span = nanoseconds(after, what="after")
     if span <= 0:
         raise DeclarationError(
@@ -237,8 +265,20 @@ def timeouts(
             got=repr(after),
             fix='write timeouts(series, "0.5s")',
         )
-    end = int(series.time[-1]) if until is None and len(series) else NEVER if until is None else int(until)
-    begin = 0 if start is None and not len(series) else start
+    end = (
+        int(series.time[-1])
+        if until is None and len(series)
+        else NEVER
+        if until is None
+        else check_stamp(f"{name}.until", until)
+    )
+    begin = (
+        0
+        if start is None and not len(series)
+        else None
+        if start is None
+        else check_stamp(f"{name}.start", start)
+    )
     awaited = series.time if begin is None else np.append(np.int64(begin), series.time[series.time > begin])
     last = awaited <= end - span  # of what has its timeout by then; written so that no sum is beyond int64
     due = awaited[last] + span
@@ -255,6 +295,7 @@ def batched(series: Series, function: Callable[[Any], Any], *, name: str | None 
         series: the recording.
         function: of all values, with the time axis in front, to as many.
     """
+    _need_series("batched", series)
     stamp = series.stamp if series.is_late else None
     made = function(series.values)
     return Series(series.time, made, name=name or series.name, gaps=series.gaps, stamp=stamp)
@@ -268,7 +309,8 @@ def replayed(series: Series, *, start: int, name: str | None = None) -> Series:
     Raises:
         DeclarationError: for a start from which a time is beyond what int64 nanoseconds hold.
     """
-    by = int(start) - int(series.time[0]) if len(series) else 0
+    _need_series("replayed", series)
+    by = check_stamp("replayed.start", start) - int(series.time[0]) if len(series) else 0
     _need_room(series, by, name or series.name)
     stamp = series.stamp + by if series.is_late else None
     return Series(

@@ -48,6 +48,10 @@ class Runs:
         """The fields are attributes too."""
         return sorted({*super().__dir__(), *(name for name in self.leaves if name.isidentifier())})
 
+    def __repr__(self) -> str:
+        runs, count = self.present.shape
+        return f"<Runs {self.name}: {runs} runs of {count} ticks, {', '.join(self.leaves)}>"
+
     def run(self, index: int) -> Series:
         """One run's stream, as a single run gives it (of the fields that were kept)."""
         at = self.present[index]

@@ -38,6 +38,27 @@ _EXPANDED = 32
 _ROOM = 2**24
 
 
+def need_place(file: str | Path) -> Path:
+    """Where a file will be written; refused before the work whose outcome it is to hold.
+
+    Raises:
+        OutputError: where it cannot be written.
+    """
+    with writes(file):
+        if "\0" in str(file):
+            raise OSError(errno.EINVAL, "a zero byte in the name")
+        place = Path(os.path.realpath(file))
+        if place.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "a folder is in its place")
+        if not place.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "there is no such folder")
+        if place.exists() and not os.access(place, os.W_OK):
+            raise PermissionError(errno.EACCES, "the file that is there is for reading only")
+        if not place.exists() and not os.access(place.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, "the folder is for reading only")
+    return place
+
+
 @contextmanager
 def whole(file: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO]:
     """A stream whose content takes the place of `file` when the block ends well, and is dropped otherwise.
@@ -52,18 +73,12 @@ def whole(file: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO]:
     Raises:
         OutputError: where it cannot be written; what was there before is then there still.
     """
+    place = need_place(file)
     with writes(file):
-        if "\0" in str(file):
-            raise OSError(errno.EINVAL, "a zero byte in the name")
-        place = Path(os.path.realpath(file))
         if place.exists() and not place.is_file():
-            if place.is_dir():
-                raise IsADirectoryError(errno.EISDIR, "a folder is in its place")
             with open(place, "wb") as stream:
                 yield stream
             return
-        if place.exists() and not os.access(place, os.W_OK):
-            raise PermissionError(errno.EACCES, "the file that is there is for reading only")
         part = place.with_name(_part_name(place.name))
         with _own(part) as stream:
             try:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from flowgraph.data.arrival import with_stamps
 from flowgraph.data.series import Flight, Series, unmasked
-from flowgraph.data.tape import need_near
+from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
 from flowgraph.language.graph import NEVER, Graph
@@ -62,9 +62,15 @@ def ticks(period: str | int, *, until: str | int, start: int = 0, name: str = "t
 
     Args:
         period, until: a duration such as "5ms", or integer nanoseconds; `until` counts from `start`.
+
+    Raises:
+        DeclarationError: for a period below 1 ns, or an `until` below 0. DataError: for a start that is no
+            whole number, or an end that int64 nanoseconds do not hold.
     """
-    step = nanoseconds(period, what="period")
-    time = np.arange(0, nanoseconds(until, what="until"), step, dtype=np.int64) + start
+    step, end = nanoseconds(period, what="period", least=1), nanoseconds(until, what="until", least=0)
+    begin = check_stamp(f"{name}.start", start)
+    check_stamp(f"{name}.until", begin + end)
+    time = np.arange(0, end, step, dtype=np.int64) + begin
     return Series(time, np.ones(len(time), dtype=bool), name=name)
 
 
@@ -103,17 +109,22 @@ def _broken_rows(series: Series) -> np.ndarray:
     return broken
 
 
-def need_inputs(graph: Graph, inputs: object) -> None:
-    """Refuse what is no graph, and inputs that are neither a flight nor data by source name."""
+def need_graph(graph: object, path: str) -> None:
+    """Refuse what is no graph."""
     if not isinstance(graph, Graph):
         getattr(graph, "sources", None)  # a @graph function says for itself that it was not built
         raise DeclarationError(
             "this is no graph",
-            path="simulate",
+            path=path,
             expected="a built graph",
             got=f"{type(graph).__name__} {graph!r}"[:80],
             fix="declare a function with @graph, and build it: f.build(...)",
         )
+
+
+def need_inputs(graph: Graph, inputs: object) -> None:
+    """Refuse what is no graph, and inputs that are neither a flight nor data by source name."""
+    need_graph(graph, "simulate")
     if not isinstance(inputs, Flight | Mapping):
         raise DataError(
             "these are no inputs",
@@ -224,13 +235,15 @@ def check_finite(name: str, series: Series) -> None:
         _not_finite(name, int(series.time[row]), f"row {row} ({int(broken.sum())} in all)")
 
 
-def _not_finite(name: str, time: int, where: str) -> None:
+def _not_finite(name: str, time: int, where: str, *, live: bool = False) -> None:
     raise DataError(
         "a value is not finite",
         path=f"{name}, {where}",
         expected="finite numbers",
         got=f"NaN or infinity at t = {time} ns",
-        fix='drop such events: arrays(time, values, not_finite="absent"), or "keep" NaN as data',
+        fix='start the run with not_finite="absent", or "keep" where NaN is data'
+        if live
+        else 'drop such events: arrays(time, values, not_finite="absent"), or "keep" NaN as data',
     )
 
 
@@ -316,31 +329,6 @@ def _as_declared(step: int, timing: Timing) -> bool:
     return timing.max_rate is None or step >= int(1e9 / timing.max_rate)
 
 
-def check_stamp(name: str, time: Any) -> int:
-    """A time as it arrives with an event, as an int.
-
-    Raises:
-        DataError: where it is no whole number of ns within 64 bits.
-    """
-    if not isinstance(time, int | np.integer) or isinstance(time, bool):
-        raise DataError(
-            "times must be integer nanoseconds",
-            path=name,
-            expected="an int",
-            got=f"{type(time).__name__} {time!r}",
-            fix="round float seconds once, at the source: round(seconds * 1e9)",
-        )
-    if not NEVER < time < 2**63:
-        raise DataError(
-            "this time does not fit 64 bits",
-            path=name,
-            expected="nanoseconds between -2^63 and 2^63, some 292 years to either side",
-            got=str(time) if abs(int(time)) < 10**30 else "a number of more than 30 digits",
-            fix="count nanoseconds from a nearer day",
-        )
-    return int(time)
-
-
 def check_event(
     name: str, time: Any, value: Any, type_: Type, timing: Timing, before: int
 ) -> tuple[int, Any]:
@@ -351,14 +339,19 @@ def check_event(
     return time, check_value(name, time, value, type_)
 
 
-def check_value(name: str, time: int, value: Any, type_: Type, not_finite: str = "raise") -> Any:
-    """The value of one event as read-only arrays; None for one that is not finite, where that is "absent"."""
+def check_value(name: str, time: int, value: Any, type_: Type, not_finite: str | None = None) -> Any:
+    """The value of one event as read-only arrays; None for one that is not finite, where that is "absent".
+
+    Args:
+        name, time, value, type_: the source, and the event.
+        not_finite: the rule of a live run; None where events are read as a recording goes.
+    """
     made = as_value(unmasked(value, name, np.float64), type_, path=f"source {name}")
     for leaf in flatten(made, type_):
         if leaf.dtype.kind == "f" and not_finite != "keep" and not np.isfinite(leaf).all():
             if not_finite == "absent":
                 return None
-            _not_finite(name, time, "this event")
+            _not_finite(name, time, "this event", live=not_finite is not None)
     return made
 
 

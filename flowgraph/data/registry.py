@@ -50,6 +50,10 @@ class Case:
             `order`, the convention of the graph's own angles, in which pictures draw them: "zyx" or "zxy".
         estimate: name of the collected stream that the score and the pictures are of.
         notes: what was assumed when it was made ready, a sentence each; see `flowgraph.data.notes`.
+        begin: where the start follows from the flight, what makes it in a graph under construction, of which
+            the flight is a part: `(first, at) -> {register: stream}`, each present where `at` is, at the
+            first tick; `first(name)` is what a stream of the flight, or "truth", is there. `study.whole`
+            checks that this is the start that the graph was built with.
         files: what `--out` writes beside what it writes of every run: by name, what writes a result to a
             path.
     """
@@ -60,6 +64,7 @@ class Case:
     estimate: str = "belief"
     notes: tuple[str, ...] = ()
     files: Mapping[str, Callable[[Result, Path], None]] = field(default_factory=dict)
+    begin: Callable[..., Mapping[str, Any]] | None = None
 
     @property
     def order(self) -> str:

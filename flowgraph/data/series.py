@@ -66,7 +66,7 @@ class Series:
         stamps = _array(time, name)
         if stamps.dtype.kind in "mM":
             stamps = _from_dates(stamps, name)
-        if stamps.dtype.kind not in "iu":
+        if stamps.size and stamps.dtype.kind not in "iu":
             raise DataError(
                 "times must be integer nanoseconds",
                 path=name,
@@ -114,15 +114,14 @@ class Series:
     @classmethod
     def from_seconds(cls, seconds: npt.ArrayLike, values: Any, **more: Any) -> Series:
         """A series from float seconds, each rounded once to the nearest nanosecond."""
-        stamps = np.rint(np.asarray(seconds, dtype=np.float64) * 1e9)
+        given = _array(seconds, f"{more.get('name', 'series')}: time", np.float64)
+        stamps = np.rint(given * 1e9)
         if not (np.abs(stamps) < 2.0**63).all():
             raise DataError(
                 "a time is not finite, or beyond what int64 nanoseconds hold",
-                path=str(more.get("name", "series")),
-                expected="seconds below 9.2e9",
-                got=repr(float(np.asarray(seconds, dtype=np.float64)[~(np.abs(stamps) < 2.0**63)][0])),
-                fix="drop such rows at the source",
-            )
+                path=str(more.get("name", "series")), expected="seconds below 9.2e9",
+                got=repr(float(given[~(np.abs(stamps) < 2.0**63)][0])), fix="drop such rows at the source",
+            )  # fmt: skip
         return cls(stamps.astype(np.int64), values, **more)
 
     @classmethod

@@ -17,7 +17,7 @@ import numpy as np
 
 from flowgraph.data.series import Series
 from flowgraph.errors import DataError
-from flowgraph.language.graph import Graph
+from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
 
 _WIDE = 64
@@ -67,6 +67,31 @@ class Tape:
         seen = np.zeros(1 << len(self.series), bool)
         seen[self.key] = True
         return tuple(np.flatnonzero(seen).tolist())
+
+
+def check_stamp(name: str, time: Any) -> int:
+    """A time as it arrives with an event, as an int.
+
+    Raises:
+        DataError: where it is no whole number of ns within 64 bits.
+    """
+    if not isinstance(time, int | np.integer) or isinstance(time, bool):
+        raise DataError(
+            "times must be integer nanoseconds",
+            path=name,
+            expected="an int",
+            got=f"{type(time).__name__} {time!r}",
+            fix="round float seconds once, at the source: round(seconds * 1e9)",
+        )
+    if not NEVER < time < 2**63:
+        raise DataError(
+            "this time does not fit 64 bits",
+            path=name,
+            expected="nanoseconds between -2^63 and 2^63, some 292 years to either side",
+            got=str(time) if abs(int(time)) < 10**30 else "a number of more than 30 digits",
+            fix="count nanoseconds from a nearer day",
+        )
+    return int(time)
 
 
 def need_near(first: int, time: int) -> None:

@@ -68,6 +68,7 @@ def draw(
     rankdir: str = "LR",
     fold: int | None = None,
     legend: bool = True,
+    words: Mapping[str, str] | None = None,
     inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str | Path:
     """Draw the block diagram.
@@ -78,6 +79,7 @@ def draw(
         rankdir: which way values flow: "LR" left to right, "TB" top to bottom, "RL" or "BT".
         fold: graphs nested deeper than this are drawn as one box: 0 folds all of them, None none.
         legend: whether to say below the title what the kinds of arrow mean.
+        words: a line more for the box of a path, such as its number formats; under "" for the title.
         inputs: what the sources are fed; of one whose values arrive late the diagram says so.
 
     Raises:
@@ -90,9 +92,10 @@ def draw(
     ending = ".svg" if path is None else path.suffix.lower()
     if ending not in ENDINGS:
         raise UnknownNameError("file ending", ending, ENDINGS, path=str(file))
-    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend, inputs=inputs)
+    source = dot_source(graph, rankdir=rankdir, fold=fold, legend=legend, words=words, inputs=inputs)
     if ending == ".html":
-        return diagram_page(graph, file, fold=fold, rankdir=rankdir, inputs=inputs)
+        costs = {at: {"words": line} for at, line in (words or {}).items()}
+        return diagram_page(graph, file, fold=fold, rankdir=rankdir, costs=costs, inputs=inputs)
     if path is None:
         text = _render(source, "svg").decode()
         return text[text.index("<svg") :]  # without the XML prolog, so that it can stand in a page
@@ -148,12 +151,13 @@ def dot_source(
     rankdir: str = "LR",
     fold: int | None = None,
     legend: bool = True,
+    words: Mapping[str, str] | None = None,
     inputs: Flight | Mapping[str, Any] | None = None,
 ) -> str:
     """The diagram in the DOT language; the arguments are those of `draw`."""
     if rankdir not in COMPASS:
         raise UnknownNameError("rankdir", rankdir, COMPASS, path=graph.name)
-    return _Diagram(graph, rankdir, fold, lateness_words(inputs)).source(legend)
+    return _Diagram(graph, rankdir, fold, words or {}, lateness_words(inputs)).source(legend)
 
 
 def _plain(text: str) -> str:
@@ -187,8 +191,15 @@ def _attributes(label: str = "", **attributes: object) -> str:
 class _Diagram:
     """One drawing of one graph: who is visible after folding, and the DOT statements for it."""
 
-    def __init__(self, graph: Graph, rankdir: str, fold: int | None, lateness: Mapping[str, str]) -> None:
-        self.graph, self.rankdir, self.lateness = graph, rankdir, lateness
+    def __init__(
+        self,
+        graph: Graph,
+        rankdir: str,
+        fold: int | None,
+        words: Mapping[str, str],
+        lateness: Mapping[str, str],
+    ) -> None:
+        self.graph, self.rankdir, self.words, self.lateness = graph, rankdir, words, lateness
         self.folded = folded_scopes(graph, fold)
         self.open = [s for s in graph.scopes if fold is None or scope_depth(graph, s) < fold]
         self.links = list(links(graph))
@@ -225,6 +236,8 @@ class _Diagram:
         rows = [_font(self.graph.name, size=15, colour=INK, tag="b")]
         if doc := doc_words(self.graph.doc):
             rows.append(_font(shorten(doc, 110), size=10))
+        if "" in self.words:
+            rows.append(_font(self.words[""], size=10))
         notes = ["dashed: read one tick later"] if any(link.feedback for link in self.links) else []
         notes += ["hollow arrow: may be absent"] if any(link.optional for link in self.links) else []
         notes += ["dotted: only fires"] if triggers(self.graph) else []
@@ -268,18 +281,22 @@ class _Diagram:
         if node.path != node.clock.name:
             tip = f"when the values of {node.clock.name} were true: {node.type}, with each of them"
         shape = {"TB": "invhouse", "BT": "house"}.get(self.rankdir, "cds")
-        label = f"<b>{_escaped(node.path)}</b>"
+        label = f"<b>{_escaped(node.path)}</b>{self.below(node.path)}"
         if late := self.lateness.get(node.path):
             label += f"<br/>{_font(late)}"
             tip += f", {late}"
         margin = "0.14,0.12" if late else "0.14,0.08"
         return self.node(node.path, "source", label, shape, tip, margin=margin)
 
+    def below(self, path: str) -> str:
+        """A line under a name, where there is one more to say."""
+        return f"<br/>{_font(self.words[path], size=8)}" if path in self.words else ""
+
     def register_node(self, node: RegisterNode, scope: str) -> str:
         name = name_in(scope, node.path)
         role = "" if re.fullmatch(rf"{node.role}(_\d+)?", name) else f"{node.role}, "
         start = _font(f"{role}init {initial_words(node)}", size=8)
-        label = f"{_font(name, size=10, colour=INK, tag='b')}<br/>{start}"
+        label = f"{_font(name, size=10, colour=INK, tag='b')}<br/>{start}{self.below(node.path)}"
         tip = f"{node.role} {node.path}: {node.type}"
         return self.node(node.path, "register", label, "cylinder", tip, margin="0.08,0.05")
 
@@ -294,6 +311,7 @@ class _Diagram:
         name, host = name_in(scope, call.path), call.block.host
         rows = [f"<tr><td><b>{_escaped(name)}</b></td></tr>"]
         notes = [block_words(call, name), shorten(firing_words(self.graph, call), 44), "on the host" * host]
+        notes.append(self.words.get(call.path, ""))
         rows += [f"<tr><td>{_font(note, tag='i')}</td></tr>" for note in notes if note]
         chip = queue_words(call)
         if call.state is not None and not chip:

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flowgraph.data.inputs import NOT_FINITE, check_stamp, check_value, periods_lost, rule_of
-from flowgraph.data.tape import need_near
+from flowgraph.data.inputs import NOT_FINITE, check_value, periods_lost, rule_of
+from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, UnknownNameError
 from flowgraph.language.graph import Graph
 
@@ -55,6 +55,25 @@ class Entrance:
         self.lost = dict.fromkeys(graph.sources, 0)
         self.absent = dict.fromkeys(graph.sources, 0)
 
+    def events(self, time: Any, values: Mapping[str, Any]) -> list[tuple[str, int, Any]]:
+        """The source, stamp and value of each event of one push, checked as `value` does.
+
+        Raises:
+            DataError: for a push without events, and as of `value`.
+        """
+        self._need_events(values)
+        return [(name, *self.value(name, time, value)) for name, value in values.items()]
+
+    def _need_events(self, values: Mapping[str, Any]) -> None:
+        if not values:
+            raise DataError(
+                "a tick needs an event",
+                path=self._graph.name,
+                expected="a value for one source or more: " + ", ".join(self._graph.sources),
+                got="none",
+                fix="call push(time, name=value)",
+            )
+
     def value(self, name: str, time: Any, value: Any) -> tuple[int, Any]:
         """The stamp and value of one event, checked; the value is None where it is absent.
 
@@ -78,14 +97,7 @@ class Entrance:
         Raises:
             DataError, ClockError, TypeMismatchError, UnknownNameError: for an event that is refused.
         """
-        if not values:
-            raise DataError(
-                "a tick needs an event",
-                path=self._graph.name,
-                expected="a value for one source or more: " + ", ".join(self._graph.sources),
-                got="none",
-                fix="call push(time, name=value)",
-            )
+        self._need_events(values)
         key, lost = 0, {}
         found: list[tuple[int, Any]] = []
         absent = []

@@ -22,7 +22,7 @@ from typing import Any
 
 from flowgraph.data.arrival import stamp_events
 from flowgraph.data.columns import Columns
-from flowgraph.data.inputs import Inputs, prepare, rule_of
+from flowgraph.data.inputs import Inputs, need_graph, prepare, rule_of
 from flowgraph.data.notes import note
 from flowgraph.data.percentiles import Durations
 from flowgraph.data.result import Result, statistics
@@ -32,10 +32,12 @@ from flowgraph.engines.contract import BlockEngine
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.mailbox import POLICIES, Event, Mailboxes, Order
 from flowgraph.engines.options import RunOptions
+from flowgraph.engines.pace import Pace
 from flowgraph.engines.registry import find_engine
 from flowgraph.engines.stepping import stepper
 from flowgraph.engines.watched import Watch, Watcher
 from flowgraph.errors import ClockError, DataError
+from flowgraph.language.checks import need_callable, need_count, need_numbers
 from flowgraph.language.clock import nanoseconds
 from flowgraph.language.graph import Graph, SourceNode, Wire
 from flowgraph.types import flatten, unflatten
@@ -109,17 +111,12 @@ class Live:
         thread: bool = True,
         watcher: Watcher | None = None,
     ) -> None:
+        need_graph(graph, "Live")
         self.graph, self._engine = graph, engine
         rule_of("full", full, POLICIES)
         rule_of("record", record, RECORDED)
-        if queue < 1:
-            raise DataError(
-                "a queue holds one event or more",
-                path="queue",
-                expected="1 or more",
-                got=str(queue),
-                fix="leave it out for 1024",
-            )
+        need_callable("Live", on_output=on_output)
+        need_count("Live", "queue", queue, least=1)
         options = RunOptions(engine=engine, dtype=dtype, init=init, state=state, seed=seed)
         self._watch = None if watcher is None else Watch(graph, watcher)
         self._blocks = self._watch is not None and isinstance(find_engine(engine), BlockEngine)
@@ -134,10 +131,10 @@ class Live:
         last = {n: int(t) for n, t in self._steps.state["sources"].items()}
         self._entrance = Entrance(graph, last, not_finite)
         self._boxes = Mailboxes(len(self._names), queue, full)
-        held = 0 if lateness == 0 else nanoseconds(lateness, what="lateness")
+        held = nanoseconds(lateness, what="lateness", least=0)
         self._order = Order(len(self._names), held, queue * len(self._names), self._steps.time)
         self._patience = held * 1e-9 if held else None
-        self._deadline = None if deadline is None else nanoseconds(deadline, what="deadline")
+        self._deadline = None if deadline is None else nanoseconds(deadline, what="deadline", least=1)
         self._missed, self._unclocked = 0, dict.fromkeys(self._names, 0)
         self._times = [Durations(), Durations(), Durations()]
         gaps = not_finite == "keep"
@@ -151,7 +148,7 @@ class Live:
         self._error: BaseException | None = None
         self._ended = False
         self._notes: dict[str, str] = {}
-        self._wall, self._alone = 0.0, RLock()
+        self._pace, self._wall, self._alone = Pace(), 0.0, RLock()
         self._turn, self._queued = Lock(), asyncio.Lock()
         self._thread = Thread(target=self._run, name=f"live {graph.name}", daemon=True) if thread else None
         if self._thread is not None:
@@ -172,13 +169,15 @@ class Live:
             FlowgraphError: what ended the run, where it has ended.
         """
         arrived = perf_counter_ns()
-        checked = [(name, *self._entrance.value(name, time, value)) for name, value in values.items()]
+        if timeout is not None:
+            need_numbers(self.graph.name, not_negative={"timeout": timeout})
+        checked = self._entrance.events(time, values)
         return self._put(checked, arrived, timeout)
 
     async def push_async(self, time: int, /, **values: Any) -> bool:
         """As `push`, from an event loop, which goes on while a full queue blocks; none overtakes another."""
         arrived = perf_counter_ns()
-        checked = [(name, *self._entrance.value(name, time, value)) for name, value in values.items()]
+        checked = self._entrance.events(time, values)
         places = [self._names.index(name) for name, _, _ in checked]
         if not self._queued.locked() and self._boxes.have_room(places):
             return self._put(checked, arrived, None)
@@ -315,6 +314,7 @@ class Live:
             sentence = f"{full.path}: {full.message}; its oldest values give way"
             self._notes[str(full.path)] = note("counted", sentence)
         self._entrance.done(admitted)
+        self._pace.tick(stamp, events[0].arrived)
         if self._record != "nothing":
             for k, value in admitted.values:
                 self._arrived[k].add(stamp, flatten(value, self._types[k]))
@@ -375,7 +375,7 @@ class Live:
         state = self._steps.state
         series = {name: c.series() for c, (name, _) in zip(self._made, self._outputs, strict=True)}
         stats = {**statistics(self.graph, state), **{kind: n for kind, n in self.counts.items() if n}}
-        notes = (*self._notes.values(), *self._count_notes())
+        notes = (*self._notes.values(), *self._count_notes(), *self._pace.notes())
         return Result(
             self.graph.name, self._engine, series, state, stats, self._steps.ticks, self._wall, notes
         )

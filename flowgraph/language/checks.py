@@ -54,6 +54,19 @@ def need_count(operation: str, name: str, n: object, *, least: int, most: int = 
     return n
 
 
+def need_callable(where: str, **given: object) -> None:
+    """Refuse what is to be called, by its name, and cannot be; None, which is left out, passes."""
+    for name, function in given.items():
+        if function is not None and not callable(function):
+            raise DeclarationError(
+                f"{name!r} is no function",
+                path=f"{where}.{name}",
+                expected="a function",
+                got=repr(function)[:80],
+                fix=f"write {name}=function, without calling it",
+            )
+
+
 MOST = 1e9
 """No setting of a filter is as large, in SI units; its square is still a number."""
 

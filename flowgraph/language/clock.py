@@ -22,27 +22,37 @@ from flowgraph.errors import ClockError, DeclarationError
 _UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 
 
-def nanoseconds(duration: str | int, *, what: str = "duration") -> int:
+def nanoseconds(duration: str | int, *, what: str = "duration", least: int | None = None) -> int:
     """Nanoseconds from "5ms", "1.25us", "2s" or an integer count of nanoseconds.
 
     Raises:
-        DeclarationError: where the text is not a number and one of ns, us, ms, s, or is beyond 64 bits.
+        DeclarationError: where the text is not a number and one of ns, us, ms, s, or is beyond 64 bits; or
+            for less than `least` ns.
     """
     if isinstance(duration, int) and not isinstance(duration, bool):
-        return _in_64_bits(duration, duration, what)
+        return _in_range(duration, duration, what, least)
     match = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*(ns|us|ms|s)\s*", str(duration))
     if match is None or isinstance(duration, float):
         raise DeclarationError(
             f"{what} is not understood",
+            path=what,
             expected='a text such as "5ms", "20us", "0.25s", or integer nanoseconds',
             got=repr(duration),
             fix=f'write {what}="5ms"',
         )
     number = float(match[1]) * _UNITS[match[2]]
-    return _in_64_bits(round(number) if number < 2.0**64 else 2**64, duration, what)
+    return _in_range(round(number) if number < 2.0**64 else 2**64, duration, what, least)
 
 
-def _in_64_bits(number: int, given: object, what: str) -> int:
+def _in_range(number: int, given: object, what: str, least: int | None) -> int:
+    if least is not None and number < least:
+        raise DeclarationError(
+            f"{what} is too short",
+            path=what,
+            expected=f"{least} ns or more",
+            got=repr(given),
+            fix=f'write {what}="5ms"',
+        )
     if not -(2**63) <= number < 2**63:
         raise DeclarationError(
             f"{what} is too long",

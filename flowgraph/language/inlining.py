@@ -7,24 +7,34 @@ register or an output of it still finds it there, and steps are not recorded ane
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 from flowgraph.errors import ClockError, UnknownNameError
 from flowgraph.language.builder import Builder
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
-from flowgraph.language.stream import Stream
+from flowgraph.language.joins import merge
+from flowgraph.language.stream import Held, Stream
 from flowgraph.types import check_fits
 
 
-def inlined(build: Builder, graph: Graph, streams: Mapping[str, Stream[Any]]) -> dict[str, Stream[Any]]:
+def inlined(
+    build: Builder,
+    graph: Graph,
+    streams: Mapping[str, Stream[Any]],
+    starts: Mapping[str, Stream[Any]] | None = None,
+) -> dict[str, Stream[Any]]:
     """Add the nodes of a built graph to one under construction.
 
     Args:
         build: the graph under construction.
         graph: what is added.
         streams: one for each of its sources, of the same type and at the same clock.
+        starts: by register, a stream that is present at the first tick alone, or at the first few: what is
+            read of the register there is this.
 
     Returns:
         The streams that it collects, by name. They are not collected in `build`.
@@ -69,7 +79,34 @@ def inlined(build: Builder, graph: Graph, streams: Mapping[str, Stream[Any]]) ->
                 )
             )
     build.scopes.extend(graph.scopes)
+    paths = {node.path: where[index] for index, node in graph.registers}
+    for name, start in (starts or {}).items():
+        if name not in paths:
+            raise UnknownNameError("register", name, list(paths), path=f"{build.name}/{graph.name}")
+        _begin(build, paths[name], start, sorted(where.values()))
     return {c.name: build.stream(wire(c.wire)) for c in graph.collected}
+
+
+def _begin(build: Builder, register: int, start: Stream[Any], places: list[int]) -> None:
+    """Have those that read a register read a start in its place, where there is one."""
+    reading = {}
+    for place in places:
+        node = build.nodes[place]
+        if isinstance(node, CallNode) and any(a.register == register for a in node.arguments):
+            reading[place] = node
+    if not reading:
+        return
+    node = build.nodes[register]
+    assert isinstance(node, RegisterNode)
+    clock = reduce(operator.or_, (reader.firing for reader in reading.values()))
+    held: Held[Any] = Held(build, register, node.type, node.path)
+    first = merge(start, held.at(clock), tie="left")
+    check_fits(first.type, node.type, given_at=first.label, wanted_at=node.path, sizes={})
+    for place, reader in reading.items():
+        moved = tuple(
+            Argument(first.wire, None, a.optional) if a.register == register else a for a in reader.arguments
+        )
+        build.nodes[place] = replace(reader, arguments=moved)
 
 
 def _places(build: Builder, graph: Graph) -> dict[int, int]:

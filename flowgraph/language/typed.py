@@ -17,12 +17,14 @@ nor take any away. Therefore
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, Never, ParamSpec, TypeAlias, TypeVar, overload
 
-from flowgraph.language.block import Block
+from flowgraph.errors import DeclarationError
+from flowgraph.language.block import HANDED_IN, Block
 from flowgraph.language.stream import Held, Stream
 
 A = TypeVar("A")
@@ -142,9 +144,48 @@ def typed_block(step: Callable[..., Any], /) -> Any:
 
     Returns:
         The `Block`. `block.wired(at=..., name=...)` is it with what is said of its place in the graph.
+
+    Raises:
+        DeclarationError: for what type checkers would get wrong where the block is called.
     """
+    _need_checkable(step)
     frame = sys._getframe(1)
     return Block(step, local=None if frame.f_locals is frame.f_globals else frame.f_locals)
+
+
+def _need_checkable(step: Callable[..., Any]) -> None:
+    """Refuse a function whose calls type checkers cannot check."""
+    path = getattr(step, "__name__", repr(step))
+    parameters = list(inspect.signature(step).parameters.values())
+    ports = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if not 1 <= len(ports) <= 4:
+        raise DeclarationError(
+            "a typed block has one to four ports",
+            path=path,
+            expected="1 to 4 positional parameters",
+            got=str(len(ports)),
+            fix="write @block, whose calls are not checked; or make one signal of several",
+        )
+    for p in parameters:
+        if p.annotation is p.empty and p.name not in HANDED_IN:
+            raise DeclarationError(
+                f"{p.name!r} has no type for a checker to check",
+                path=path,
+                expected="an annotation for each port and setting",
+                got=f"{p.name} alone",
+                fix=f"write {p.name}: Scalar, or what it is",
+            )
+        if p.name in HANDED_IN and p.default is p.empty and p not in ports:
+            kind, default = ("Namespace", "np") if p.name == "xp" else ("float", "0.0")
+            raise DeclarationError(
+                f"{p.name!r} is handed in by the engine, and a checker would want it of whoever calls",
+                path=path,
+                expected="a default, which is never used",
+                got=f"{p.name} without one",
+                fix=f"write {p.name}: {kind} = {default}"
+                if p.name in ("dt", "t", "xp")
+                else f"write {p.name}: Any = None",
+            )
 
 
 __all__ = ["Namespace", "typed_block"]

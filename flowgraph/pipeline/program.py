@@ -6,7 +6,7 @@ instructions that only the other side needed disappear. Without one, presence st
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -59,6 +59,15 @@ class Program:
                 sure.update(i.args[:1] if i.op == "where" else i.args)
         others = (i for i in reversed(self.instructions) if i.op == "where" or i.out not in sure)
         return frozenset(sure), tuple(others)
+
+    @cached_property
+    def users(self) -> Mapping[int, tuple[Instruction, ...]]:
+        """By value, the instructions that take it."""
+        found: dict[int, list[Instruction]] = {}
+        for i in self.instructions:
+            for a in set(i.args):
+                found.setdefault(a, []).append(i)
+        return {n: tuple(some) for n, some in found.items()}
 
     @property
     def work(self) -> int:
@@ -179,6 +188,46 @@ def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
                     continue
             taken[a] = m if before is None else True if m is True else before | m
     return taken
+
+
+def needed_of(program: Program, env: Mapping[int, Any], values: Iterable[int]) -> dict[int, Any]:
+    """What `needed` says of some values alone, found from these on: quick where they are few."""
+    sure, _ = program.surely
+    ends = {n for flag, leaves in program.outputs if flag is not None and env.get(flag, True) for n in leaves}
+    known: dict[int, Any] = {}
+
+    def of(n: int) -> Any:
+        """The mask of a value: True, or False for none, or by element."""
+        if n in known:
+            return known[n]
+        mask: Any = n in sure or n in ends
+        for i in () if mask is True else program.users.get(n, ()):
+            whole = of(i.out)
+            if whole is False:
+                continue
+            for place, a in enumerate(i.args):
+                if a != n:
+                    continue
+                m = whole
+                if i.op == "where" and place:
+                    chosen = np.asarray(env[i.args[0]], bool)
+                    m = (chosen if place == 1 else ~chosen) & whole
+                elif i.op != "where" and i.op not in ELEMENTWISE:
+                    m = True
+                if m is not True:
+                    m = _reduced(np.broadcast_to(m, i.spec.shape), np.shape(env[n]))
+                mask = True if m is True or mask is True else mask | m
+            if mask is True:
+                break
+        known[n] = mask = mask if mask is True or np.any(mask) else False
+        return mask
+
+    asked = set(values)
+    try:
+        return {n: mask for n in asked if (mask := of(n)) is not False}
+    except RecursionError:  # a chain of a thousand that nothing surely takes
+        found = needed(program, env)
+        return {n: found[n] for n in asked if n in found}
 
 
 def _reduced(mask: Any, shape: tuple[int, ...]) -> Any:

@@ -161,6 +161,7 @@ _SLOPES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "log2": lambda xp, x, y: float(1.0 / np.log(2.0)) / x,
     "sin": lambda xp, x, y: xp.cos(x),
     "cos": lambda xp, x, y: -xp.sin(x),
+    "unnormalized_sinc": lambda xp, x, y: (xp.cos(x) - y) / _nonzero(xp, x),
     "tan": lambda xp, x, y: 1.0 + y * y,
     "asin": lambda xp, x, y: _inverse_root(xp, 1.0 - x * x),
     "acos": lambda xp, x, y: -_inverse_root(xp, 1.0 - x * x),

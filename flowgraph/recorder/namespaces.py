@@ -1,4 +1,4 @@
-"""NumPy as the engines use it: the array API, and the two operations that pipelines add to it."""
+"""NumPy as the engines use it: the array API, and the operations that pipelines add to it."""
 
 from __future__ import annotations
 
@@ -51,8 +51,18 @@ def _one_by_one(function: Any, shape: tuple[int, ...], *matrices: Any) -> Any:
     return found
 
 
+LEAST_ANGLE = 1e-30
+"""Below it a sine is its angle, in every precision."""
+
+
+def unnormalized_sinc(x: Any, xp: Any) -> Any:
+    """sin(x) / x, and 1 at 0, of what `xp` has as floating-point numbers: never 0/0, and without a branch."""
+    size = xp.maximum(xp.abs(x), LEAST_ANGLE)
+    return xp.sin(size) / size
+
+
 class NumpyNamespace:
-    """`numpy` with `float32_bits` and `materialise`.
+    """`numpy` with `float32_bits`, `unnormalized_sinc` and `materialise`.
 
     On small arrays a function's Python wrapper costs more than its work. Where blocks meet that often, the
     wrapper is passed by.
@@ -94,6 +104,11 @@ class NumpyNamespace:
     def float32_bits(x: Any) -> Any:
         """The bits of the IEEE binary32 number nearest to each int32, as int32: octave and leading bits."""
         return np.asarray(x).astype(np.float32).view(np.int32)
+
+    @staticmethod
+    def unnormalized_sinc(x: Any, /) -> Any:
+        """sin(x) / x, and 1 at 0."""
+        return unnormalized_sinc(x, np)
 
     @staticmethod
     def materialise(x: Any) -> Any:

@@ -50,11 +50,14 @@ class Op:
 
 _OF_ONE = "sqrt exp expm1 log log1p log2 sin cos tan asin acos atan sinh cosh tanh"
 _OF_TWO = "atan2 hypot copysign"
+SINC = "unnormalized_sinc"
+"""sin(x) / x, and 1 at 0. NumPy's `sinc` is another function: of pi x."""
+
 FUNCTIONS = frozenset(f"{_OF_ONE} {_OF_TWO}".split())
 """Functions of real numbers; C has them under the same names."""
 
-_UNARY = f"""abs negative sign square positive {_OF_ONE} floor ceil round trunc logical_not isfinite isnan
-bitwise_invert"""
+_UNARY = f"""abs negative sign square positive {_OF_ONE} {SINC} floor ceil round trunc logical_not
+isfinite isnan bitwise_invert"""
 """Those among the operations element by element that take one argument; the others take two."""
 
 
@@ -365,7 +368,7 @@ def _table() -> dict[str, Op]:
 
     each("add multiply maximum minimum abs", _elementwise(None), "same")
     each("subtract remainder floor_divide pow negative sign square positive", _numeric, "same")
-    each(f"divide {_OF_TWO} {_OF_ONE}", _elementwise("real"), "real")
+    each(f"divide {_OF_TWO} {_OF_ONE} {SINC}", _elementwise("real"), "real")
     each("floor ceil round trunc", _numeric, "same")
     each("equal not_equal less less_equal greater greater_equal", _elementwise("bool"), "same")
     each("logical_and logical_or logical_xor logical_not", _elementwise("bool"), "bool")

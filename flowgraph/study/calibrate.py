@@ -158,7 +158,10 @@ def calibrate(
     if of_truth:
         likely = _Tried(problem, watch)
         likely.places = places
-        notes += [w for f in offsets for w in _other_clock(f, found, deviations[f.name], likely)]
+        for f in offsets:
+            said, spread = _by_likelihood(f, found, deviations[f.name], likely)
+            notes += said
+            deviations[f.name] = spread
         count += likely.count
     return Calibrated(graph, found, deviations, count, guesses, tuple(dict.fromkeys(notes)))
 
@@ -180,20 +183,23 @@ def _truth_stays(problem: Trials, offsets: Sequence[Fit]) -> bool:
     )
 
 
-def _other_clock(
+def _by_likelihood(
     f: Fit, found: Mapping[str, Parameter], deviation: float | None, likely: _Tried
-) -> list[str]:
-    """A note where the likelihood says another offset than the truth."""
+) -> tuple[list[str], float | None]:
+    """A note where the likelihood says another offset than the truth; and the deviation of what the truth
+    says, to which that of the likelihood is added: the curve of an error tells none of the sensors' noise."""
     here = float(found[f.name])
     try:
         there, spread, inside = _vertex(f, _WIDTHS[-1], found, likely)
     except DataError:
-        return []  # without innovations there is nothing to say
-    sure = math.hypot(deviation or 0.0, spread or 0.0)
+        return [], deviation  # without innovations there is nothing to say
+    if deviation is None or spread is None:
+        return [], deviation
+    sure = math.hypot(deviation, spread)
     if not inside or abs(there - here) <= max(3.0 * sure, _ONE_CLOCK):
-        return []
+        return [], sure
     said = f"{f.name}: the truth says {here:.4f} s, the likelihood {there:.4f} s"
-    return [note("info", f"{said}: the clock of the truth is not the inertial unit's")]
+    return [note("info", f"{said}: the clock of the truth is not the inertial unit's")], sure
 
 
 def _apart(

@@ -246,9 +246,9 @@ def _run(
             runner.submit(task.name, run_task, task)
         for finished in runner.as_completed():
             task = work.pop(finished.task)
-            for one, safe in _ended(finished, task, work, runner):
-                if safe:
-                    store.write(one.key, one.row, one.trajectory)
+            ended = _ended(finished, task, work, runner)
+            store.write((one.key, one.row, one.trajectory) for one, safe in ended if safe)
+            for one, _ in ended:
                 rows[one.key] = one.row
                 done += 1
                 watcher.row(one.row)
@@ -267,13 +267,14 @@ def _run(
 
 def _there(study: Study, store: Store, planned: Plan, retry: bool) -> dict[str, Row]:
     found = {}
+    kept = store.read(run.key for run in planned.runs)
     for run in planned.runs:
-        row = store.read(run.key)
-        if row is None or (retry and row.get("error") is not None):
+        one = kept.get(run.key)
+        if one is None or (retry and one.row.get("error") is not None):
             continue
-        if study.keep and row.get("error") is None and not store.has_trajectory(run.key):
+        if study.keep and one.row.get("error") is None and not store.has_trajectory(one):
             continue
-        found[run.key] = row
+        found[run.key] = one.row
     return found
 
 

@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from flowgraph.errors import DeclarationError, MissingDependencyError
 
@@ -229,9 +230,27 @@ class ProcessPool(_Closing):
         self._waiting.clear()
 
 
-def serve(descriptor: int) -> None:
-    """What a worker process does: run tasks from its connection until that is closed."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+def serve(descriptor: int) -> NoReturn:
+    """What a worker process does: run tasks from its connection until that is closed.
+
+    It ends there and then, for taking all that it has loaded apart would keep its study waiting.
+    """
+    code = 0
+    try:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        _serve(descriptor)
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    with suppress(OSError, ValueError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code)
+
+
+def _serve(descriptor: int) -> None:
     with Connection(descriptor) as connection:
         while True:
             try:

@@ -43,8 +43,9 @@ FIGURES = (POSITION, ATTITUDE, RELATIVE, DECISIONS)
 MARGIN = 2.0
 """The sizes that occurred times this fit their formats, if nobody says otherwise."""
 
-_ROUNDS = 10
-_WIDER = 4.0
+_ROUNDS = 30
+_WIDER, _WIDEST = 2, 16
+"""Bits by which the format of what saturates is widened: twice as many each time that it happens again."""
 
 Say = Callable[[str], None]
 
@@ -167,6 +168,7 @@ class _Search:
         self._margin, self._say = margin, say
         self.pipeline = self._flights[0].pipeline
         self.notes: list[str] = []
+        self._more: dict[int, int] = {}
         self._worst = Counts()
         first = structure_of(self.pipeline)
         for one in (*self._flights, *self._held):
@@ -200,7 +202,7 @@ class _Search:
 
     def _player(self, formats: Formats, flights: Sequence[_Ready]) -> CompiledIntegers:
         patterns = sorted({key for one in (*self._flights, *self._held) for key in one.tape.patterns})
-        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns)
+        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns, tabled=True)
 
     def _widened(self, player: CompiledIntegers, flights: Sequence[_Ready], where: str, bits: int) -> bool:
         counts = Counts()
@@ -211,7 +213,8 @@ class _Search:
     def _widen(self, counts: Counts, where: str, bits: int) -> bool:
         """Widen the formats of what saturated; tells whether anything did."""
         for value, marks in counts.cut.items():
-            self.sizes.widen(value, marks, _WIDER)
+            more = self._more[value] = min(2 * self._more.get(value, _WIDER // 2), _WIDEST)
+            self.sizes.widen(value, marks, 2.0**more)
         if counts.cut:
             names = names_of(self.pipeline)
             some = ", ".join(names[v] for v in list(counts.cut)[:3])

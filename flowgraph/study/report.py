@@ -23,7 +23,7 @@ from flowgraph.study.charts import pictures, ratios
 from flowgraph.study.shown import chosen as chosen_runs
 from flowgraph.study.shown import shown_again
 from flowgraph.study.statistics import compared, differing, metrics_of, quantiles
-from flowgraph.study.store import Store, is_key, put_inside, read_study, read_table
+from flowgraph.study.store import Store, put_inside, read_study, read_table
 
 WORST = 10
 PAGE, FIGURES = "report.html", "figures"
@@ -191,10 +191,12 @@ def _worst(rows: Sequence[Mapping[str, Any]], names: list[str], metric: str, sto
         and math.isfinite(r[metric])
     ]  # fmt: skip
     lines = []
-    for row in sorted(usable, key=lambda r: -r[metric])[:WORST]:
+    worst = sorted(usable, key=lambda r: -r[metric])[:WORST]
+    kept = store.read(row["key"] for row in worst)
+    for row in worst:
         line: dict[str, Any] = {**_setting(row, names), metric: row[metric]}
         line["run again"] = Raw(f"<code>{safe(_command(row, names))}</code>")
-        if is_key(row["key"]) and store.has_trajectory(row["key"]):
+        if row["key"] in kept and store.has_trajectory(kept[row["key"]]):
             file = store.trajectory_file(row["key"]).relative_to(store.folder)
             line["trajectory"] = Raw(f'<a href="{safe(file.as_posix())}">{safe(row["key"][:8])}.npz</a>')
         lines.append(line)

@@ -1,14 +1,15 @@
-"""Results on disk: one file a run, named by its key, that is either whole or not there; and the table of all.
+"""Results on disk: a line a run, written as it ends, and the table of all.
 
-A file is written under a temporary name in the same folder and then renamed, which the file system does at
-once or not at all. It also carries a digest of its content, for a disk that lost power can leave a whole name
-on half a file; what does not agree with its digest is no result, and is run again. It holds the digest of
-its trajectory as well. The folder is locked while a study runs into it, and a second is refused.
+Lines are only ever added, so what is killed leaves all but its last line whole. Each carries a digest of its
+row; what does not agree with it is no result, and is run again. It holds the digest of its trajectory as
+well. Of two lines of one run the later counts. Other files are written under a temporary name and then
+renamed, which the file system does at once or not at all. The folder is locked while a study runs into it,
+and a second is refused.
 
     DIR/study.json               the resolved study
     DIR/study.lock               while it runs: which process on which machine
+    DIR/runs.jsonl               a run that has ended a line
     DIR/results.parquet          a row a run
-    DIR/runs/ab/abcd....json     one run
     DIR/trajectories/abcd....npz what a run estimated, where the study keeps it
 """
 
@@ -20,8 +21,10 @@ import json
 import os
 import re
 import socket
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +36,11 @@ from flowgraph.errors import DataError, MissingDependencyError, OutputError, wri
 from flowgraph.study.keys import content_digest
 from flowgraph.study.spec import MOST_RUNS, Study
 
-RESULTS, RESOLVED, LOCK = "results.parquet", "study.json", "study.lock"
+RESULTS, RESOLVED, LOCK, RUNS = "results.parquet", "study.json", "study.lock", "runs.jsonl"
 Row = dict[str, Any]
+
+MOST_LINE = 2**24
+"""Bytes of the longest line of a run that is read."""
 
 MOST_KEPT = 2**33
 """Bytes of the largest trajectory that is read."""
@@ -75,6 +81,31 @@ def is_key(text: Any) -> bool:
     return isinstance(text, str) and re.fullmatch("[0-9a-f]{16,128}", text) is not None
 
 
+@dataclass(frozen=True)
+class Kept:
+    """A run that was kept: its row, and the digest of its trajectory where it has one."""
+
+    key: str
+    row: Row
+    trajectory: str | None = None
+
+
+def _kept(line: bytes) -> Kept | None:
+    """The run of a line; None where it is not whole."""
+    try:
+        found = json.loads(line)
+        key, row = found["key"], found["row"]
+        whole = is_key(key) and isinstance(row, dict) and found["digest"] == content_digest(row)
+        return Kept(key, row, found.get("trajectory")) if whole else None
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return None
+
+
+def _waiting_for_nobody(file: str, flags: int) -> int:
+    """Open a file; a pipe in its place has nobody at its other end, and is not waited for."""
+    return os.open(file, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
+
+
 class Store:
     """The folder of one study's results.
 
@@ -84,9 +115,6 @@ class Store:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-
-    def run_file(self, key: str) -> Path:
-        return self.folder / "runs" / key[:2] / f"{key}.json"
 
     def trajectory_file(self, key: str) -> Path:
         return self.folder / "trajectories" / f"{key}.npz"
@@ -112,36 +140,46 @@ class Store:
                 )
             yield
 
-    def read(self, key: str) -> Row | None:
-        """The row of a run; None where there is none that is whole."""
-        found = self._kept(key)
-        return None if found is None else found["row"]
+    def read(self, keys: Iterable[str]) -> dict[str, Kept]:
+        """What there is, whole, of the runs of these keys."""
+        wanted, found = set(keys), {}
+        with suppress(OSError), open(self.folder / RUNS, "rb", opener=_waiting_for_nobody) as stream:
+            while stat.S_ISREG(os.fstat(stream.fileno()).st_mode) and (line := stream.readline(MOST_LINE)):
+                kept = _kept(line)
+                if kept is not None and kept.key in wanted:
+                    found[kept.key] = kept
+        return found
 
-    def _kept(self, key: str) -> dict[str, Any] | None:
-        try:
-            found = json.loads(content_of(self.run_file(key)))
-            row = found["row"]
-            whole = found["key"] == key and found["digest"] == content_digest(row)
-        except (OSError, ValueError, LookupError, TypeError, RecursionError):
-            return None
-        return found if whole and isinstance(row, dict) else None
+    def write(self, runs: Iterable[tuple[str, Row, bytes | None]]) -> None:
+        """Keep runs, each with its key and perhaps its trajectory, which comes first, so that no row names
+        one that is not there.
 
-    def write(self, key: str, row: Row, trajectory: bytes | None = None) -> None:
-        """Keep a run: its trajectory first, so that a row never names one that is not there."""
-        plain = json.loads(json.dumps(row))  # what is digested is what will be read
-        content = {"key": key, "digest": content_digest(plain), "row": plain}
-        if trajectory is not None:
-            put_inside(self.trajectory_file(key), trajectory)
-            content["trajectory"] = hashlib.sha256(trajectory).hexdigest()
-        put_inside(self.run_file(key), json.dumps(content).encode())
+        Raises:
+            OutputError: where they cannot be written.
+        """
+        lines = []
+        for key, row, trajectory in runs:
+            plain = json.loads(json.dumps(row))  # what is digested is what will be read
+            content = {"key": key, "digest": content_digest(plain), "row": plain}
+            if trajectory is not None:
+                put_inside(self.trajectory_file(key), trajectory)
+                content["trajectory"] = hashlib.sha256(trajectory).hexdigest()
+            lines.append(json.dumps(content).encode() + b"\n")
+        file = self.folder / RUNS
+        with writes(file), open(file, "ab+", buffering=0, opener=_waiting_for_nobody) as stream:
+            size = stream.seek(0, os.SEEK_END)
+            torn = size > 0 and os.pread(stream.fileno(), 1, size - 1) != b"\n"
+            left = memoryview(b"\n" * torn + b"".join(lines))
+            while left:
+                left = left[stream.write(left) :]
 
-    def has_trajectory(self, key: str) -> bool:
+    def has_trajectory(self, kept: Kept) -> bool:
         """Whether the whole trajectory of this very run is there."""
         try:
-            found = hashlib.sha256(content_of(self.trajectory_file(key), most=2**40)).hexdigest()
+            content = content_of(self.trajectory_file(kept.key), most=2**40)
         except OSError:
             return False
-        return (self._kept(key) or {}).get("trajectory") == found
+        return hashlib.sha256(content).hexdigest() == kept.trajectory
 
     def write_study(self, resolved: Mapping[str, Any]) -> None:
         """Keep the resolved study; a file of that name that is none is somebody else's.

@@ -224,20 +224,27 @@ def _together(task: Task, program: Any, lanes: list[_Lane], keep: tuple[str, ...
         start = perf_counter()
         cases, seeds = [lane.case for lane in lanes], [lane.run.seed for lane in lanes]
         options = task.options.but(keep=keep, diverged="count")  # one that diverges leaves the others be
-        results = simulate_together(cases, seeds, program, options)
+        batch = _played(cases, seeds, program, options)
         share = (perf_counter() - start) / len(lanes)
     except Exception as error:
         if len(lanes) == 1:
             return [_failed(lanes[0].run, error)]
         return [done for lane in lanes for done in _together(task, program, [lane], keep)]
     found = []
-    for lane, result in zip(lanes, results, strict=True):
+    brief = getattr(cases[0].score, "of", None)  # of the last values alone
+    for k, lane in enumerate(lanes):
         lane.times["run_s"] = share
-        if result.notes and task.options.diverged == "raise":
-            found.append(Done(lane.run.key, {**_named(lane.run), "error": "; ".join(result.notes)}))
+        if k in batch.diverged and task.options.diverged == "raise":
+            why = note("diverged", batch.diverged[k])
+            found.append(Done(lane.run.key, {**_named(lane.run), "error": why}))
             continue
         try:
-            found.append(_scored(task, lane, result))
+            if brief is None or task.keep:
+                found.append(_scored(task, lane, _result(lane.case.graph, batch, k)))
+            else:
+                start = perf_counter()
+                last = {n: {x: a[k, -1] for x, a in s.leaves.items()} for n, s in batch.series.items()}
+                found.append(_row(task, lane, brief(last), batch.ticks, start))
         except Exception as error:
             found.append(_failed(lane.run, error))
     return found
@@ -250,16 +257,19 @@ def simulate_together(
 
     Only the streams of `options.keep` come back.
     """
+    batch = _played(cases, seeds, program, options)
+    return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
+
+
+def _played(cases: Sequence[Case], seeds: Sequence[int], program: Any, options: RunOptions) -> Batch:
     graph = _program(cases[0].graph.name, program, cases[0].graph)
     streams: Any = [_streams(case, graph) for case in cases]
     start: Any = None
     whole = any(cases[0] is one for one in _wholes.values())
     if whole and all(case is cases[0] for case in cases):  # but for the seeds they are one run
         streams, start = streams[0], start_of(cases[0].graph)
-    batch = run_many(
-        graph, streams, seeds, options.but(init=start or [start_of(case.graph) for case in cases])
-    )
-    return [_result(case.graph, batch, k) for k, case in enumerate(cases)]
+    starts = start or [start_of(case.graph) for case in cases]
+    return run_many(graph, streams, seeds, options.but(init=starts))
 
 
 def _read(case: Case) -> tuple[str, ...] | None:
@@ -318,15 +328,21 @@ def _result(graph: Graph, batch: Batch, k: int) -> Result:
 
 def _scored(task: Task, lane: _Lane, result: Result) -> Done:
     start = perf_counter()
-    run, score = lane.run, lane.case.score(result)
-    values = {n: _plain(v) for n, v in {**score, **result.stats}.items()}
+    score = lane.case.score(result)
+    kept = pack_trajectory(result.series) if task.keep else None
+    return _row(task, lane, {**score, **result.stats}, result.ticks, start, kept)
+
+
+def _row(
+    task: Task, lane: _Lane, score: Mapping[str, Any], ticks: int, start: float, kept: bytes | None = None
+) -> Done:
+    run, values = lane.run, {n: _plain(v) for n, v in score.items()}
     lane.times["score_s"] = perf_counter() - start
-    row = {**_named(run), **_chosen(values, task.metrics, run), "ticks": result.ticks, "error": None}
+    row = {**_named(run), **_chosen(values, task.metrics, run), "ticks": ticks, "error": None}
     astray = [n for n, v in values.items() if isinstance(v, float) and not math.isfinite(v)]
     if astray:
         row["error"] = f"the estimate went astray: {astray[0]} is {values[astray[0]]}"
     row.update(lane.times, wall_s=sum(lane.times.values()))
-    kept = pack_trajectory(result.series) if task.keep else None
     return Done(run.key, row, kept)
 
 

@@ -17,11 +17,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from flowgraph.data.registry import find_graph, flight_settings
-from flowgraph.data.settings import parsed_settings, text
+from flowgraph.data.settings import keyword_types, parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter
@@ -200,13 +201,15 @@ def start_of_fit(graph: str, fit: Fit) -> Parameter:
     return 0.5 * (fit.low + fit.high) if fit.scale == "linear" else math.sqrt(fit.low * fit.high)
 
 
-def _wrong(place: str, expected: str, got: object, *, verb: str = "tune") -> DeclarationError:
+def _wrong(
+    place: str, expected: str, got: object, *, verb: str = "tune", fix: str | None = None
+) -> DeclarationError:
     return DeclarationError(
         f"this cannot be {verb.removesuffix('e')}ed",
         path=f"{verb}, {place}",
         expected=expected,
         got=repr(got),
-        fix=f"mend {place}",
+        fix=fix or f"mend {place}",
     )
 
 
@@ -242,6 +245,9 @@ def check_fits(
         raise wrong("data", "one recording or more", "none")
     prepare = find_graph(graph).prepare
     for fit in fits:
+        of_flight = any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out))
+        if prepare is not None and not of_flight and not placed(fit.name):
+            _need_name(prepare, graph, fit.name)
         numbers = [fit.low, fit.low if fit.start is None or np.ndim(fit.start) else fit.start, fit.high]
         least = -math.inf if fit.scale == "linear" else 0.0
         if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers) or not (
@@ -260,7 +266,11 @@ def check_fits(
         if np.ndim(matrix) == 2 and not _is_covariance(matrix):
             raise wrong(f"fit {fit.name}", "a start that is a covariance", matrix)
         if fit.name in settings or sum(f.name == fit.name for f in fits) > 1:
-            raise wrong(f"fit {fit.name}", "each parameter once, and not set as well", fit.name)
+            again = f"--set {fit.name}, or its bounds" if fit.name in settings else "all but one of them"
+            raise wrong(
+                f"fit {fit.name}", "each parameter once, and not set as well", fit.name,
+                fix=f"leave out {again}",
+            )  # fmt: skip
         if fit.name in getattr(prepare, "scoring", ()):
             raise wrong(
                 f"fit {fit.name}", "a setting of the filter; this one changes how a run is scored", fit.name
@@ -270,10 +280,25 @@ def check_fits(
                 if not flight_part(r.data, {fit.name: fit.low}):
                     raise UnknownNameError("setting", fit.name, flight_settings(r.data), path=r.data)
             continue
-        if any(flight_part(r.data, {fit.name: fit.low}) for r in (*recordings, *held_out)):
-            raise wrong(f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name)
+        if of_flight:
+            own = ", ".join(keyword_types(prepare)) if prepare is not None else "of the graph"
+            raise wrong(
+                f"fit {fit.name}", "a setting of the graph that is none of the flight", fit.name,
+                fix=f"choose one of {own}",
+            )  # fmt: skip
         if prepare is not None:
             parsed_settings(prepare, {fit.name: text(start_of_fit(graph, fit))}, also=(), path=graph)
+
+
+def _need_name(prepare: Any, graph: str, name: str) -> None:
+    """Refuse the name of no setting before anything is said of its bounds."""
+    try:
+        parsed_settings(prepare, {name: "1.0"}, also=(), path=graph)
+    except UnknownNameError as error:
+        valid = [*error.valid, *(f"STREAM.{part}" for part in PLACED)]
+        raise UnknownNameError("setting", name, valid, path=graph) from None
+    except DeclarationError:
+        return  # of another kind of value
 
 
 def _bounds_mended(fit: Fit) -> str:

@@ -125,10 +125,11 @@ def _compared(pipeline: Any, flown: Flown, seconds: float) -> tuple[int, int]:
     subject = LoweredGraph(flown.graph)
     start = subject.start(RunOptions(seed=flown.seed))
     events = subject.tape(flown.inputs, start.last)
+    patterns = sorted(events.patterns)
     events = events.first(int(np.searchsorted(events.time, events.time[0] + int(seconds * 1e9))))
     players = (
         ENGINE.prepare(pipeline, events.patterns, len(events.time), "fixed", ()),
-        CompiledIntegers(pipeline, events.patterns),
+        CompiledIntegers(pipeline, patterns, tabled=True),
     )
     ours, theirs = (p.play(events, start.cells, seed_words(flown.seed), None) for p in players)
     count = differing = 0

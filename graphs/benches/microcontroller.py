@@ -118,13 +118,13 @@ def _rows(
         )
         write_fixed(replace(found.pipeline, formats=found.formats), folder)
         file = f"{pipeline.name}_fixed.c"
-        takes = "(int64_t *w, uint8_t *off, int64_t *lost, int key)"
-        names = ("w", "off", "lost", "key")
+        takes = "(int32_t *v, int64_t *w, int64_t *count, int key)"
+        names = ("v", "w", "count", "key")
         functions = [
             Metered(f"int {f}{takes}", f, names, "key", f == "fx_end") for f in ("fx_compute", "fx_end")
         ]
-        tables: tuple[str, ...] = ("fx_first",)
-        ram = "FX_WORDS * sizeof(int64_t) + FX_WORDS + 1 + (FX_COUNTERS + 1) * sizeof(int64_t)"
+        tables: tuple[str, ...] = ("fx_begin",)
+        ram = "FX_SMALL * sizeof(int32_t) + (FX_WIDE + 3) * sizeof(int64_t)"
     else:
         write_c(pipeline, folder, dtype)
         source = generate(pipeline, dtype, tidy=lambda program: optimise(program, COMPILED))

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from tests.bench import (
     derived_c,
+    further_run,
     generated_c,
     imports,
     inertial,
@@ -57,6 +58,7 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
         studies.seeds_of_ekf,
         {"runs": 8, "sample": 2, "duration": 2.0, "chunk": 4, "repeats": 1},
     ),
+    "study-more-run": (further_run.rows, {"runs": 4, "repeats": 1, "factor": 0.5}),
     "study-memory": (study_memory.rows, {"sizes": (4, 8), "duration": 1.2}),
     "pages": (pages.rows, {"duration": 2.0, "repeats": 1}),
     "import": (imports.import_time, {"repeats": 1}),

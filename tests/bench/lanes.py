@@ -26,7 +26,7 @@ BOUNDS = {kalman: 0.6, ekf: 0.45, ins_eskf: 0.45}
 """The share of the vector width that must be reached."""
 
 
-def rows(*, duration: float = 20.0, repeats: int = 5) -> list[Row]:
+def rows(*, duration: float = 4.0, repeats: int = 51) -> list[Row]:
     """Ticks a second of one core: lanes, and one run."""
     return [_row(graph, share, duration, repeats) for graph, share in BOUNDS.items()]
 

@@ -1,7 +1,9 @@
 """A row of the benchmark's table, and the timing behind it: medians of interleaved pairs.
 
 On a machine that is shared, speeds drift by a factor over seconds. So ours and the peer take turns, A B A B,
-and what is compared is the median of the ratios of neighbours, not the ratio of two medians.
+and what is compared is the median of the ratios of neighbours, not the ratio of two medians. A piece that
+lasts longer than a turn of the system's scheduler measures other programs too: better
+many short ones.
 """
 
 from __future__ import annotations

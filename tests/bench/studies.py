@@ -2,7 +2,7 @@
 
 There are two comparisons. In the first both are given the recorded flights and are warm: `recorded` says
 what is within the time that counts. In the second both make each flight, filter it and score all of it; ours
-is the whole study, to a table on disk, its processes started and its program compiled within the time that
+is the whole study, to a table on disk, planned and its program lowered and loaded within the time that
 counts. Of the peer's runs only a sample is done.
 """
 
@@ -147,17 +147,18 @@ def recorded(runs: int, sample: int, duration: float, chunk: int, repeats: int) 
 def whole(runs: int, sample: int, duration: float, chunk: int) -> Row:
     """A study from nothing to its table, in C; what either spends on making flights is in it.
 
-    Ours flies `sim:figure`, where world, filter and score are one graph and start alike; the peer's flights
-    are the same figures by the loader of `sim`, whose share of a run is `peer_load_share`.
+    Ours flies `sim:figure`, where world, filter and score are one graph and start alike, in the process that
+    leads and as many threads as there are processors; the peer's flights are the same figures by the loader
+    of `sim`, whose share of a run is `peer_load_share`.
     """
     parameters = {"duration": duration, "start": "truth"}
     study = Study(
-        graphs=["ekf"], data=["sim:figure"], seeds=runs, engine="c", chunk=chunk, parameters=parameters
+        graphs=["ekf"], data=["sim:figure"], seeds=runs, engine="c", chunk=8 * chunk, parameters=parameters
     )
     before = _pool(sample, duration)
     with tempfile.TemporaryDirectory() as folder:
         start = perf_counter()
-        done = run_study(study, folder, workers=WORKERS)
+        done = run_study(study, folder)
         spent = perf_counter() - start
     assert not done.failed
     after = _pool(sample, duration)  # before and after, for the speed of a shared machine drifts

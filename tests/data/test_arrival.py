@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import (
+    Flight,
     Run,
     Scalar,
     Series,
@@ -256,3 +257,37 @@ def test_a_recording_is_worked_on_whole_and_played_again():
     assert (np.diff(again.time) == np.diff(FIX.time)).all()
     assert (again.time - again.stamp == 5 * MS).all()
     assert not replayed(FIX, start=0).is_late
+
+
+def test_what_is_no_recording_is_refused():
+    for wrong in ([1, 2], None, (IMU.time, np.zeros(40))):
+        for refused in (
+            lambda w: delayed(w, "5ms"),
+            lambda w: timeouts(w, "5ms"),
+            lambda w: batched(w, abs),
+            lambda w: replayed(w, start=0),
+        ):
+            with pytest.raises(DataError, match="this is no series(.*\\n)*.*expected: +a Series"):
+                refused(wrong)
+    with pytest.raises(DataError, match="reorder.imu: this is no series"):
+        reorder({"imu": iter([(0, 1.0)])}, "5ms")
+    with pytest.raises(DataError, match="reorder: these are no streams by name"):
+        reorder(IMU, "5ms")  # type: ignore[arg-type]
+
+
+def test_a_flight_is_reordered_as_its_streams():
+    flight = Flight("late", {"fix": delayed(FIX, ("0ms", "60ms"))})
+    assert (reorder(flight, "60ms")["fix"].stamp == FIX.time).all()
+    assert reorder(flight, "60ms").late == {"fix": 0}
+
+
+def test_times_that_are_none_are_refused():
+    for wrong in (0.5, 1e4, True):
+        with pytest.raises(DataError, match="replayed.start: times must be integer nanoseconds"):
+            replayed(FIX, start=wrong)  # type: ignore[arg-type]
+        with pytest.raises(DataError, match="timeouts.until: times must be integer nanoseconds"):
+            timeouts(FIX, "5ms", until=wrong)  # type: ignore[arg-type]
+        with pytest.raises(DataError, match="timeouts.start: times must be integer nanoseconds"):
+            timeouts(FIX, "5ms", start=wrong)  # type: ignore[arg-type]
+    with pytest.raises(DeclarationError, match="beyond what int64 nanoseconds hold"):
+        reorder({"fix": Series([2**63 - 5], np.ones(1))}, "1s")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from flowgraph import OutputError
-from flowgraph.data.files import arrays_of, claimed, content_of, put, put_new, text_of, whole
+from flowgraph.data.files import arrays_of, claimed, content_of, need_place, put, put_new, text_of, whole
 
 
 def test_a_block_that_fails_leaves_what_was_there_and_nothing_else(tmp_path):
@@ -94,6 +94,15 @@ def test_where_nothing_can_be_written_the_error_is_ours(tmp_path, kind):
         put(tmp_path / place, "text")
     assert caught.value.path == str(tmp_path / place)
     assert sorted(os.listdir(tmp_path)) == ["d", "file"]
+
+
+def test_a_place_is_refused_before_anything_is_written_there(tmp_path):
+    (tmp_path / "d").mkdir()
+    for place in ("d", "x/y", "x\0y"):
+        with pytest.raises(OutputError, match="this cannot be written"):
+            need_place(tmp_path / place)
+    assert need_place(tmp_path / "d" / "new") == (tmp_path / "d" / "new").resolve()
+    assert sorted(os.listdir(tmp_path)) == ["d"]
 
 
 def test_a_full_disk_leaves_what_was_there(tmp_path):

@@ -9,6 +9,7 @@ from flowgraph import (
     Array,
     ClockError,
     DataError,
+    DeclarationError,
     Flight,
     Scalar,
     Series,
@@ -22,6 +23,7 @@ from flowgraph import (
     periodic,
     real,
     simulate,
+    ticks,
     timing_of,
 )
 from tests.support import pairs, scalars
@@ -227,3 +229,21 @@ def test_the_users_arrays_are_not_changed_by_a_run():
     values = np.arange(4.0)
     simulate(copy.build(), {"x": (np.arange(4), values)})
     assert values.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_ticks_that_are_none_are_refused():
+    for period in (0, "0s", -5):
+        with pytest.raises(DeclarationError, match="period: period is too short(.*\\n)*.*1 ns or more"):
+            ticks(period, until="1s")
+    with pytest.raises(DeclarationError, match="until: until is too short"):
+        ticks("5ms", until=-5)
+    with pytest.raises(DataError, match="ticks.start: times must be integer"):
+        ticks("5ms", until="1s", start=0.5)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="ticks.until: this time does not fit 64 bits"):
+        ticks("100ms", until="1s", start=2**63 - 10)
+    assert not len(ticks("5ms", until=0))
+
+
+def test_seconds_that_are_no_numbers_are_refused():
+    with pytest.raises(DataError, match="fix: time: this is no array of numbers"):
+        Series.from_seconds(["a", "b"], np.zeros(2), name="fix")

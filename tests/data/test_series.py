@@ -118,3 +118,10 @@ def test_what_a_graph_needs_of_a_flight():
     assert "imu, gps" in str(missing.value)
     with pytest.raises(DataError, match="'vicon' is empty"):
         flight.need("ekf", "imu", "vicon")
+
+
+@pytest.mark.parametrize("time", [[], (), np.zeros(0), np.zeros(0, np.int32)])
+def test_no_times_are_whole_nanoseconds_of_any_kind(time):
+    none = Series(time, np.zeros((0, 3)))
+    assert len(none) == 0
+    assert none.time.dtype == np.int64

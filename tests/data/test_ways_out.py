@@ -132,6 +132,20 @@ def test_a_run_is_read_back_from_mcap_with_the_standard_schemas(flown, tmp_path)
     assert len(found["/position_innovation"]) == len(result.position_innovation)
 
 
+@pytest.mark.parametrize("shape", [(), (2,), (3, 3)])
+def test_a_stream_without_values_is_a_topic_without_messages(shape, tmp_path):
+    reader = pytest.importorskip("mcap.reader", reason="needs the extra mcap")
+    write_mcap(
+        {"none": Series([], np.zeros((0, *shape))), "one": Series([5], np.ones((1, *shape)))}, tmp_path / "a"
+    )
+    with open(tmp_path / "a", "rb") as stream:
+        found = [channel.topic for _, channel, _ in reader.make_reader(stream).iter_messages()]
+        stream.seek(0)
+        topics = {c.topic for c in reader.make_reader(stream).get_summary().channels.values()}
+    assert found == ["/one"]
+    assert topics == {"/none", "/one"}
+
+
 def test_what_is_said_of_a_run_is_in_the_mcap(flown, tmp_path):
     reader = pytest.importorskip("mcap.reader", reason="needs the extra mcap")
     flown[1].to_mcap(tmp_path / "a.mcap")

@@ -7,12 +7,21 @@ and the traceback shows the line.
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+from typer.main import get_command
+
+from flowgraph.cli import app
+from flowgraph.data.registry import find_graph, graph_names
+from flowgraph.data.settings import keyword_types
+from flowgraph.study.tune import placed
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -71,3 +80,42 @@ def test_a_python_block_is_closed_and_starts_at_the_margin() -> None:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         assert len(re.findall(r"```\s*py", text)) == len(list(blocks(text))), page.name
+
+
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """The words after `flowgraph` of each command of a page, with its place."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for fence in re.finditer(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+            for line in fence[1].replace("\\\n", " ").splitlines():
+                for part in line.split("&&"):
+                    words = shlex.split(part, comments=True)
+                    if words and words[0].rpartition("/")[2] == "flowgraph":
+                        yield f"{page.name}: {line}", words[1:]
+
+
+def wrong_in(words: list[str]) -> list[str]:
+    """The options of a command that it has not, and the parameters to find that its graph has not."""
+    command: Any = get_command(app)
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    known = {option for parameter in command.params for option in parameter.opts}
+    wrong = [w for w in words if w.startswith("-") and w.partition("=")[0] not in known]
+    sought = [b.partition("=")[0] for a, b in pairwise(words) if a in ("--fit", "--find")]
+    if sought and words[0] in graph_names():
+        prepare = find_graph(words[0]).prepare
+        assert prepare is not None
+        wrong += [n for n in sought if not placed(n) and n.replace(".", "_") not in keyword_types(prepare)]
+    return wrong
+
+
+def test_the_commands_of_the_pages_have_the_options_that_are_written() -> None:
+    found = list(commands())
+    assert len(found) > 30
+    assert {place: wrong for place, words in found if (wrong := wrong_in(words))} == {}
+
+
+def test_a_command_with_an_option_that_is_not_there_is_found() -> None:
+    assert wrong_in(["tune", "ins_eskf", "--fit", "gyro_noise=1:2", "--most", "3"]) == ["gyro_noise"]
+    assert wrong_in(["run", "ins_eskf", "--dta", "sim"]) == ["--dta"]
+    assert wrong_in(["tune", "ins_eskf", "--fit", "gyro_factor=1:2"]) == []

@@ -164,6 +164,7 @@ def test_a_batch_shows_itself_and_its_streams_are_attributes(run: tuple[Graph, R
     assert "value" in dir(batch.y)
     assert "value" in dir(batch.y.run(0))
     assert "3 runs of 2 ticks" in " ".join(_Whole(batch._repr_html_()).text)
+    assert repr(batch.y) == "<Runs y: 3 runs of 2 ticks, value>"
     assert repr(batch) == "<Batch of doubled (reference): 3 runs of 2 ticks, y>"
     with pytest.raises(AttributeError, match="no output is called 'z'"):
         _ = batch.z

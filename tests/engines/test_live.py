@@ -33,6 +33,7 @@ from flowgraph import (
     stamp_of,
 )
 from flowgraph.engines.mailbox import Event, Mailboxes, Order
+from flowgraph.engines.pace import Pace
 from tests.support import MS, scalars
 
 ENGINES = ("python", "c")
@@ -274,8 +275,17 @@ def test_what_cannot_be_live_is_refused():
         Live(SUMMED, full="wait")
     with pytest.raises(UnknownNameError, match="rule for record"):
         Live(SUMMED, record="some")
-    with pytest.raises(DataError, match="a queue holds one event or more"):
-        Live(SUMMED, queue=0)
+    for queue in (0, 2.5, "3", True):
+        with pytest.raises(DeclarationError, match="whole number as 'queue'"):
+            Live(SUMMED, queue=queue)  # type: ignore[arg-type]
+    with pytest.raises(DeclarationError, match="lateness is too short.*\n.*0 ns or more.*\n.*-5.*\n.*write"):
+        Live(SUMMED, lateness=-5)
+    with pytest.raises(DeclarationError, match="deadline is too short"):
+        Live(SUMMED, deadline=0)
+    with pytest.raises(DeclarationError, match="Live.on_output: 'on_output' is no function"):
+        Live(SUMMED, on_output=3)  # type: ignore[arg-type]
+    with pytest.raises(DeclarationError, match="Live: this is no graph"):
+        Live(None)  # type: ignore[arg-type]
 
     @graph
     def shown(a: Stream[Scalar]):
@@ -285,6 +295,50 @@ def test_what_cannot_be_live_is_refused():
 
     with pytest.raises(DeclarationError, match="blocks of the host run in the Python engine"):
         Live(shown.build(), engine="c")
+
+
+@pytest.mark.parametrize("thread", [True, False])
+def test_what_is_no_push_is_refused(thread):
+    with Live(SUMMED, thread=thread) as live:
+        with pytest.raises(DataError, match="summed: a tick needs an event"):
+            live.push(10)
+        with pytest.raises(DataError, match="summed: a tick needs an event"):
+            asyncio.run(live.push_async(10))
+        for wrong in ("x", None):
+            with pytest.raises(DeclarationError, match="source a: a signal cannot carry this kind"):
+                live.push(10, a=wrong)
+        with pytest.raises(DataError, match="not finite(.*\n)*.*fix: +start the run with not_finite="):
+            live.push(10, a=float("nan"))
+        for timeout in ("1", -1, float("nan")):
+            with pytest.raises(DeclarationError, match="summed.timeout"):
+                live.push(10, a=1.0, timeout=timeout)  # type: ignore[arg-type]
+        live.push(10, a=1.0)
+    assert live.counts["a.taken"] == 1
+    assert not live.result().notes
+
+
+@pytest.mark.parametrize(("unit", "said"), [(1e-3, "us"), (1e-6, "ms"), (1e-9, "s"), (1.0, ""), (0.1, "")])
+def test_a_clock_of_another_unit_is_said(unit, said):
+    pace = Pace()
+    for k in range(101):
+        pace.tick(round(k * 10 * MS * unit * 1.01), k * 10 * MS + k % 3)
+    assert ["are they" in n for n in pace.notes()] == [True] * bool(said)
+    assert f"are they {said}?" in "".join(pace.notes()) or not said
+
+
+def test_a_short_time_says_nothing_of_a_pace():
+    with Live(SUMMED) as live:
+        for k in range(100):
+            live.push(k, a=1.0)
+    assert not live.result().notes
+
+
+def test_a_live_run_of_milliseconds_says_so():
+    with Live(SUMMED, thread=False) as live:
+        for k in range(3):
+            live.push(300 * k, a=1.0)  # as of a sender that counts milliseconds
+            time.sleep(0.3)
+    assert any(note.startswith("warning:") and "are they ms?" in note for note in live.result().notes)
 
 
 def test_deadlines_and_latencies():

@@ -162,3 +162,15 @@ def test_packets_over_udp_are_filtered_as_they_come(capsys: pytest.CaptureFixtur
         assert n == none + len(live.arrived[name]) + live.counts[f"{name}.refused"]
     assert found["result"].ticks > 1300
     assert "the same to the bit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_the_tracker_of_a_small_vehicle_is_switched_off_after_its_unit(seed: int) -> None:
+    mav = runpy.run_path(str(EXAMPLES / "mav_flight.py"))["mav"]
+    flight = mav(seed=seed, duration=6.0)
+    unit, tracker = (flight.streams[name].time for name in ("imu", "leica"))
+    steps = np.diff(np.union1d(unit, tracker))
+    assert 0.9 < (flight.truth.time[-1] - unit[-1]) / 1e9 < 2.1
+    assert tracker[-1] > unit[-1]
+    assert steps.max() >= 50_000_000  # as long as a step of the filter becomes there
+    assert np.median(steps) == 5_000_000

@@ -19,7 +19,7 @@ from flowgraph.blocks.vision.tags import TagMap
 from flowgraph.data.registry import find_graph, load_flight
 from flowgraph.engines.state import load_registers, load_state, save_state
 from flowgraph.study.spec import Study
-from flowgraph.study.store import Store, pack_trajectory, read_table, read_trajectory
+from flowgraph.study.store import RUNS, Store, pack_trajectory, read_table, read_trajectory
 from tests.blocks.datasets import test_datasets, test_euroc, test_studentdata
 from tests.blocks.datasets import test_navigation_files as files
 from tests.blocks.datasets.bags import Pen
@@ -154,12 +154,11 @@ def _add_saved(add: Callable[..., None]) -> None:
         store = Store(folder)
         store.write_study(study.resolved())
         store.write_table([row, {**row, "seed": 0}])
-        store.write("ab" * 16, row, kept)
+        store.write([("ab" * 16, row, kept)])
 
     add("results", results, read_table, "results.parquet")
     add("resolved", results, lambda f: Study.load(f / "study.json"), "study.json")
-    run = f"runs/ab/{'ab' * 16}.json"
-    add("run", results, lambda f: _same(Store(f), row), run)
+    add("run", results, lambda f: _same(Store(f), row), RUNS)
     trajectory = f"trajectories/{'ab' * 16}.npz"
     add("trajectory", results, lambda f: read_trajectory(f / trajectory), trajectory)
     add("kept", results, lambda f: _whole(Store(f), kept), trajectory)
@@ -167,14 +166,15 @@ def _add_saved(add: Callable[..., None]) -> None:
 
 def _same(store: Store, row: dict[str, Any]) -> None:
     """A run that is read is the one that was kept, or is none."""
-    found = store.read("ab" * 16)
-    assert found is None or json.dumps(found, sort_keys=True) == json.dumps(row, sort_keys=True)
+    found = store.read(["ab" * 16]).get("ab" * 16)
+    assert found is None or json.dumps(found.row, sort_keys=True) == json.dumps(row, sort_keys=True)
 
 
 def _whole(store: Store, content: bytes) -> None:
     """A trajectory that counts as kept is the one that was."""
     same = store.trajectory_file("ab" * 16).read_bytes() == content
-    assert store.has_trajectory("ab" * 16) == same
+    kept = store.read(["ab" * 16])["ab" * 16]
+    assert store.has_trajectory(kept) == same
 
 
 def is_flight(found: Any) -> bool:

@@ -11,6 +11,7 @@ from flowgraph import (
     ClockError,
     Graph,
     Scalar,
+    Series,
     Stream,
     Tick,
     TypeMismatchError,
@@ -20,6 +21,7 @@ from flowgraph import (
     graph,
     latest,
     periodic,
+    simulate,
 )
 from flowgraph.language.builder import builder
 from flowgraph.language.inlining import inlined
@@ -67,6 +69,38 @@ def test_a_built_graph_does_inside_another_what_it_does_alone() -> None:
     np.testing.assert_allclose(inside["sum"].value, alone["x"].value + v["value"])
     registers = inside.state["registers"]
     same_state({n: registers[n] for n in alone.state["registers"]}, alone.state["registers"])
+
+
+@block
+def thrice(v: Scalar) -> Scalar:
+    return 3.0 * v
+
+
+@graph
+def started(v: Stream[Scalar], seldom: Stream[Scalar], once: Stream[Tick], *, inner: Graph):
+    start = thrice(latest(v, init=0.0, name="first"), at=once, name="start")
+    found = inlined(builder("started"), inner, {"v": v, "seldom": seldom}, {"x": start})
+    return {"x": found["x"], "seen": found["seen"]}
+
+
+def test_a_register_of_a_built_graph_starts_with_a_stream_where_there_is_one() -> None:
+    v, seldom = scalars(np.arange(8) * 5 * MS, 1.0 + np.arange(8)), scalars(np.arange(3) * 15 * MS)
+    once = Series(np.array([0]), np.ones(1, dtype=bool))
+    whole = started.build(**CLOCKS, once=periodic("40ms", phase=0), inner=built())
+    found = all_engines(whole, {"v": v, "seldom": seldom, "once": once}, seed=4)
+    want = all_engines(distance.build(**CLOCKS), {"v": v, "seldom": seldom}, seed=4, init={"x": 3.0})
+    np.testing.assert_array_equal(found["x"].value, want["x"].value)
+    alone = simulate(distance.build(**CLOCKS), {"v": v, "seldom": seldom}, seed=4)
+    np.testing.assert_allclose(found["x"].value - alone["x"].value, 1.0, atol=1e-12)  # 3 in place of 2
+
+
+def test_a_start_of_a_register_that_is_none_is_refused() -> None:
+    @graph
+    def wrong(v: Stream[Scalar], seldom: Stream[Scalar]):
+        return inlined(builder("wrong"), built(), {"v": v, "seldom": seldom}, {"y": v})
+
+    with pytest.raises(UnknownNameError, match="register"):
+        wrong.build(**CLOCKS)
 
 
 def test_streams_that_are_no_sources_or_are_missing_are_refused() -> None:

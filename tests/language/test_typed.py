@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,6 +73,48 @@ def test_what_is_handed_in_is_no_setting_and_the_step_can_be_called_alone() -> N
     assert grown.settings == {"gain": 1.0}
     assert grown.handed == {"dt", "xp"}
     assert grown.step(1.0, -2.0, dt=0.5) == 2.0
+
+
+def _five(a: Scalar, b: Scalar, c: Scalar, d: Scalar, e: Scalar) -> Scalar:
+    return a
+
+
+def _bare(a, *, gain: float = 1.0) -> Scalar:  # type: ignore[no-untyped-def]
+    return a
+
+
+def _setting(a: Scalar, *, gain=1.0) -> Scalar:  # type: ignore[no-untyped-def]
+    return a
+
+
+def _timed(a: Scalar, *, dt: float) -> Scalar:
+    return a
+
+
+def _named(a: Scalar, *, xp: ModuleType) -> Scalar:
+    return a
+
+
+def _none(*, gain: float = 1.0) -> Scalar:
+    return np.zeros(())
+
+
+@pytest.mark.parametrize(
+    ("step", "said", "fix"),
+    [
+        (_five, "one to four ports", "write @block"),
+        (_none, "one to four ports", "write @block"),
+        (_bare, "'a' has no type", "write a: "),
+        (_setting, "'gain' has no type", "write gain: "),
+        (_timed, "'dt' is handed in", "write dt: float = 0.0"),
+        (_named, "'xp' is handed in", "write xp: Namespace = np"),
+    ],
+)
+def test_what_checkers_cannot_check_is_refused_at_once(step: Any, said: str, fix: str) -> None:
+    with pytest.raises(DeclarationError, match=said) as refused:
+        typed_block(step)
+    assert refused.value.path == step.__name__
+    assert str(refused.value.fix).startswith(fix)
 
 
 def test_a_typed_block_is_refused_where_a_plain_one_is() -> None:

@@ -75,7 +75,9 @@ def beyond(x: Any, xp: Any) -> Any:
 
 
 ROUNDED = ("floor", "ceil", "round", "trunc")
-SMOOTH = "abs negative positive square exp expm1 sin cos atan sinh cosh tanh tan materialise"
+SMOOTH = (
+    "abs negative positive square exp expm1 sin cos unnormalized_sinc atan sinh cosh tanh tan materialise"
+)
 # name -> functions of x (..., 6), each row of its own
 CASES: dict[str, list[Callable[[Any, Any], Any]]] = {
     **{name: half(name) for name in ("add", "subtract", "multiply", "divide", "maximum", "minimum")},

@@ -259,6 +259,40 @@ def test_what_calibrate_refuses_is_said_in_its_name():
     assert refused.value.fix == "swap the bounds: low -0.2, high 0.2"
 
 
+@pytest.mark.parametrize(("verb", "option"), [("calibrate", "--find"), ("tune", "--fit")])
+def test_a_misspelt_parameter_is_told_before_its_bounds(verb, option):
+    def said(key: str) -> str:
+        done = RUNNER.invoke(app, [verb, "ins_eskf", "--data", "sim", option, f"{key}=-0.3:0.1"])
+        assert done.exit_code == 2
+        return done.output
+
+    for key, meant in (
+        ("vicon.time_offst", "vicon.time_offset"),
+        ("leica.lver", "leica.lever"),
+        ("gyro_facto", "gyro_factor"),
+    ):
+        assert f"no setting is called '{key}'" in said(key)
+        assert f"did you mean '{meant}'?" in said(key)
+    assert "give bounds above 0" in said("gyro_factor")
+
+
+@pytest.mark.parametrize(("verb", "option"), [("calibrate", "--find"), ("tune", "--fit")])
+def test_a_file_that_cannot_be_written_is_told_before_the_search(verb, option, tmp_path):
+    (tmp_path / "folder").mkdir()
+    for place in (tmp_path / "gone" / "found.json", tmp_path / "folder"):
+        words = [verb, "ekf", "--data", "sim", option, "gyro_factor=0.5:2", "--out", str(place)]
+        done = RUNNER.invoke(app, words)
+        assert done.exit_code == 1
+        assert "this cannot be written" in done.output
+        assert "tried" not in done.output
+
+
+def test_what_is_set_as_well_is_told_with_the_option_to_leave_out():
+    with pytest.raises(DeclarationError) as refused:
+        calibrate("ekf", [Fit("gyro_factor", 0.5, 2.0)], [Recording("sim")], settings={"gyro_factor": 1.0})
+    assert refused.value.fix == "leave out --set gyro_factor, or its bounds"
+
+
 SHORT = {"duration": 2.0, "imu.rate": 50.0, "vicon.rate": 25.0}
 
 

@@ -131,6 +131,19 @@ def test_the_command_writes_what_run_and_lower_read(tmp_path):
         f.name for f in (tmp_path / "c").iterdir()
     }
     assert json.loads((tmp_path / "c" / "pipeline.json").read_text())["formats"]["width"] == 26
+    cost = run(
+        app, ["lower", "kalman", *flight, "--formats", str(tmp_path / "f"), "--report", "-o", str(tmp_path)]
+    )
+    assert cost.exit_code == 0, cost.output
+    assert "Number formats" in (tmp_path / "report.txt").read_text()
+    drawn = [(kind, tmp_path / f"drawn.{kind}") for kind in ("dot", "html")]
+    for _, file in drawn:
+        shown = run(app, ["show", "kalman", *flight, "--formats", str(tmp_path / "f"), "-o", str(file)])
+        assert shown.exit_code == 0, shown.output
+        assert "words of 26 bits" in file.read_text()
+        assert "26 bits, fraction " in file.read_text()
+    shown = run(app, ["show", "kalman", *flight, "--formats", str(tmp_path / "f")])
+    assert "26 bits, fraction " in shown.output
 
 
 def test_lowering_to_fixed_point_needs_formats(tmp_path):

@@ -153,7 +153,15 @@ def test_run_reads_what_tune_found(walk: str, tmp_path: Path):
         for more in ([], ["--settings", str(file)], ["--settings", str(file), "--set", "size=1.0"])
     ]
     assert runs[0] == runs[2] != runs[1]
-    for text in ("[]", "{", '{"parameters": {"size": {"value": ["x"], "deviation": 1}}}'):
+    for text in (
+        "[]",
+        "{",
+        '{"parameters": {"size": {"value": ["x"], "deviation": 1}}}',
+        *(
+            f'{{"parameters": {{"size": {one}}}}}'
+            for one in ('{"valu": 1}', "null", '{"value": NaN}', "[1, null]")
+        ),
+    ):
         file.write_text(text)
         wrong = runner.invoke(app, ["run", *words, "--settings", str(file)])
         assert wrong.exit_code == 1

@@ -32,6 +32,7 @@ from flowgraph.study import (
     tasks,
 )
 from flowgraph.study.execution import tasks_of
+from flowgraph.study.store import RUNS
 from flowgraph.types import flatten, unflatten
 
 pytest.importorskip("pyarrow")
@@ -109,24 +110,28 @@ def test_a_default_spelled_out_has_a_key_of_its_own_but_the_same_result(tmp_path
     assert a.rows[0]["position_rmse_m"] == b.rows[0]["position_rmse_m"]
 
 
-@pytest.mark.parametrize("damage", ["half", "empty", "other", "text"])
+@pytest.mark.parametrize("damage", ["half", "cut", "empty", "other", "text", "bytes"])
 def test_what_is_not_whole_is_no_result(tmp_path, damage):
     study = small(seeds=2)
     whole = run_study(study, tmp_path)
     key = whole.rows[0]["key"]
-    file = Store(tmp_path).run_file(key)
+    file = tmp_path / RUNS
     content = file.read_bytes()
+    first, last = sorted(content.splitlines(), key=lambda line: key.encode() not in line)
     spoiled = {
-        "half": content[: len(content) // 2],
-        "empty": b"",
-        "other": content.replace(b'"seed": 0', b'"seed": 9'),
-        "text": b"[1, 2]",
+        "half": last + b"\n" + first[: len(first) // 2],  # as a process that is killed leaves it
+        "cut": first[: len(first) // 2] + b"\n" + last,
+        "empty": last,
+        "other": first.replace(b'"seed": 0', b'"seed": 9') + b"\n" + last + b"\n",
+        "text": b"[1, 2]\n" + last + b"\n",
+        "bytes": b"\xff\0\n" + last + b"\n",
     }
     assert spoiled[damage] != content
     file.write_bytes(spoiled[damage])
     again = run_study(study, tmp_path)
     assert (again.done, again.kept) == (1, 1)
     assert told(again.rows) == told(whole.rows)
+    assert run_study(study, tmp_path).kept == 2
 
 
 def test_the_resolved_study_is_itself_a_study(tmp_path):
@@ -308,6 +313,12 @@ def test_the_command_uses_a_scheduler_elsewhere(cluster, undisturbed, tmp_path):
     assert told(read_table(tmp_path / "out")) == rows
 
 
+def written(out: Path) -> int:
+    """How many runs are written down."""
+    file = out / RUNS
+    return file.read_bytes().count(b"\n") if file.exists() else 0
+
+
 def test_a_study_killed_and_run_again_changes_nothing(undisturbed, tmp_path):
     study, rows = undisturbed
     file = tmp_path / "study.json"
@@ -317,12 +328,12 @@ def test_a_study_killed_and_run_again_changes_nothing(undisturbed, tmp_path):
     command += ["--out", str(out), "--workers", "2", "--quiet"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 90
-    while len(list(out.glob("runs/*/*.json"))) < 3 and time.monotonic() < deadline:
+    while written(out) < 3 and time.monotonic() < deadline:
         assert process.poll() is None, "it ended before it could be killed"
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    there = len(list(out.glob("runs/*/*.json")))
+    there = written(out)
     assert 3 <= there < 20
     assert not (out / "results.parquet").exists()
     done = run_study(study, out)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flowgraph import find_graph, load_flight, simulate
+from flowgraph import Case, Flight, find_graph, load_flight, simulate
+from flowgraph.blocks.models.pose import pose_at_start
 from flowgraph.study import Study, run_study, tasks
 from flowgraph.study.whole import whole_case
 
@@ -64,26 +66,66 @@ def test_a_setting_that_a_program_cannot_take_is_an_error_of_its_rows_alone(tmp_
     assert [row["error"] is None for row in rows] == [True, True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("settings", "more"),
-    [({}, {"start": "file"}), ({"vicon.latency": "0.02"}, {"start": "truth"})],
-    ids=["a start by the first pose", "a reading that comes late"],
-)
-def test_what_hangs_on_the_recording_has_no_whole_case(
-    settings: dict[str, str], more: dict[str, str]
-) -> None:
+def cases_of(name: str, settings: dict[str, str], more: dict[str, Any]) -> list[tuple[Case, Flight]]:
+    """Those of two seeds, and their flights."""
     found = []
     for seed in (0, 1):
         flight = load_flight(
             "sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings}
         )
-        found.append((find_graph("ekf").case(flight, **more), flight))
+        case, _ = tasks.prepared(name, "sim:figure", seed, more, flight)
+        found.append((case, flight))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "more"),
+    [
+        ("ekf", {"vicon.latency": "0.02"}, {"start": "truth"}),
+        ("ekf", {}, {"start": "unknown_yaw"}),
+        ("ins_eskf", {}, {"start": "file"}),
+        ("rbpf_indoor", {}, {"particles": 5, "start": "file"}),
+    ],
+    ids=["a reading that comes late", "half a first pose", "a measured pose, levelled", "a mean at rest"],
+)
+def test_what_hangs_on_the_recording_has_no_whole_case(
+    name: str, settings: dict[str, str], more: dict[str, Any]
+) -> None:
+    found = cases_of(name, settings, more)
     made_by = found[0][1].experiment
     if settings:
         assert made_by is None
     else:
         assert made_by is not None
         assert whole_case(made_by, *found) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "more"), [("ekf", {}), ("ins_eskf", {}), ("rbpf_indoor", {"particles": 8})])
+def test_a_start_that_follows_from_the_flight_is_made_in_the_graph(name: str, more: dict[str, Any]) -> None:
+    found = cases_of(name, {}, more)
+    experiment = found[0][1].experiment
+    assert experiment is not None
+    whole = whole_case(experiment, *found)
+    assert whole is not None
+    assert "begin" in whole.graph.sources
+    for seed, (case, _) in enumerate(found):
+        got = whole.score(simulate(whole.graph, whole.inputs, engine="python", seed=seed))
+        want = case.score(simulate(case.graph, case.inputs, engine="reference", seed=seed))
+        assert got.keys() == want.keys()
+        for figure, value in want.items():
+            assert got[figure] == pytest.approx(value, rel=1e-9, abs=1e-9), figure
+
+
+def test_a_start_in_the_graph_that_is_not_the_case_s_is_not_taken() -> None:
+    found = cases_of("ekf", {}, {})
+    experiment = found[0][1].experiment
+    assert experiment is not None
+    (case, flight), other = found
+    assert case.begin is not None
+    off = lambda first, at: {"belief": pose_at_start(first("vicon"), deviations=(0.7, 0.7, 0.31), at=at)}
+    assert whole_case(experiment, (replace(case, begin=off), flight), other) is None
+    assert whole_case(experiment, (replace(case, begin=None), flight), other) is None
 
 
 @pytest.mark.slow

@@ -144,7 +144,7 @@ def _fields(series: Series) -> Make:
     """All fields of a row, nested as their names are; without those that are not finite."""
     columns = [(leaf.split("."), array.tolist()) for leaf, array in series.leaves.items()]
     good = [
-        np.isfinite(array).reshape(len(array), -1).all(axis=1).tolist() for array in series.leaves.values()
+        np.isfinite(array).all(axis=tuple(range(1, array.ndim))).tolist() for array in series.leaves.values()
     ]
 
     def make(row: int) -> dict[str, Any]:

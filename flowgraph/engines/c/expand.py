@@ -16,6 +16,7 @@ from flowgraph.engines.c.nodes import Buffer, Node, View
 from flowgraph.engines.c.shapes import JOINS, Shapes, host_kind, within, without_zeros
 from flowgraph.engines.c.values import Value, lanes, row_major, space_of, unrolled
 from flowgraph.errors import LoweringError
+from flowgraph.pipeline.optimise.aside import Choice
 from flowgraph.recorder.ops import ELEMENTWISE, OPS, Spec, broadcast
 from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
@@ -78,6 +79,16 @@ class Expander(Shapes):
         self.tape.macro("replay", views, out, body=body_of(i.attrs["body"]))
         return self.from_view(i.spec, out)
 
+    def chosen(self, i: Instruction, choice: Choice) -> Value:
+        """One array, or where a truth says so what a function of others makes."""
+        truth, other, *inputs = (self.known[a] for a in i.args)
+        self.tape.origin = i.line
+        views = [self.form.stored(other), *(self.form.own(x) for x in inputs)]
+        out = self.fresh(i.spec)
+        when = self.form.elements(truth).item()
+        self.tape.macro("choose", views, out, [when], choice=choice, truth=i.attrs["truth"])
+        return self.from_view(i.spec, out)
+
     # -- products ------------------------------------------------------------------------------------
 
     def matmul(self, spec: Spec, a: Value, b: Value) -> Value:
@@ -114,8 +125,11 @@ class Expander(Shapes):
         if only_inner and not any(fo) and math.prod(spec.shape) <= UNROLLED_SUMS:
             x, y = self.form.elements(a), self.form.elements(b)
             made = np.empty(spec.shape, object)
-            rank = len(spec.shape)
+            rank, even = len(spec.shape), _weighted(x, y)
             for index in np.ndindex(spec.shape):
+                if even and index[0] > index[1]:
+                    made[index] = made[index[::-1]]
+                    continue
                 p = x[within(x, (*index[:-1], 0), rank)]
                 q = y[within(y, (*index[:-2], 0, index[-1]), rank)]
                 term = self.tape.op("multiply", spec.dtype, p, q)
@@ -290,6 +304,21 @@ class Expander(Shapes):
 
 
 UNROLLED_SUMS = 64
+
+
+def _weighted(x: Any, y: Any) -> bool:
+    """Whether x (m, 1) holds the elements of y (1, m), each times the same: sums of x y are symmetric."""
+    if x.ndim != 2 or y.ndim != 2 or len(x) != y.shape[1]:
+        return False
+    times: list[Node | None] = []
+    for p, q in zip(x[:, 0], y[0], strict=True):
+        if p is q:
+            times.append(None)
+        elif p.op == "multiply" and q in p.args:
+            times.append(p.args[1 if p.args[0] is q else 0])
+        else:
+            return False
+    return all(t is times[0] for t in times)
 
 
 def _is_zero(node: Node) -> bool:

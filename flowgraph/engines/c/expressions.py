@@ -32,11 +32,15 @@ class Expressions:
     Args:
         real: "double" or "float".
         turn: the text of a function, given its name, a case of a replay and the sizes of history and row.
+        choice: the text of a function, given its name and a choice.
     """
 
-    def __init__(self, real: str, turn: Callable[..., str] = lambda *_: "") -> None:
-        self.real, self.turn = real, turn
+    def __init__(
+        self, real: str, turn: Callable[..., str] = lambda *_: "", choice: Callable[..., str] = lambda *_: ""
+    ) -> None:
+        self.real, self.turn, self.choice = real, turn, choice
         self.helpers: set[str] = set()
+        self.packs = False
         self.called: set[str] = set()
         self.functions: dict[Any, tuple[str, str]] = {}
 

@@ -24,11 +24,12 @@ from flowgraph.engines.c.header import header
 from flowgraph.engines.c.helpers import helper_text, own_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
-from flowgraph.engines.c.preamble import MACROS, REFUSED
+from flowgraph.engines.c.preamble import MACROS, PACK, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.syntax import comment, ctype, number
 from flowgraph.engines.c.values import Value, row_major
+from flowgraph.pipeline.optimise.aside import CHOOSE, Choice, put_aside
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline, kind_of
 from flowgraph.pipeline.program import Program, specialise
 from flowgraph.recorder.ops import Spec
@@ -81,7 +82,7 @@ class File:
         self.pipeline, self.real, self.patterns, self.tidy = pipeline, real, patterns, tidy
         self.checked = checked
         self.names = names_of(pipeline)
-        self.expressions = Expressions(real, self.turn)
+        self.expressions = Expressions(real, self.turn, self.choice)
         self.constants: dict[Any, tuple[str, Buffer]] = {}
         self.pool: dict[str, list[int]] = {}
         self.presence: dict[int | None, tuple[int, int]] = {}
@@ -99,6 +100,7 @@ class File:
             "",
             REFUSED,
             MACROS,
+            PACK.replace("REAL", self.real) if self.expressions.packs else None,
             helper_text(self.expressions.helpers, self.real),
             own_text(self.expressions.called, self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),
@@ -125,16 +127,19 @@ class File:
     def reaction(self, key: int | None) -> str:
         """The function of one pattern of present inputs."""
         pipeline, tape = self.pipeline, Tape()
-        program = self.tidy(specialise(pipeline, key))
+        sites = {site.value: site for site in pipeline.random}
+        program, choices = put_aside(specialise(pipeline, key), sites)
+        program = self.tidy(program)
         values = self._given(tape, program, key)
         expander = Expander(tape, values)
-        sites = {site.value: site for site in pipeline.random}
         places = self._in_place(program)
         for i in program.instructions:
             if i.out in sites:
                 values[i.out] = self._drawn(tape, sites[i.out], values[pipeline.seed])
             elif i.out in places:
                 values[i.out] = expander.replayed(i, places[i.out])
+            elif i.op == CHOOSE:
+                values[i.out] = expander.chosen(i, choices[i.attrs["choice"]])
             else:
                 expander.tell(program.elements, i)
                 expander.play(i)
@@ -198,25 +203,62 @@ class File:
         specs = {0: before, 1: row, **{n: Spec(a.shape, kind_of(a)) for n, a in case.constants.items()}}
         specs |= {t.out: t.spec for t in case.turns}
         steps = tuple(Instruction(t.op, t.args, t.attrs, t.out, t.spec, t.line) for t in case.turns)
-        program = self.tidy(Program(case.constants, steps, ((None, ()),), (case.result,), specs, (0,)))
-        tape, values = Tape(), {}
-        for n, text, spec in ((0, "before", before), (1, "row", row)):
-            values[n] = _whole(Buffer(text, "real", spec.shape[0], "input"), spec.shape)
-        for n, array in program.constants.items():
-            values[n] = self._known(np.asarray(array), program.specs[n].dtype)
-        expander = Expander(tape, values)
-        for i in program.instructions:
-            expander.tell(program.elements, i)
-            expander.play(i)
-        after = Buffer("after", "real", sizes[0], "output")
-        plan = schedule(tape, self._write(expander, after, values[program.writes[0]]))
-        work, local = self._memory(plan.span, "turn_")
-        body = Writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
-        unused = [n for n in ("s", "before", "row") if not _names_it("\n".join(body), n)]
+        program = Program(case.constants, steps, ((None, ()),), (case.result,), specs, (0,))
         real, state = self.real, f"{self.names.module}_state"
         head = (
             f"static FG_APART void {name}({state} *s, const {real} *before, const {real} *row, {real} *after)"
         )
+        program, choices = put_aside(program)
+        return self._apart(head, program, choices, {0: "before", 1: "row"}, "after", "turn_")
+
+    def choice(self, name: str, choice: Choice) -> str:
+        """The function of what is rarely taken."""
+        real = self.expressions.ctype("real")
+        inputs = {n: f"from{k}" for k, n in enumerate(choice.inputs)}
+        given = [f"const {real} *restrict {text}" for text in inputs.values()]
+        given = [f"{self.names.module}_state *s", *given, f"{real} *restrict made"]
+        head = f"static FG_APART void {name}({', '.join(given)})"
+        return self._apart(head, choice.program, [], inputs, "made", "choice_")
+
+    def _apart(
+        self,
+        head: str,
+        program: Program,
+        choices: list[Choice],
+        inputs: dict[int, str],
+        result: str,
+        whose: str,
+    ) -> str:
+        """A function of arrays of reals beside the reactions.
+
+        Args:
+            head: how it begins.
+            program: its one register is the result.
+            choices: that it names.
+            inputs: what it is given, by number.
+            result: where its result belongs.
+            whose: its large buffers are.
+        """
+        program = self.tidy(program)
+        tape, values = Tape(), {}
+        for n, text in inputs.items():
+            spec = program.specs[n]
+            values[n] = _whole(Buffer(text, "real", math.prod(spec.shape), "input"), spec.shape)
+        for n, array in program.constants.items():
+            values[n] = self._known(np.asarray(array), program.specs[n].dtype)
+        expander = Expander(tape, values)
+        for i in program.instructions:
+            if i.op == CHOOSE:
+                values[i.out] = expander.chosen(i, choices[i.attrs["choice"]])
+            else:
+                expander.tell(program.elements, i)
+                expander.play(i)
+        after = values[program.writes[0]]
+        place = Buffer(result, "real", math.prod(after.shape), "output")
+        plan = schedule(tape, self._write(expander, place, after))
+        work, local = self._memory(plan.span, whose)
+        body = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
+        unused = [n for n in ("s", *inputs.values()) if not _names_it("\n".join(body), n)]
         return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
 
     def signature(self, key: int | None) -> str:

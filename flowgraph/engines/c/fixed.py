@@ -19,7 +19,7 @@ from flowgraph.engines.fixed.source import Source
 from flowgraph.engines.options import Meter
 from flowgraph.pipeline.formats import real_numbers
 from flowgraph.pipeline.pipeline import Pipeline
-from flowgraph.pipeline.program import needed
+from flowgraph.pipeline.program import needed_of
 from flowgraph.recorder.ops import Spec
 from flowgraph.types import DTYPES
 
@@ -33,21 +33,30 @@ class CompiledIntegers(Player):
 
     The C stops at a tick in which a word was marked, for here it is known what takes the word, and goes on.
 
+    Args:
+        pipeline: with formats.
+        patterns: of present inputs that come.
+        tabled: whether it is compiled once for all formats of a structure, and slower then.
+
     Attributes:
         counts: of the last run.
     """
 
-    def __init__(self, pipeline: Pipeline, patterns: Sequence[int]) -> None:
+    def __init__(self, pipeline: Pipeline, patterns: Sequence[int], *, tabled: bool = False) -> None:
         self.pipeline = pipeline
-        self.source = Source(pipeline, patterns)
+        self.source = Source(pipeline, patterns, tabled=tabled)
         self.counts = Counts()
         by_place = sorted((p, n) for n, p in self.source.place.items())
         self._places, self._values = np.array([p for p, _ in by_place]), [n for _, n in by_place]
-        self._play = load({"fixed.c": f"{self.source.text}\n{self.source.play}"}, FLAGS).fx_play
+        self._library = load({"fixed.c": f"{self.source.text}\n{self.source.play}"}, FLAGS)
+        self._play = self._library.fx_play
         self._play.restype = ctypes.c_int64
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         source, pipeline = self.source, self.pipeline
+        if source.tabled:
+            for name, row in (("fx_s", source.shifts), ("fx_m", source.mosts)):
+                ctypes.c_void_p.in_dll(self._library, name).value = row.ctypes.data
         player = Integers(pipeline, cells, seed)
         held = [c for r in pipeline.registers for c in r.cells]
         w, off = source.first.copy(), np.zeros(source.size + 1, np.uint8)
@@ -105,7 +114,8 @@ class CompiledIntegers(Player):
         marked = {
             self._values[k] for k in np.searchsorted(self._places, np.flatnonzero(off[:-1]), "right") - 1
         }
-        taken = needed(program, _Words(w, self.source.place, self.pipeline.specs)) if marked else {}
+        words = _Words(w, self.source.place, self.pipeline.specs)
+        taken = needed_of(program, words, marked) if marked else {}
         for n in marked:
             p, shape = self.source.place[n], self.pipeline.specs[n].shape
             marks = off[p : p + math.prod(shape)].reshape(shape)

@@ -18,7 +18,8 @@ from flowgraph.engines.c.harness import makefile
 from flowgraph.engines.c.replay import KEEPS, csv_names
 from flowgraph.engines.c.syntax import comment, string
 from flowgraph.engines.fixed.files import texts_of
-from flowgraph.engines.fixed.source import Source
+from flowgraph.engines.fixed.places import KNOWN, KNOWN_SMALL, SMALL, Place
+from flowgraph.engines.fixed.standalone import Standalone
 from flowgraph.errors import writes
 from flowgraph.pipeline.formats import FREE
 from flowgraph.pipeline.pipeline import Leaf, Pipeline
@@ -58,28 +59,29 @@ class _Tables:
             self.lines.append(f"static const int16_t {self._fractions[row]}[] = {{{numbers}}};")
         return self._fractions[row]
 
-    def port(self, name: str, leaves: Sequence[tuple[Leaf, int, int, np.ndarray | None]]) -> int:
+    def port(self, name: str, leaves: Sequence[tuple[Leaf, Place, int, np.ndarray | None]]) -> int:
         rows = []
         for leaf, place, bits, fraction in leaves:
             count = math.prod(leaf.shape)
-            rows.append(f"{{{place}, {count}, {bits}, {self.fraction(fraction, count, leaf.shape)}}}")
-        self.lines.append(f"static const leaf {name}[] = {{{', '.join(rows) or '{0, 0, 0, NULL}'}}};")
+            at = f"{place[1]}, {int(place[0] == SMALL)}"
+            rows.append(f"{{{at}, {count}, {bits}, {self.fraction(fraction, count, leaf.shape)}}}")
+        self.lines.append(f"static const leaf {name}[] = {{{', '.join(rows) or '{0, 0, 0, 0, NULL}'}}};")
         return len(rows)
 
 
-def main_of_fixed(source: Source) -> str:
+def main_of_fixed(source: Standalone) -> str:
     """The text of the program."""
     pipeline = source.pipeline
     assert pipeline.formats is not None
     tables, given = _Tables(), []
     for k, (port, name) in enumerate(zip(pipeline.inputs, csv_names(pipeline.inputs), strict=True)):
         leaves = [
-            (leaf, source.place[leaf.value], pipeline.formats.width_of(leaf.value),
+            (leaf, source.held(leaf.value), pipeline.formats.width_of(leaf.value),
              pipeline.formats.fractions.get(leaf.value, np.array(0)) if leaf.dtype == "real" else None)
             for leaf in port.leaves
         ]  # fmt: skip
         count = tables.port(f"in{k}", leaves)
-        given.append(f"{{{string(name)}, -1, {count}, in{k}}}")
+        given.append(f"{{{string(name)}, -1, 0, {count}, in{k}}}")
     cases = []
     names = csv_names(pipeline.outputs)
     for key, bound in zip(source.keys, source.bound, strict=True):
@@ -88,13 +90,19 @@ def main_of_fixed(source: Source) -> str:
             if flag is None:
                 continue
             made = [
-                (leaf, source.place[n], 0, bound.fractions[n] if leaf.dtype == "real" else None)
+                (leaf, source.end(key, n), 0, bound.fractions[n] if leaf.dtype == "real" else None)
                 for leaf, n in zip(pipeline.outputs[p].leaves, values, strict=True)
             ]
             count = tables.port(f"out{key}_{p}", made)
-            rows.append(f"{{{string(names[p])}, {source.place[flag]}, {count}, out{key}_{p}}}")
+            array, place = source.end(key, flag)
+            at = (
+                f"-1, {int(array == SMALL)}"
+                if array in (KNOWN, KNOWN_SMALL)
+                else f"{place}, {int(array == SMALL)}"
+            )
+            rows.append(f"{{{string(names[p])}, {at}, {count}, out{key}_{p}}}")
         tables.lines.append(
-            f"static const port ports{key}[] = {{{', '.join(rows) or '{NULL, 0, 0, NULL}'}}};"
+            f"static const port ports{key}[] = {{{', '.join(rows) or '{NULL, 0, 0, 0, NULL}'}}};"
         )
         cases.append(f"    case {key}: print(ports{key}, {len(rows)}); break;")
     longest = max((len(s.encode()) for s in csv_names(pipeline.inputs)), default=0)
@@ -118,8 +126,9 @@ _TEXT = r"""/* Replays events through TITLE in fixed point: replay EVENTS.csv [S
 #include <stdlib.h>
 #include <string.h>
 
-typedef struct { int place, count, bits; const int16_t *fraction; } leaf; /* no fractions: whole numbers */
-typedef struct { const char *name; int present, count; const leaf *leaves; } port;
+/* no fractions: whole numbers; present -1: always */
+typedef struct { int place, small, count, bits; const int16_t *fraction; } leaf;
+typedef struct { const char *name; int present, small, count; const leaf *leaves; } port;
 static const int64_t none = -((int64_t)1 << 62); /* a reading that is not there */
 
 @TABLES@
@@ -127,8 +136,8 @@ static const port given[] = {
     @GIVEN@};
 enum { INPUTS = (int)(sizeof given / sizeof given[0]) };
 
-static int64_t w[FX_WORDS], lost[FX_COUNTERS + 1];
-static uint8_t off[FX_WORDS + 1];
+static int32_t v[FX_SMALL];
+static int64_t w[FX_WIDE], count_of[3];
 static char line[@LINE@];
 static long row;
 static int key, keeps;
@@ -179,20 +188,24 @@ static void read(const port *p, char **rest)
         const leaf *x = &p->leaves[l];
         for (int k = 0; k < x->count; ++k) {
             const char *text = field(rest);
-            w[x->place + k] = x->fraction != NULL ? word(text, x->fraction[k], x->bits) : whole(text);
+            const int64_t n = x->fraction != NULL ? word(text, x->fraction[k], x->bits) : whole(text);
+            if (x->small) v[x->place + k] = (int32_t)n;
+            else w[x->place + k] = n;
         }
     }
 }
 
+static int64_t at(int place, int small) { return small ? v[place] : w[place]; }
+
 static void print(const port *ports, int count)
 {
     for (int p = 0; p < count; ++p) {
-        if (w[ports[p].present] == 0) continue;
+        if (ports[p].present >= 0 && at(ports[p].present, ports[p].small) == 0) continue;
         printf("%lld,%s", (long long)w[FX_TIME], ports[p].name);
         for (int l = 0; l < ports[p].count; ++l) {
             const leaf *x = &ports[p].leaves[l];
             for (int k = 0; k < x->count; ++k) {
-                const int64_t n = w[x->place + k];
+                const int64_t n = at(x->place + k, x->small);
                 if (x->fraction == NULL) printf(",%lld", (long long)n);
                 else printf(",%.17g", n == none ? NAN : ldexp((double)n, -x->fraction[k]));
             }
@@ -204,11 +217,11 @@ static void print(const port *ports, int count)
 static void tick(void)
 {
     if (key == 0) return;
-    if (fx_compute(w, off, lost, key) != 0) refuse("inputs meet that have no formats together", "");
+    if (fx_compute(v, w, count_of, key) != 0) refuse("inputs meet that have no formats together", "");
     switch (key) {
 @CASES@
     }
-    if (fx_end(w, off, lost, key) != 0) refuse("inputs meet that have no formats together", "");
+    if (fx_end(v, w, count_of, key) != 0) refuse("inputs meet that have no formats together", "");
     key = 0;
 }
 
@@ -221,7 +234,7 @@ int main(int count, char **words)
         fprintf(stderr, "usage: replay EVENTS.csv [SEED], of a file that can be read\n");
         return 2;
     }
-    memcpy(w, fx_first, sizeof w);
+    fx_begin(v, w);
     w[FX_RANDOM_SEED] = (int64_t)(seed & 0xFFFFFFFFu);
     w[FX_RANDOM_SEED + 1] = (int64_t)(seed >> 32);
     while (fgets(line, sizeof line, file) != NULL) {

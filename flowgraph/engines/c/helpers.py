@@ -26,12 +26,20 @@ def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
     start, slope = segments()
     f = "" if real == "double" else "f"
     unit, step, half = (number(x, "real", real) for x in (2.0**-22, 2.0**-24, 0.5))
+    even = number(1e-20 if real == "double" else 1e-8, "real", real)
     found: dict[str, tuple[tuple[str, ...], str]] = {
         **vector_texts(real),
         "fg_clip": (
             (),
             """static inline int32_t fg_clip(int64_t at, int32_t size) {
     return (int32_t)(at < 0 ? 0 : (at >= size ? size - 1 : at));
+}
+""",
+        ),
+        "fg_clip_32": (
+            (),
+            """static inline int32_t fg_clip_32(int32_t at, int32_t size) {
+    return at < 0 ? 0 : (at >= size ? size - 1 : at);
 }
 """,
         ),
@@ -114,10 +122,43 @@ static FG_INLINE void fg_cholesky({real} *a, int32_t n) {{
 }}
 """,
         ),
+        "fg_solve_plain": (
+            (),
+            f"""/* a x = b in place of b (n x m), without exchange of rows; whether the matrix is one that
+   needs none: symmetric and positive */
+static FG_INLINE bool fg_solve_plain({real} *a, {real} *b, int32_t n, int32_t m) {{
+    bool sound = true;
+    for (int32_t j = 0; j < n; j++) {{
+        for (int32_t i = j + 1; i < n; i++) {{
+            const {real} apart = a[n * i + j] - a[n * j + i];
+            sound = sound && apart * apart <= {even} * (a[n * i + i] * a[n * j + j]);
+        }}
+    }}
+    if (!sound) return false;
+    for (int32_t j = 0; j < n; j++) {{
+        sound = sound && a[n * j + j] > 0;
+        const {real} inverse = 1 / a[n * j + j];
+        a[n * j + j] = inverse;
+        for (int32_t i = j + 1; i < n; i++) {{
+            const {real} f = a[n * i + j] * inverse;
+            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
+            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
+        }}
+    }}
+    for (int32_t j = n - 1; j >= 0; j--) {{
+        for (int32_t i = j + 1; i < n; i++) {{
+            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
+        }}
+        for (int32_t k = 0; k < m; k++) b[m * j + k] *= a[n * j + j];
+    }}
+    return sound;
+}}
+""",
+        ),
         "fg_solve": (
             (),
             f"""/* a x = b in place of b (n x m), by elimination with row exchange; NaN where a is singular */
-static FG_INLINE void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
+static FG_APART void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
     for (int32_t j = 0; j < n; j++) {{
         int32_t best = j;
         for (int32_t i = j + 1; i < n; i++) {{

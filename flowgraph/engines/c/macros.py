@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.nodes import Macro, View
 from flowgraph.engines.c.syntax import ctype
 
+if TYPE_CHECKING:
+    from flowgraph.engines.c.statements import Writer
 
-def write_macro(w: Lines, m: Macro) -> None:
+
+def write_macro(w: Writer, m: Macro) -> None:
     """Write a macro's loops."""
     _MACROS[m.kind](w, m)
 
@@ -69,34 +73,75 @@ def call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object)
         w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
 
 
+_ACCUMULATORS = 12
+"""Vectors of sums that are under way together: what is one after the other waits for each sum."""
+
+
 def _matmul(w: Lines, m: Macro) -> None:
     type_ = ctype(m.output.buffer.dtype, w.write.real)
 
     def text(name: str, a: View, b: View, out: View) -> str:
         rows, columns, inner = out.shape[-2], out.shape[-1], a.shape[-1]
-        left = index(a.strides[-2:], ("i", "k"))
         right = index(b.strides[-2:], ("k", "j"))
-        made = index(out.strides[-2:], ("i", "j"))
-        turned = b.strides[-1] != 1 and columns > 1
-        copy = f"""    {type_} turned[{inner * columns}];
-    for (int32_t k = 0; k < {inner}; k++)
-        for (int32_t j = 0; j < {columns}; j++) turned[{columns} * k + j] = b[{right}];
-"""
-        factor = f"turned[{columns} * k + j]" if turned else f"b[{right}]"
-        return f"""/* ({rows} x {inner}) ({inner} x {columns}) */
-static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b, {type_} *restrict out)
-{{
-{copy if turned else ""}    for (int32_t i = 0; i < {rows}; i++) {{
-        {type_} row[{columns}];
-        for (int32_t j = 0; j < {columns}; j++) row[j] = 0;
-        for (int32_t k = 0; k < {inner}; k++) {{
-            const {type_} left = a[{left}];
-            for (int32_t j = 0; j < {columns}; j++) row[j] += left * {factor};
-        }}
-        for (int32_t j = 0; j < {columns}; j++) out[{made}] = row[j];
-    }}
-}}
-"""
+
+        def at(r: int) -> str:
+            return index(a.strides[-2:], (f"(i + {r})" if r else "i", "k"))
+
+        def to(r: int) -> str:
+            return index(out.strides[-2:], (f"(i + {r})" if r else "i", "j"))
+
+        packed = type_ == w.write.real and rows >= 4 and columns > 1
+        w.write.packs |= packed
+        kept, wide, one = ("fg_pack", f"FG_PACKS({columns})", type_) if packed else (type_, columns, type_)
+
+        def block(first: int, last: int, step: int) -> list[str]:
+            """Rows from `first` on up to `last`, so many at a time."""
+            each = range(step)
+            factor = f"right[{wide} * k + j]" if packed else f"b[{right}]"
+            lines = [
+                f"    for (int32_t i = {first}; i < {last}; i += {step}) {{",
+                *(f"        {kept} row{r}[{wide}];" for r in each),
+                f"        for (int32_t j = 0; j < {wide}; j++) {{",
+                *(f"            row{r}[j] = {'none' if packed else '0'};" for r in each),
+                "        }",
+                f"        for (int32_t k = 0; k < {inner}; k++) {{",
+                *(f"            const {one} left{r} = a[{at(r)}];" for r in each),
+                f"            for (int32_t j = 0; j < {wide}; j++) {{",
+                *(f"                row{r}[j] += left{r} * {factor};" for r in each),
+                "            }",
+                "        }",
+            ]
+            for r in each:
+                if packed:
+                    lines.append(f"        for (int32_t j = 0; j < {wide}; j++) made[j] = row{r}[j];")
+                found = f"((const {type_} *)made)[j]" if packed else f"row{r}[j]"
+                lines.append(f"        for (int32_t j = 0; j < {columns}; j++) out[{to(r)}] = {found};")
+            return [*lines, "    }"]
+
+        together = max(1, min(_ACCUMULATORS // -(-columns // 4), 4)) if packed else 1
+        full = rows - rows % together
+        copy = [
+            f"    fg_pack right[{inner} * {wide}], made[{wide}];",
+            "    const fg_pack none = FG_ZERO;",
+            f"    for (int32_t k = 0; k < {inner}; k++) {{",
+            f"        {type_} *const row = ({type_} *)(right + {wide} * k);",
+            f"        for (int32_t j = 0; j < {columns}; j++) row[j] = b[{right}];",
+            f"        for (int32_t j = {columns}; j < FG_PACK * {wide}; j++) row[j] = 0;",
+            "    }",
+        ]
+        return "\n".join(
+            [
+                f"/* ({rows} x {inner}) ({inner} x {columns}) */",
+                f"static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b, "
+                f"{type_} *restrict out)",
+                "{",
+                *(copy if packed else []),
+                *block(0, full, together),
+                *(block(full, rows, rows - full) if full < rows else []),
+                "}",
+                "",
+            ]
+        )
 
     call(w, "matmul", m, text, type_)
 
@@ -121,21 +166,29 @@ static FG_APART void {name}(const {real} *restrict a, {real} *restrict out)
     call(w, "cholesky", m, text)
 
 
+_SMALL = 32
+"""Numbers that stay in registers around a solution."""
+
+
 def _solve(w: Lines, m: Macro) -> None:
-    real, helper = w.write.real, w.write.helper("fg_solve")
+    real, plain, exchanging = w.write.real, w.write.helper("fg_solve_plain"), w.write.helper("fg_solve")
 
     def text(name: str, a: View, b: View, out: View) -> str:
         n, columns = out.shape[-2:]
         made = index(out.strides[-2:], "ij")
+        given = f"""    for (int32_t i = 0; i < {n}; i++) {{
+        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{index(a.strides[-2:], "ij")}];
+        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{index(b.strides[-2:], "ij")}];
+    }}
+"""
+        where = "FG_INLINE" if n * (n + columns) <= _SMALL else "FG_APART"
         return f"""/* ({n} x {n}) x = ({n} x {columns}) */
-static FG_APART void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
+static {where} void {name}(const {real} *restrict a, const {real} *restrict b, {real} *restrict out)
 {{
     {real} matrix[{n * n}], right[{n * columns}];
-    for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = a[{index(a.strides[-2:], "ij")}];
-    for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = b[{index(b.strides[-2:], "ij")}];
-    {helper}(matrix, right, {n}, {columns});
+{given}    if (!{plain}(matrix, right, {n}, {columns})) {{
+{given.replace("    ", "        ", 1)}        {exchanging}(matrix, right, {n}, {columns});
+    }}
     for (int32_t i = 0; i < {n}; i++)
         for (int32_t j = 0; j < {columns}; j++) out[{made}] = right[{columns} * i + j];
 }}
@@ -301,6 +354,27 @@ def _replay(w: Lines, m: Macro) -> None:
     w.line("}")
 
 
+def choice_call(w: Lines, m: Macro) -> str:
+    """The call of the function that makes a choice, which a file has once."""
+    choice = m.extra["choice"]
+    name = w.write.function(("choice", choice.key), "choice", w.write.choice, choice)
+    places = [f"&{w.at(v.buffer, str(v.offset))}" for v in (*m.inputs[1:], m.output)]
+    return f"{name}(s, {', '.join(places)});"
+
+
+def _choose(w: Writer, m: Macro) -> None:
+    """What is rarely taken is computed only then."""
+    called, when = choice_call(w, m), w.ref(m.args[0])
+    w.line(f"if ({when}) {{" if m.extra["truth"] else f"if (!({when})) {{")
+    w.line(f"    {called}")
+    w.line("} else {")
+    w.depth += 1
+    with Loops(w, m.output.shape) as at:
+        w.line(f"{element(w, m.output, at)} = {element(w, m.inputs[0], at)};")
+    w.depth -= 1
+    w.line("}")
+
+
 def _random(w: Lines, m: Macro) -> None:
     name = w.write.helper(f"fg_{m.extra['draws']}")
     blocks = m.output.buffer.size // 4
@@ -309,7 +383,7 @@ def _random(w: Lines, m: Macro) -> None:
            f"{w.at(m.inputs[0].buffer, '1')});")  # fmt: skip
 
 
-_MACROS: dict[str, Callable[[Lines, Macro], None]] = {
+_MACROS: dict[str, Callable[[Any, Macro], None]] = {
     "matmul": _matmul,
     "cholesky": _cholesky,
     "solve": _solve,
@@ -320,5 +394,6 @@ _MACROS: dict[str, Callable[[Lines, Macro], None]] = {
     "sort": _sort,
     "argsort": _sort,
     "random": _random,
+    "choose": _choose,
     "replay": _replay,
 }

@@ -29,3 +29,13 @@ MACROS = """#ifdef __cplusplus
 #define FG_SIMD(text)
 #endif
 """
+
+PACK = """/* numbers that are added together: a vector with FLOWGRAPH_SIMD, else one */
+#ifdef FLOWGRAPH_SIMD
+typedef REAL fg_pack __attribute__((vector_size(32)));
+#else
+typedef REAL fg_pack;
+#endif
+#define FG_PACK ((int32_t)(sizeof(fg_pack) / sizeof(REAL)))
+#define FG_PACKS(n) (((n) + FG_PACK - 1) / FG_PACK)
+"""

@@ -144,12 +144,27 @@ def _write_state(made: Schedule, users: dict[Node, list[Group]]) -> None:
                 at = places.get((item.extra[1], item.extra[2]))
                 ends = users[item] if item.space else []
                 safe = all(g[0] < first or (at is not None and (g[0] < at[0] or g == at)) for g in ends)
+                safe = safe or not any(
+                    _overlap(
+                        _reach(item.extra[1], item.extra[2], item.space), _reach(s.offset, s.strides, s.space)
+                    )
+                    for s in written
+                )
             else:
                 level, space = group_of(item)
                 safe = level < first or (level == first and not space)
             if not safe:
                 made.late[buffer] = Buffer("", buffer.dtype, buffer.size, "work")
                 break
+
+
+def _reach(offset: int, strides: tuple[int, ...], space: Space) -> tuple[int, int]:
+    """The first and last place that is read or written in loops."""
+    return offset, offset + sum(s * (n - 1) for s, n in zip(strides, space, strict=False))
+
+
+def _overlap(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    return a[0] <= b[1] and b[0] <= a[1]
 
 
 def _spans(made: Schedule, users: dict[Node, list[Group]]) -> None:

@@ -15,7 +15,8 @@ import numpy as np
 from flowgraph.engines.c.nodes import Node, Tape, View
 from flowgraph.engines.c.values import Value, Values, lanes, row_major, space_of, unrolled
 from flowgraph.pipeline.pipeline import kind_of
-from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.namespaces import LEAST_ANGLE
+from flowgraph.recorder.ops import SINC, Spec
 
 
 class Shapes:
@@ -35,6 +36,10 @@ class Shapes:
         parts = [self.form.aligned(a, spec.shape) for a in args]
         if op == "square":
             op, parts = "multiply", [parts[0], parts[0]]
+        if op == SINC:
+            least: Any = np.array(self.tape.const(LEAST_ANGLE, spec.dtype), object)
+            size = self.combine("maximum", spec, self.combine("abs", spec, *parts), least)
+            op, parts = "divide", [self.combine("sin", spec, size), size]
         return Value(spec, self.combine(op, spec, *parts))
 
     def combine(self, op: str, spec: Spec, *parts: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 
 from flowgraph.engines.c.expressions import Expressions
@@ -14,6 +14,7 @@ from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, 
 from flowgraph.engines.c.syntax import comment, number
 from flowgraph.recorder.ops import FUNCTIONS
 
+_OFTEN = 3  # quotients by one number, from which on it is inverted
 _SHORT = 50  # characters of an expression that is written where it is used
 
 
@@ -32,6 +33,8 @@ class Writer(Lines):
         self.uniform: dict[Node, str] = {}
         self.local: dict[Node, str] = {}
         self.place, self.flat = "", False
+        self.often: set[Node] = set()
+        self.inverse: dict[Node, str] = {}
         self.kept = {i.node for i in plan.items if isinstance(i, Store) and i.buffer.kind == "state"}
         self.groups: dict[tuple[int, Space], list[Node | Store]] = defaultdict(list)
         self.straight: dict[int, list[Node | Store | Macro]] = defaultdict(list)
@@ -120,6 +123,9 @@ class Writer(Lines):
             self.depth += 1
         self.local = {}
         late: list[Store] = []
+        self.inverse = {}
+        divisors = Counter(i.args[1] for i in items if isinstance(i, Node) and _is_quotient(i))
+        self.often = {n for n, count in divisors.items() if count >= _OFTEN}
         for item in items:
             if isinstance(item, Store):
                 if item.buffer.kind == "state":
@@ -143,7 +149,7 @@ class Writer(Lines):
         for node in reductions:
             if node.extra[0] in ("max", "min") and node.dtype == "real":
                 self.settle(node)
-        self.local = {}
+        self.local, self.often = {}, set()
         self.place = ""
 
     flag_type, no_flag = "int", "0"
@@ -267,7 +273,11 @@ class Writer(Lines):
             return f"(int64_t)i{node.extra}"
         if node.op == "gather":
             buffer, offset, strides, step, size = node.extra
-            clip = f"{self.write.helper('fg_clip')}((int64_t){self.ref(node.args[0])}, {size})"
+            (at,) = node.args
+            if at.dtype == "int32":
+                clip = f"{self.write.helper('fg_clip_32')}({self.ref(at)}, {size})"
+            else:
+                clip = f"{self.write.helper('fg_clip')}((int64_t){self.ref(at)}, {size})"
             scaled = clip if step == 1 else f"{step} * {clip}"
             rest = self.index(offset, strides)
             return self.at(buffer, scaled if rest == "0" else f"{rest} + {scaled}")
@@ -278,7 +288,22 @@ class Writer(Lines):
             whole = self.names(buffer) + (f" + {offset}" if offset else "")
             array = f"&{whole}" if buffer.bare else whole
             return f"{name}({array}, {size}, {self.ref(node.args[0])}, {int(side == 'right')})"
+        if _is_quotient(node) and node.args[1] in self.often:
+            return self._times_inverse(*node.args)
         return self.write.write(node, [self.ref(a) for a in node.args])
+
+    def _times_inverse(self, a: Node, b: Node) -> str:
+        """A quotient by what is divided by often: one division takes as long as ten products."""
+        if b not in self.inverse:
+            one = number(1.0, b.dtype, self.write.real)
+            divisor = self.ref(b)
+            self.inverse[b] = f"u{b.order}"
+            self.line(f"const {self.type_of(b)} u{b.order} = {one} / {divisor};")
+        return f"{self.ref(a)} * {self.inverse[b]}"
+
+
+def _is_quotient(node: Node) -> bool:
+    return node.op == "divide" and node.dtype == "real" and node.args[1].space != ()
 
 
 def _closed(text: str) -> bool:

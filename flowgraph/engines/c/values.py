@@ -143,6 +143,15 @@ class Values:
             return View(view.buffer, v.shape, view.offset, wanted)
         return self.put(Value(v.spec, self.elements(v)), wanted)
 
+    def own(self, v: Value) -> View:
+        """The array in memory in C's order, and not among the constants."""
+        view = self.packed(v)
+        if view.buffer.kind != "const":
+            return view
+        made = View(self.tape.work(v.spec.dtype, math.prod(v.shape)), v.shape, 0, row_major(v.shape))
+        self.write(made, self.elements(v))
+        return made
+
     def put(self, v: Value, strides: tuple[int, ...]) -> View:
         elements = self.elements(v)
         flat = list(elements.ravel())

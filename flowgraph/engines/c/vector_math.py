@@ -154,7 +154,7 @@ static FG_INLINE {real} {{name}}"""
 """,
         ),
         "fg_sincos": (
-            ("fg_bits",),
+            ("fg_bits", "fg_from_bits"),
             start.format(
                 what="sine and cosine on the quarter turn nearest to x; NaN where it cannot be told exactly",
                 name="fg_sine",
@@ -171,9 +171,9 @@ static FG_INLINE {real} fg_quarter({real} x, {word} more) {{
     const {real} t = x * {n(2 / math.pi)} + {n(rounds)};
     const {real} k = t - {n(rounds)};
     const {real} r = {rest};
-    const {word} q = fg_bits(t) + more;
-    const {real} y = (q & 1u) ? fg_cosine(r) : fg_sine(r);
-    return fabs{f}(x) <= {n(form.most)} ? ((q & 2u) ? -y : y) : NAN;
+    const {word} q = fg_bits(t) + more, odd = 0u - (q & 1u);
+    const {word} y = (fg_bits(fg_cosine(r)) & odd) | (fg_bits(fg_sine(r)) & ~odd); /* by no branch */
+    return fabs{f}(x) <= {n(form.most)} ? fg_from_bits(y ^ ((q & 2u) << {form.bits - 2})) : NAN;
 }}
 """,
         ),

@@ -9,36 +9,36 @@ import numpy as np
 from flowgraph.engines.comparisons import COMPARISONS
 from flowgraph.engines.fixed import rules, shifts
 from flowgraph.engines.fixed.shifts import Site
-from flowgraph.engines.fixed.text import Text
+from flowgraph.engines.fixed.text import Text, never_none, unless_none
 from flowgraph.errors import LoweringError
-from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.ops import SINC, Spec
 
 _JOIN = {"logical_and": "&&", "logical_or": "||"}
 _BITS = {"bitwise_and": "&", "bitwise_or": "|", "bitwise_xor": "^"}
 _WHOLE = {"floor": 0, "ceil": 1, "trunc": 2, "round": 3}
-_ONE = {"sqrt": "fx_square_root", "exp": "fx_exponential", "log": "fx_logarithm"}
+_ONE = {"sqrt": "fx_square_root", "exp": "fx_exponential", "log": "fx_logarithm", SINC: "fx_sine_over"}
 _TWO = {"atan2": "fx_angle", "hypot": "fx_length"}
 
 
 class Elements(Text):
     """Text that knows the expression of one element."""
 
-    def element(self, s: Site, x: list[str], index: Sequence[str]) -> str:
+    def expression(self, s: Site, x: list[str], index: Sequence[str]) -> str:
         i, op = s.i, s.i.op
         kinds = [s.specs[a].dtype for a in i.args]
         if op in ("isnan", "isfinite"):
-            return (
-                f"{x[0]} {'==' if op == 'isnan' else '!='} FX_NAN"
-                if kinds[0] == "real"
-                else str(int(op != "isnan"))
-            )
+            if kinds[0] != "real" or never_none(x[0]):
+                return str(int(op != "isnan"))
+            return f"{x[0]} {'==' if op == 'isnan' else '!='} FX_NAN"
         if op == "materialise" or op == "positive":
             return x[0]
         if op == "negative":
-            text = f"-{x[0]}" if kinds[0] == "real" else self.wrapped(f"-(uint64_t){x[0]}", i.spec)
-            return f"{x[0]} == FX_NAN ? FX_NAN : {text}" if kinds[0] == "real" else text
+            if kinds[0] == "real":
+                return unless_none(x[0], f"-{x[0]}")
+            return self.wrapped(f"-(uint64_t){x[0]}", i.spec)
         if op == "abs":
-            return f"{x[0]} == FX_NAN ? FX_NAN : fx_abs({x[0]})" if kinds[0] == "real" else f"fx_abs({x[0]})"
+            size = f"fx_abs({x[0]})"
+            return unless_none(x[0], size) if kinds[0] == "real" else size
         if op == "astype":
             return self.cast(s, x[0], kinds[0], index)
         if "real" in kinds:
@@ -78,9 +78,7 @@ class Elements(Text):
             for f in s.f
         ]
         if op == "where":
-            kept = [
-                f"({a} == FX_NAN ? FX_NAN : fx_shift({a}, {e}))" for a, e in zip(x[1:], ends[1:], strict=True)
-            ]
+            kept = [unless_none(a, f"fx_shift({a}, {e})") for a, e in zip(x[1:], ends[1:], strict=True)]
             return f"{x[0]} ? {kept[0]} : {kept[1]}"
         if op == "copysign":
             return (

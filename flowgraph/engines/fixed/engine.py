@@ -25,7 +25,7 @@ from flowgraph.pipeline.formats import (
     whole_numbers,
 )
 from flowgraph.pipeline.pipeline import Pipeline
-from flowgraph.pipeline.program import Program, needed, specialise
+from flowgraph.pipeline.program import Program, needed_of, specialise
 from flowgraph.recorder.ops import Spec
 from flowgraph.types import DTYPES
 
@@ -192,7 +192,7 @@ class Integers:
             if step.op == "divide" and not np.all(given[1]):
                 by_zero[step.out] = np.broadcast_to(given[1] == 0, np.shape(made))
         if cut or by_zero:
-            taken = needed(bound.program, env)
+            taken = needed_of(bound.program, env, [*cut, *by_zero])
             for kind, found in (("saturations", cut), ("divisions_by_zero", by_zero)):
                 for value, off in found.items():
                     self.counts.add(kind, value, off & taken.get(value, False))

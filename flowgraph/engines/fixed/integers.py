@@ -101,6 +101,14 @@ def sine(x: Ints, fraction: Ints, out: Ints, *, ahead: int = 0) -> Ints:
     return np.where(n & 2, -value, value)
 
 
+def sinc(x: Ints, fraction: Ints, out: Ints) -> Ints:
+    """sin(x) / x, or 1 at 0, of words in radians."""
+    turns = shift(x * QUARTER_TURNS, fraction + 1)
+    r = turns - (((turns + (1 << 29)) >> 30) << 30)
+    near = shift(_horner(SINC, (r * r + (1 << 29)) >> 30), 30 - out)
+    return np.where(r == turns, near, quotient(sine(x, fraction, np.int64(30)), x, out + fraction - 30))
+
+
 LOG2_E = np.int64(round(math.log2(math.e) * 2**30))
 LN_2 = np.int64(round(math.log(2.0) * 2**30))
 POWER = [round(math.log(2.0) ** k / math.factorial(k) * 2**30) for k in range(9)]

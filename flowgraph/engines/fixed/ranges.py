@@ -183,6 +183,9 @@ def _held(pipeline: Pipeline) -> frozenset[int]:
             found.update(a for a in i.args if specs[a].dtype == "real")
         elif i.out in found and i.op == "divide":
             found.add(i.args[0])
+    for i in pipeline.instructions:  # and what is added to them: an adder costs less than a multiplier
+        if i.spec.dtype == "real" and i.op in _CARRYING | MOVES and any(a in found for a in i.args):
+            found.add(i.out)
     return frozenset(found - set(pipeline.constants))
 
 

@@ -34,7 +34,7 @@ from flowgraph.engines.fixed.shifts import (
 from flowgraph.errors import LoweringError
 from flowgraph.pipeline.formats import FREE, NOT_A_NUMBER
 from flowgraph.recorder.namespaces import NUMPY
-from flowgraph.recorder.ops import OPS, bound_attrs
+from flowgraph.recorder.ops import OPS, SINC, bound_attrs
 
 
 def _shifting(by: np.ndarray) -> Run:
@@ -289,6 +289,7 @@ _REAL: dict[str, Callable[[Site], Run]] = {
     "sqrt": _of_one(z.square_root),
     "sin": _of_one(z.sine),
     "cos": _of_one(z.sine, ahead=1),
+    SINC: _of_one(z.sinc),
     "exp": _of_one(z.exponential),
     "log": _of_one(z.logarithm),
     "atan2": _of_two(z.angle),

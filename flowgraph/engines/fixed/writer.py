@@ -8,8 +8,8 @@ import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
 from flowgraph.engines.fixed.elements import Elements
-from flowgraph.engines.fixed.shifts import Site, slim
-from flowgraph.engines.fixed.text import flat, plus
+from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.fixed.text import flat, narrow, plus, unless_none, wide
 from flowgraph.errors import LoweringError
 from flowgraph.recorder.trace import Instruction
 
@@ -26,6 +26,7 @@ class Writer(Elements):
     def tick(self, key: int) -> tuple[list[str], str]:
         """The bodies of the functions that compute a tick, in order, and of the one that ends it."""
         self.bound = self.player.bind(key)
+        self.places.begin(key, self.bound)
         program, width, widths = self.bound.program, self.player.formats.width, self.bound.widths
         doubtful = absent.may_be_nan(program.instructions, self.player.formats.absent)
         bodies = []
@@ -75,17 +76,20 @@ class Writer(Elements):
         i = s.i
         real = i.spec.dtype == "real"
         with self.loops(i.spec.shape) as index:
-            place, args = self.word(i.out, index), [self.word(a, index) for a in i.args]
-            text = self.element(s, args, index)
+            place, args = self.to(i.out, index), [self.word(a, index) for a in i.args]
+            text = self.expression(s, args, index)
             if real and i.op in _LOSE:
-                text = f"fx_lost({text}, {_LOSE[i.op].format(*args)}, &lost[{self.counter(i.out)}])"
+                text = f"fx_lost({text}, {_LOSE[i.op].format(*args)}, &{self.counter(i.out)})"
             if lost and i.op not in _PASS:
                 none = " || ".join(f"{self.word(a, index)} == FX_NAN" for a in lost)
                 text = f"{none} ? {'FX_NAN' if real else int(i.op == 'not_equal')} : {text}"
             if real and i.op == "divide":
-                self.put(f"if ({args[1]} == 0) FX_MARK({place[2:-1]}, 2);")
+                self.put(f"if ({args[1]} == 0) {self.by_zero(place)}")
             fits = not real or i.op in shifts.MOVES
-            self.put(f"{place} = {text};" if fits else self.fitted(place, text))
+            if fits:
+                self.put_to(place, text)
+            else:
+                self.put(self.fitted(place, text))
 
     def refuse_lost(self, i: Instruction, lost: list[int]) -> None:
         if lost:
@@ -137,12 +141,10 @@ class Writer(Elements):
         if i.op == "matmul":
             *batch, row, _, column = index
             a, b = (self.shape(n) for n in i.args)
-            return self.word(
-                i.out, [*batch, *([row] if len(a) > 1 else []), *([column] if len(b) > 1 else [])]
-            )
+            return self.to(i.out, [*batch, *([row] if len(a) > 1 else []), *([column] if len(b) > 1 else [])])
         if i.attrs.get("keepdims", False):
-            return self.word(i.out, index)
-        return self.word(i.out, [x for n, x in enumerate(index) if n not in axes])
+            return self.to(i.out, index)
+        return self.to(i.out, [x for n, x in enumerate(index) if n not in axes])
 
     def along(self, s: Site) -> None:
         """Reductions that keep or compare: any, all, whole sums, extremes and where they are."""
@@ -176,9 +178,10 @@ class Writer(Elements):
                     at - (s.out if keep else np.expand_dims(np.broadcast_to(s.out, i.spec.shape), axes)),
                     index,
                 )
-                statement = self.fitted(self.word(i.out, out), f"fx_shift(best, {end})")
+                statement = self.fitted(self.to(i.out, out), f"fx_shift(best, {end})")
             else:
-                statement = f"{self.word(i.out, out)} = {value};"
+                to = self.to(i.out, out)
+                statement = f"{to} = {narrow(to, value)};"
             self.put(f"(void)place; (void)k; {statement} }}")
             self.indent -= 1
 
@@ -199,10 +202,10 @@ class Writer(Elements):
                 if real:
                     self.put(f"sum += fx_cut(fx_shift({x}, {self.shift(by, here)}), INT64_C({most}));")
                     text = f"fx_shift(sum, {self.shift(last, here)})"
-                    self.put(self.fitted(self.word(i.out, here), text))
+                    self.put(self.fitted(self.to(i.out, here), text))
                 else:
                     self.put(f"sum = {self.wrapped(f'(uint64_t)sum + (uint64_t){x}', i.spec)};")
-                    self.put(f"{self.word(i.out, here)} = sum;")
+                    self.put_to(self.to(i.out, here), "sum")
             self.indent -= 1
             self.put("}")
 
@@ -214,15 +217,16 @@ class Writer(Elements):
             left, right = shifts.shifts_of_search(s)
             with self.loops(i.spec.shape) as index:
                 q = self.shift(right, index)
-            p = f"{self.table(np.broadcast_to(left, (n,)))}[middle]"
+            p = self.row(np.broadcast_to(left, (n,)), "middle")
         order = "<=" if i.attrs.get("side", "left") == "right" else "<"
-        base = self.at(i.args[0], (n,))
+        middle = wide(self.element(i.args[0], (n,), "middle"))
         with self.loops(i.spec.shape) as index:
             self.put(f"{{ int64_t low = 0, high = {n}, x = fx_shift({self.word(i.args[1], index)}, {q});")
             self.put("  while (low < high) { int64_t middle = (low + high) / 2;")
-            before = f"fx_shift(w[{base} + middle], {p}) {order} x"
+            before = f"fx_shift({middle}, {p}) {order} x"
             self.put(f"    if ({before}) low = middle + 1; else high = middle; }}")
-            self.put(f"  {self.word(i.out, index)} = low; }}")
+            self.put_to(self.to(i.out, index), "low")
+            self.put("}")
 
     def order(self, s: Site) -> None:
         """Sorting by insertion, which keeps the order of what is equal."""
@@ -241,15 +245,16 @@ class Writer(Elements):
             def key(name: str) -> str:
                 return f"fx_shift({self.word(i.args[0], along(name))}, {self.shift(by, along(name))})"
 
-            k, m, n = (self.word(i.out, along(name)) for name in "kmn")
+            k, m, n = (self.to(i.out, along(name)) for name in "kmn")
             self.put(f"for (int n = 0; n < {shape[axis]}; ++n) {{ int64_t x = {key('n')}; int k = n;")
             held = "m" if i.op == "sort" else f"(int){m}"
             self.put(f"  for (; k > 0; --k) {{ int m = k - 1; {k} = {m}; m = {held};")
-            self.put(f"    if ({m if i.op == 'sort' else key('m')} <= x) break; }}")
-            self.put(f"  {k} = {'x' if i.op == 'sort' else 'n'}; }}")
+            self.put(f"    if ({wide(m) if i.op == 'sort' else key('m')} <= x) break; }}")
+            self.put(f"  {k} = {narrow(k, 'x' if i.op == 'sort' else 'n')}; }}")
             if i.op == "sort" and i.spec.dtype == "real":
                 end = self.shift(at - np.broadcast_to(s.out, shape), along("n"))
-                self.put(f"for (int n = 0; n < {shape[axis]}; ++n) {self.fitted(n, f'fx_shift({n}, {end})')}")
+                fitted = self.fitted(n, f"fx_shift({wide(n)}, {end})")
+                self.put(f"for (int n = 0; n < {shape[axis]}; ++n) {fitted}")
 
     def move(self, s: Site) -> None:
         i = s.i
@@ -260,7 +265,7 @@ class Writer(Elements):
             kept = "<=" if i.op == "tril" else ">="
             with self.loops(i.spec.shape) as index:
                 inside = f"{index[-1]} - {index[-2]} {kept} {i.attrs.get('k', 0)}"
-                self.put(f"{self.word(i.out, index)} = {inside} ? {self.word(i.args[0], index)} : 0;")
+                self.put_to(self.to(i.out, index), f"{inside} ? {self.word(i.args[0], index)} : 0")
             return
         if i.op in ("concat", "stack"):
             axis = i.attrs["axis"] % len(i.spec.shape)
@@ -268,15 +273,18 @@ class Writer(Elements):
             for a in i.args:
                 shape = self.shape(a)
                 block = shape if i.op == "concat" else (*shape[:axis], 1, *shape[axis:])
-                with self.loops(block) as index:
-                    to = [plus(start, x) if n == axis else x for n, x in enumerate(index)]
-                    source = index if i.op == "concat" else [x for n, x in enumerate(index) if n != axis]
-                    self.put(f"{self.word(i.out, to)} = {self.word(a, source)};")
+                begin = start * math.prod(shape[axis:]) if i.op == "stack" and axis == 0 else -1
+                if not self.places.lies(a, i.out, begin):
+                    with self.loops(block) as index:
+                        to = [plus(start, x) if n == axis else x for n, x in enumerate(index)]
+                        source = index if i.op == "concat" else [x for n, x in enumerate(index) if n != axis]
+                        self.put_to(self.to(i.out, to), self.word(a, source))
                 start += block[axis]
+            return
+        if self.places.lies(i.out, i.args[0]):
             return
         shape = self.shape(i.args[0])
         where = shifts.moved_from(i, shape)
-        begin = self.at(i.args[0], shape)
         affine = _affine(where)
         with self.loops(i.spec.shape) as index:
             if affine is None:
@@ -289,7 +297,7 @@ class Writer(Elements):
                     if k and x != "0"
                 ]
                 found = " + ".join([*([str(base)] if base or not parts else []), *parts])
-            self.put(f"{self.word(i.out, index)} = w[{plus(begin, found)}];")
+            self.put_to(self.to(i.out, index), wide(self.element(i.args[0], shape, found)))
 
     def take(self, s: Site) -> None:
         i = s.i
@@ -300,7 +308,7 @@ class Writer(Elements):
         if real:
             f = s.real(0)
             by = shifts.between(f, np.broadcast_to(f.min(axis=axis, keepdims=True), f.shape))
-        by = slim(np.broadcast_to(by, shape)) if real else by
+        by = np.broadcast_to(by, shape) if real else by
         with self.loops(i.spec.shape) as index:
             chosen = self.word(i.args[1], index[axis : axis + len(indices)])
             at = [*index[:axis], "n", *index[axis + len(indices) :]]
@@ -309,7 +317,8 @@ class Writer(Elements):
             )
             x = self.word(i.args[0], at)
             text = f"fx_shift({x}, {self.shift(by, at)})" if real else x
-            self.put(f"  {self.word(i.out, index)} = {text}; }}")
+            self.put_to(self.to(i.out, index), text)
+            self.put("}")
 
     def writes(self) -> None:
         """Registers at the end of a tick; all are read before the first is written."""
@@ -322,17 +331,15 @@ class Writer(Elements):
             by = np.zeros((), np.int64)
             if real:
                 by = shifts.between(self.bound.fractions[n], self.bound.fractions[c.read])
-            kept = self.at(-1 - c.read, c.shape)
             with self.loops(c.shape) as index:
                 x = self.word(n, index)
-                text = f"({x} == FX_NAN ? FX_NAN : fx_shift({x}, {self.shift(by, index)}))" if real else x
-                to = f"w[{plus(kept, flat(c.shape, index))}]"
+                text = unless_none(x, f"fx_shift({x}, {self.shift(by, index)})") if real else x
+                to = self.element(-1 - c.read, c.shape, flat(c.shape, index))
                 self.most = self.bound.most(c.read) if real else None
-                self.put(self.fitted(to, text) if real else f"{to} = {text};")
+                self.put(self.fitted(to, text) if real else f"{to} = {narrow(to, text)};")
             size = max(math.prod(c.shape), 1)
-            later.append(
-                f"for (int k = 0; k < {size}; ++k) w[{self.at(c.read, c.shape)} + k] = w[{kept} + k];"
-            )
+            new, old = (self.element(n, c.shape, "k") for n in (-1 - c.read, c.read))
+            later.append(f"for (int k = 0; k < {size}; ++k) {old} = {new};")
         for copy in later:
             self.put(copy)
 

@@ -72,7 +72,7 @@ class Functions(Nodes, abc.ABC):
             total = self.sum([Term("MUL", total, u, 30), self.plain(self.constant(c))], mode="RAW")
         return total
 
-    def sine(self, x: int, fraction: int, out: int, ahead: int) -> int:
+    def sine(self, x: int, fraction: int, out: int, ahead: int, mode: str = "FIT") -> int:
         known = self.known(x)
         if known is not None:
             f, o = np.int64(fraction), np.int64(out)
@@ -84,17 +84,31 @@ class Functions(Nodes, abc.ABC):
         u = self.sum([Term("MUL", r, r, 30)], mode="RAW")
         sinc, cosine = self._polynomial(z.SINC, u), self._polynomial(z.COSINE, u)
         turned = self.sum([Term("MUL", r, self.constant(z.QUARTER), 30)], mode="RAW")
-        sin = self.sum([Term("MUL", turned, sinc, 60 - out)])
-        cos = self.sum([self.plain(cosine, 30 - out)])
+        sin = self.sum([Term("MUL", turned, sinc, 60 - out)], mode=mode)
+        cos = self.sum([self.plain(cosine, 30 - out)], mode=mode)
         if ahead:
             n = self.sum([self.plain(n), self.plain(self.one)], mode="RAW")
         else:
-            small = self.sum([Term("MUL", x, sinc, fraction + 30 - out)])
-            sin = self.sum([Term("SEL", sin, n), Term("SELN", small, n)])
+            small = self.sum([Term("MUL", x, sinc, fraction + 30 - out)], mode=mode)
+            sin = self.sum([Term("SEL", sin, n), Term("SELN", small, n)], mode=mode)
         odd = self.sum([Term("AND", n, self.one)], mode="RAW")
-        value = self.sum([Term("SEL", cos, odd), Term("SELN", sin, odd)])
+        value = self.sum([Term("SEL", cos, odd), Term("SELN", sin, odd)], mode=mode)
         back = self.sum([Term("AND", n, self.constant(2))], mode="RAW")
-        return self.sum([Term("SEL", value, back, 0, True), Term("SELN", value, back)])
+        return self.sum([Term("SEL", value, back, 0, True), Term("SELN", value, back)], mode=mode)
+
+    def sinc(self, x: int, fraction: int, out: int) -> int:
+        """sin(x) / x: as a polynomial near 0, as a quotient elsewhere."""
+        known = self.known(x)
+        if known is not None:
+            return self._folded(z.sinc(np.int64(known), np.int64(fraction), np.int64(out)))
+        self._whole_turns("unnormalized_sinc", fraction)
+        turns = Term("MUL", x, self.constant(z.QUARTER_TURNS), fraction + 1)
+        n = self.sum([turns], end=30, mode="RAW")
+        r = self.sum([turns, self.plain(n, -30, True)], mode="RAW")
+        u = self.sum([Term("MUL", r, r, 30)], mode="RAW")
+        near = self.sum([self.plain(self._polynomial(z.SINC, u), 30 - out)])
+        far = self.quotient(self.sine(x, fraction, 30, 0, "RAW"), x, out + fraction - 30)
+        return self.sum([Term("SEL", far, n), Term("SELN", near, n)])
 
     def _whole_turns(self, name: str, fraction: int) -> None:
         if fraction < 0:

@@ -89,6 +89,9 @@ class Real(Functions):
     def _cos(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._of_one(lambda x, f, out: self.sine(x, f, out, 1), s, a)
 
+    def _unnormalized_sinc(self, s: Site, a: np.ndarray) -> np.ndarray:
+        return self._of_one(self.sinc, s, a)
+
     def _exp(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._of_one(self.exponential, s, a)
 

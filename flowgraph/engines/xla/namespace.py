@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.recorder import ranges
+from flowgraph.recorder.namespaces import unnormalized_sinc
 from flowgraph.recorder.ops import OPS, bound_attrs
 from flowgraph.recorder.replay import Case, body_of
 
@@ -46,6 +47,9 @@ class JaxNamespace:
     def float32_bits(self, x: Any) -> Any:
         jnp = self._jax.numpy
         return self._jax.lax.bitcast_convert_type(x.astype(jnp.float32), jnp.int32)
+
+    def unnormalized_sinc(self, x: Any) -> Any:
+        return unnormalized_sinc(x, self._jax.numpy)
 
     def floor_divide(self, a: Any, b: Any) -> Any:
         return ranges.floor_divide(self._jax.numpy, a, b)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from flowgraph.pipeline.optimise.elements import MOVES
 from flowgraph.pipeline.pipeline import kind_of
-from flowgraph.recorder.ops import ELEMENTWISE, FUNCTIONS, Spec
+from flowgraph.recorder.ops import ELEMENTWISE, FUNCTIONS, SINC, Spec
 from flowgraph.recorder.replay import body_of
 from flowgraph.recorder.trace import Instruction
 
@@ -58,7 +58,9 @@ def operations(i: Instruction, specs: Mapping[int, Spec]) -> Counter[str]:
     if i.op == "replay":
         return Counter({kind: first.shape[0] * n for kind, n in _longest_turn(i, specs)[0].items()})
     real = first.dtype == "real" or i.spec.dtype == "real"
-    if i.op == "hypot":
+    if i.op == SINC:
+        found.update(function=size, divide=size, compare=size)
+    elif i.op == "hypot":
         found.update(multiply=2 * size, add=size, root=size)
     elif i.op in ELEMENTWISE:
         found[_KIND[i.op]] = size
@@ -132,7 +134,7 @@ def depth(i: Instruction, specs: Mapping[int, Spec]) -> int:
     if i.op == "replay":
         return first[0] * _longest_turn(i, specs)[1]
     if i.op in ELEMENTWISE:
-        return {"hypot": 3}.get(i.op, 1)
+        return {"hypot": 3, SINC: 3}.get(i.op, 1)
     if i.op in ("matmul", "vecdot"):
         return 1 + _levels(first[-1])
     if i.op in ("outer", "cross"):

@@ -28,6 +28,7 @@ from flowgraph.pipeline.costs.storage import (
     stores,
 )
 from flowgraph.pipeline.costs.timing import Interval, Machine, Slot, critical_path, interval, reach, schedule
+from flowgraph.pipeline.format_words import formats_by_path
 from flowgraph.pipeline.optimise import DEFAULT, Plan, check_passes, optimise, plan
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
@@ -225,8 +226,18 @@ def cost_report(
             _stores(whole),
             _fifos(whole),
             _energy(whole),
+            *_formats(pipeline),
         ),
     )
+
+
+def _formats(pipeline: Pipeline) -> list[Section]:
+    """The number formats, where the pipeline has some."""
+    rows = tuple(
+        {"path": path or pipeline.name, "words": words} for path, words in formats_by_path(pipeline).items()
+    )
+    note = "Of inputs, blocks and registers: the last bit of a word of fraction f is worth 2^-f."
+    return [Section("Number formats", note, rows)] if rows else []
 
 
 def _patterns(pipeline: Pipeline, costs: Mapping[int | None, Costs]) -> Section:

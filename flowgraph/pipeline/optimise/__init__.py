@@ -66,9 +66,9 @@ DEFAULT = tuple(PASSES)
 ARRAYS = ("fold", "share", "drop", "algebra")
 """Passes that keep arrays whole: for backends that are fast on arrays and slow on many small operations."""
 
-COMPILED = tuple(n for n in PASSES if n not in ("symmetry", "structure"))
-"""Passes for C, unless others are asked for. `symmetry` and `structure` cut large products into many small
-ones: `mirror` and `sparse` save as much in a fifth of the compiler's time."""
+COMPILED = tuple(n for n in PASSES if n != "structure")
+"""Passes for C, unless others are asked for. `structure` cuts large products into many small ones, symmetric
+ones too: `mirror` and `sparse` save as much in a fifth of the compiler's time."""
 
 RELYING = ("symmetry", "mirror")
 """Passes that take registers as symmetric which are so at reset: not for runs that begin otherwise."""
@@ -94,7 +94,7 @@ def optimise(
         ("share", share, {}),
         ("algebra", simplify, {}),
         ("drop", drop, {}),
-        ("symmetry", halve_products, {"largest": small}),
+        ("symmetry", halve_products, {"largest": small, "banded": "structure" in chosen}),
         ("structure", split_products, {"largest": small}),
         ("unroll", unroll, {"largest": unroll_work}),
         ("algebra", simplify, {}),

@@ -58,6 +58,10 @@ class Elements:
         """How many entries the table of a value has."""
         return math.prod(self.shape(self.specs[value]))
 
+    def longest(self, value: int) -> int:
+        """The longest axis of the table of a value."""
+        return max(self.shape(self.specs[value]), default=1)
+
     def expand(self, i: Instruction, tables: list[Table]) -> Table | None:
         """The table of an instruction's result from those of its arguments; None: there is no rule."""
         if any(n == 0 for n in i.spec.shape):

@@ -68,17 +68,18 @@ PLANS = ("loops", "reuse", "layout")
 """The passes by name that say how a program is run, and leave its list alone."""
 
 
-def plan(program: Program, passes: Collection[str] = PLANS) -> Plan:
+def plan(program: Program, passes: Collection[str] = PLANS, *, scalars: bool = False) -> Plan:
     """Loops, buffers and layout of a program.
 
     Args:
         program: as `optimise` left it.
         passes: without "loops" every instruction is a loop of its own, without "reuse" every array has a
             buffer of its own, without "layout" every array is in row-major order.
+        scalars: whether these have buffers as well, for whoever cannot leave them to a compiler.
     """
     groups = loops(program) if "loops" in passes else ()
     order = layout(program) if "layout" in passes else {}
-    buffers, place, view = _assign(program, groups, order, reuse="reuse" in passes)
+    buffers, place, view = _assign(program, groups, order, reuse="reuse" in passes, scalars=scalars)
     return Plan(groups, buffers, place, view, order)
 
 
@@ -94,7 +95,12 @@ def layout(program: Program) -> dict[int, tuple[int, ...]]:
 
 
 def _assign(
-    program: Program, groups: tuple[Loop, ...], order: Mapping[int, tuple[int, ...]], *, reuse: bool
+    program: Program,
+    groups: tuple[Loop, ...],
+    order: Mapping[int, tuple[int, ...]],
+    *,
+    reuse: bool,
+    scalars: bool,
 ) -> tuple[tuple[Buffer, ...], dict[int, int], dict[int, tuple[int, int]]]:
     step = list(range(len(program.instructions)))  # the whole of a loop is one step
     local: set[int] = set()
@@ -119,7 +125,7 @@ def _assign(
     for value in ends(program.outputs, program.writes):
         last[root[value]] = len(program.instructions)
     made = {i.out for i in program.instructions} - local
-    roots = [v for v in born if v in made and program.specs[v].shape != ()]
+    roots = [v for v in born if v in made and (scalars or program.specs[v].shape != ())]
     buffers, place = _shared(program, sorted(roots, key=born.__getitem__), born, last, reuse=reuse)
     return buffers, place, view
 

@@ -8,6 +8,7 @@ import math
 from flowgraph.pipeline.evaluate import evaluate
 from flowgraph.pipeline.optimise.draft import LARGEST_CONSTANT, Draft, ends
 from flowgraph.pipeline.program import Program
+from flowgraph.recorder.ops import OPS
 
 _COMMUTATIVE = """
 add multiply maximum minimum equal not_equal logical_and logical_or logical_xor bitwise_and bitwise_or
@@ -22,7 +23,7 @@ def fold(program: Program) -> Program:
     draft = Draft(program)
     for i in program.instructions:
         args = draft.args(i)
-        small = math.prod(i.spec.shape) <= LARGEST_CONSTANT
+        small = i.op in OPS and math.prod(i.spec.shape) <= LARGEST_CONSTANT
         if small and all(a in draft.constants for a in args):
             value = evaluate(i, *(draft.constants[a] for a in args))
             draft.replace(i.out, draft.constant(value, i.spec.dtype))

@@ -17,13 +17,14 @@ from flowgraph.recorder.trace import Instruction
 _BANDS = 5
 
 
-def halve_products(program: Program, *, largest: int = 0) -> Program:
+def halve_products(program: Program, *, largest: int = 0, banded: bool = True) -> Program:
     """Compute one half of each product that is known to be symmetric.
 
     Args:
         program: what to rewrite.
         largest: a product of at most so many multiplications is only marked, by an upper triangle and its
-            mirror: unrolling it then leaves the other half unused. A larger one is computed in bands of rows.
+            mirror: unrolling it then leaves the other half unused.
+        banded: compute a larger one in bands of rows; else it stays whole.
     """
     facts = facts_of(program)
     draft = Draft(program)
@@ -34,7 +35,7 @@ def halve_products(program: Program, *, largest: int = 0) -> Program:
             full = draft.emit("matmul", *draft.args(i), by=i)
             below = draft.emit("matrix_transpose", draft.emit("triu", full, by=i, k=1), by=i)
             draft.replace(i.out, draft.emit("add", draft.emit("triu", full, by=i), below, by=i))
-        elif i.spec.shape[0] > 1:
+        elif banded and i.spec.shape[0] > 1:
             draft.replace(i.out, _banded(draft, i))
         else:
             draft.keep(i)

@@ -20,6 +20,9 @@ from flowgraph.recorder.trace import Instruction
 LARGEST_ARRAY = 36
 """Elements (beside those along the axis of particles) of an array above which it stays one: 6 by 6."""
 
+LONGEST_AXIS = 16
+"""Beside that of particles: a longer one is a loop."""
+
 LARGEST_WORK = 256
 """Scalar operations of an instruction above which it stays one."""
 
@@ -54,7 +57,7 @@ class _Unroller:
         serves = self.program.origin.get(i.out, i.out)  # a piece of a large product stays with its likes
         if self.elements.count(i.out) > LARGEST_ARRAY or self.elements.count(serves) > LARGEST_ARRAY:
             return None
-        if self._work(i) > self.largest:
+        if self._work(i) > self.largest or self.elements.longest(i.out) > LONGEST_AXIS:
             return None
         if any(self.elements.count(a) > LARGEST_ARRAY for a in i.args if a not in self.program.constants):
             return None

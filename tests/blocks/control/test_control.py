@@ -60,6 +60,35 @@ def test_a_pid_loop_in_continuous_time_is_exact_however_seldom_it_is_looked_at(p
 
 
 @graph
+def demanded(clock: Stream[Tick], demand: Stream[Scalar]):
+    """The PID example of bdsim: P = 10 and I = 3 in front of 0.5 / (2 s + 1), a demand of 1 from 1 s on."""
+    closed = pid_action(10.0, 3.0, 0.0, filter=1.0).then(transfer([0.5], [2.0, 1.0])).fed_back()
+    body = plant(closed.model, start=np.zeros(len(closed.A)), command=0.0, at=clock)
+    body.feed(demand)
+    return body.output.map(lambda x: (closed.C @ x)[0])
+
+
+def test_the_pid_example_of_bdsim_is_its_closed_loop() -> None:
+    clock = ticks("10ms", until="10s")
+    found = all_engines(
+        demanded.build(), {"clock": clock, "demand": scalars([1000 * MS], [1.0])}
+    ).output.value
+
+    # 2 y' = -y + 0.5 (10 e + 3 z), z' = e = r - y, by a solver that knows nothing of blocks
+    def loop(t: float, x: np.ndarray) -> list[float]:
+        error = 1.0 - x[0]
+        return [0.5 * (-x[0] + 0.5 * (10.0 * error + 3.0 * x[1])), error]
+
+    after = clock.time[clock.time >= 1000 * MS] * 1e-9
+    solved = scipy.integrate.solve_ivp(
+        loop, (1.0, after[-1]), [0.0, 0.0], method="DOP853", t_eval=after, rtol=1e-13, atol=1e-14
+    )
+    want = np.concatenate([np.zeros(len(found) - len(after)), solved.y[0]])
+    np.testing.assert_allclose(found, want, atol=1e-9)
+    assert found[-1] == pytest.approx(1.0, abs=0.02)
+
+
+@graph
 def sampled(clock: Stream[Tick], *, lag: int, low: float, high: float):
     """A sampled PID in front of 1 / (s (s + 1)), whose output comes late."""
     system = transfer([1.0], [1.0, 1.0, 0.0])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +13,41 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from flowgraph.blocks.geometry import rotations as g
+from flowgraph.recorder.namespaces import NUMPY
+
+
+def series(x, first):
+    """The series of cos(x), or with 1 of sin(x) / x, in exact fractions."""
+    term, total, square = Fraction(1), Fraction(1), -(Fraction(x) ** 2)
+    for k in range(first + 2, 60, 2):
+        term *= square / (k * (k - 1))
+        total += term
+    return total
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_the_ratio_of_a_sine_to_its_angle_is_as_exact_as_a_number_can_be(kind):
+    x = np.concatenate(
+        [[0.0, 1e-300, 1e-20, 1e-9], np.geomspace(1e-8, 3.0, 300), -np.geomspace(1e-3, 1.5, 50)]
+    )
+    x = x.astype(kind)
+    got = g.sinc(x, xp=NUMPY)
+    assert got.dtype == kind
+    assert g.sinc(x, xp=np).tolist() == got.tolist()
+    last = np.finfo(kind).eps
+    for a, y in zip(x.tolist(), got.tolist(), strict=True):
+        true = series(a, 1)
+        assert abs(Fraction(y) - true) <= Fraction(float(last)) * abs(true) * 2  # two roundings
+
+
+def test_a_rotation_vector_of_any_size_gives_its_quaternion_to_the_last_bits():
+    rng = np.random.default_rng(3)
+    for size in (0.0, 1e-200, 1e-40, 1e-17, 1e-16, 1e-15, 1e-12, 1e-8, 1e-3, 0.3, 2.0):
+        v = size * rng.uniform(-1.0, 1.0, 3)
+        half = math.sqrt(math.fsum((0.5 * v) ** 2))
+        want = [float(series(half, 0)), *(float(series(half, 1) * Fraction(x) / 2) for x in v.tolist())]
+        np.testing.assert_allclose(g.from_rotation_vector(v, xp=NUMPY), want, rtol=4e-16, atol=2e-16 * half)
+
 
 numbers = st.floats(-1.0, 1.0, allow_subnormal=False)
 vectors = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0, allow_subnormal=False))

@@ -41,10 +41,10 @@ def _floating(folder, case, dtype):
 def _fixed(folder, case):
     pipeline = replace(plain(lower(case.graph, dtype="fixed")), formats=formats_of("complementary", 28, 0.3))
     write_fixed(pipeline, folder)
-    takes, names = "(int64_t *w, uint8_t *off, int64_t *lost, int key)", ("w", "off", "lost", "key")
+    takes, names = "(int32_t *v, int64_t *w, int64_t *count, int key)", ("v", "w", "count", "key")
     both = ("fx_compute", "fx_end")
     metered = [Metered(f"int {f}{takes}", f, names, "key", f == "fx_end") for f in both]
-    return f"{pipeline.name}_fixed.c", metered, "FX_WORDS * sizeof(int64_t)"
+    return f"{pipeline.name}_fixed.c", metered, "FX_SMALL * sizeof(int32_t) + FX_WIDE * sizeof(int64_t)"
 
 
 @needs_tools

@@ -26,9 +26,11 @@ from flowgraph import (
 from flowgraph.engines.fixed import rules
 from flowgraph.engines.fixed.ranges import Sizes
 from flowgraph.engines.options import RunOptions
+from flowgraph.engines.reference import Interpreter
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.pipeline.format_files import with_formats
 from flowgraph.pipeline.plain import plain
+from flowgraph.pipeline.program import needed, needed_of
 from flowgraph.recorder.random import seed_words
 from tests.graphs.library import library_case
 from tests.support import same
@@ -81,6 +83,7 @@ def mixed(x: Three, *, xp) -> Three:
     count = xp.astype(xp.floor(4.0 * x), xp.int32) % 3
     most = xp.max(turned) - xp.min(x) + xp.sum(x) / 3.0
     steps = xp.cumulative_sum(xp.abs(x)) + xp.asarray(count, dtype=x.dtype)
+    most = most + xp.sum(xp.unnormalized_sinc(3.0 * x) - xp.unnormalized_sinc(0.0 * x))
     return order * most + xp.remainder(steps, 1.5) - xp.round(up) + xp.copysign(xp.hypot(x, up), x)
 
 
@@ -250,3 +253,28 @@ def test_an_operation_without_a_form_is_named(monkeypatch):
     built = everything.build()
     with pytest.raises(LoweringError, match=r"test_fixed:\d+: hypot has no form in fixed point"):
         simulate(built, _flight(), engine="fixed", formats=sizes_of(built, _flight()).formats(24, 2.0))
+
+
+@pytest.mark.parametrize("name", ["kalman", "complementary", "orientation_complementary"])
+def test_what_some_values_bear_on_is_what_all_are_asked_for(name):
+    case = library_case(name, 0.3)
+    subject = LoweredGraph(case.graph)
+    pipeline = plain(subject.pipeline)
+    start = subject.start(RunOptions())
+    player = Interpreter(pipeline, start.cells, np.dtype(np.float64), seed_words(0))
+    tape = subject.tape(case.inputs, start.last)
+    rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
+    partly = 0
+    for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
+        given = [next(row) for k, row in enumerate(rows) if key >> k & 1]
+        with np.errstate(all="ignore"):
+            program, env = player.values(time, key, given)
+        player.cells = [env[n] for n in program.writes]
+        whole = needed(program, env)
+        outs = [i.out for i in program.instructions]
+        for n in outs:
+            found = needed_of(program, env, [n]).get(n, False)
+            wanted = np.broadcast_to(whole.get(n, False), np.shape(env[n]))
+            assert (np.broadcast_to(found, np.shape(env[n])) == wanted).all()
+            partly += not wanted.all()
+    assert partly

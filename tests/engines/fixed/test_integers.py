@@ -48,6 +48,7 @@ def test_products_quotients_and_roots_are_rounded_to_the_last_place(seed):
 FUNCTIONS: dict[str, tuple[Any, Any, float]] = {
     "sine": (lambda a, f, out: z.sine(a, f, out), np.sin, 4.0),
     "cosine": (lambda a, f, out: z.sine(a, f, out, ahead=1), np.cos, 4.0),
+    "sinc": (z.sinc, lambda x: np.sin(x) / x, 6.0),
     "angle": (lambda a, f, out: z.angle(a, a[::-1], f, f[::-1], out), lambda x: np.arctan2(x, x[::-1]), 1.0),
 }
 
@@ -64,6 +65,15 @@ def test_small_angles_keep_their_own_precision():
     a, f, x = words(10 ** RNG.uniform(-9, -2, 1000))
     out = finest(np.sin(x))
     assert error(z.sine(a, f, out), out, np.sin(x)) <= 4.0
+
+
+def test_a_ratio_of_a_sine_to_its_angle_is_one_at_zero_and_falls_from_there():
+    x = np.array([0.0, 2e-9, 1e-3, -0.5, 0.7, 0.79, -1.5, 3.1])
+    raw, f, x = np.ldexp(x, 29).astype(np.int64), np.int64(29), np.ldexp(np.floor(np.ldexp(x, 29)), -29)
+    want = np.where(x == 0.0, 1.0, np.sin(x) / np.where(x == 0.0, 1.0, x))
+    out = np.int64(30)
+    assert z.sinc(raw, f, out)[0] == 1 << 30
+    assert error(z.sinc(raw, f, out), out, want) <= 8.0
 
 
 def test_exponentials_logarithms_and_lengths():

@@ -57,6 +57,7 @@ def mixed(x: Three, y: Scalar, *, dt: float, xp) -> Three:
     count = xp.astype(xp.floor(4.0 * x), xp.int32) - 3
     some = xp.asarray(xp.any(x > 0.9), dtype=x.dtype) - xp.asarray(xp.all(x < 0.9), dtype=x.dtype)
     most = xp.max(turned) - xp.min(x) + xp.log(xp.abs(y) + 0.25) + dt
+    most = most - xp.max(xp.unnormalized_sinc(3.0 * x))
     kept = xp.minimum(x, y) @ xp.stack([x, up, turned])
     ends = xp.ceil(3.0 * x) + xp.trunc(5.0 * up) - xp.round(2.0 * x) + xp.sign(x)
     return (

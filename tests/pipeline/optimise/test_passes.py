@@ -189,6 +189,11 @@ def test_half_of_a_symmetric_product_is_computed(n):
     np.testing.assert_allclose(full, full.T, rtol=1e-12)
 
 
+def test_without_bands_a_large_product_stays_whole():
+    program = record(predict, (15, 15), (15, 15), memory=(1,), symmetric=(1,))
+    assert halve_products(program, banded=False).instructions == program.instructions
+
+
 def test_marked_and_unrolled_it_needs_a_triangle():
     program = record(predict, (6, 6), (6, 6), memory=(1,), symmetric=(1,))
     passes = ("symmetry", "unroll", "algebra", "fold", "share", "drop")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from flowgraph.engines.c.expressions import ARITHMETIC, IN_LANES, Expressions
 from flowgraph.engines.c.nodes import Buffer, Node
@@ -49,8 +49,8 @@ def no_lanes(what: str, origin: str) -> NoLanesError:
 class LaneExpressions(Expressions):
     """Writes operations on lanes; the arguments that it is given are vectors where the node varies."""
 
-    def __init__(self) -> None:
-        super().__init__("double")
+    def __init__(self, choice: Callable[..., str] = lambda *_: "") -> None:
+        super().__init__("double", choice=choice)
         self._varies: dict[Node, bool] = {}
 
     def ctype(self, dtype: str) -> str:

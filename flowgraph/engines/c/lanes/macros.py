@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from flowgraph.engines.c.lanes.expressions import no_lanes
 from flowgraph.engines.c.lines import Lines
-from flowgraph.engines.c.macros import Loops, call, element, index
+from flowgraph.engines.c.macros import Loops, call, choice_call, element, index
 from flowgraph.engines.c.nodes import Macro, View
 
 if TYPE_CHECKING:
@@ -88,22 +88,29 @@ static FG_APART void {name}(const {kinds[0]} *restrict a, fg_real *restrict out)
 
 def _solve(w: Lines, m: Macro) -> None:
     kinds = _types(w, m)
-    eliminate = w.write.function(("eliminate",), "solve", lambda name: SOLVE.replace("NAME", name))
+    exchanging = w.write.function(("eliminate",), "solve", lambda name: SOLVE.replace("NAME", name))
+    plain = w.write.function(("plain",), "solve_plain", lambda name: PLAIN.replace("NAME", name))
 
     def text(name: str, a: View, b: View, out: View) -> str:
         n, columns = out.shape[-2:]
         left, right = index(a.strides[-2:], ("i", "j")), index(b.strides[-2:], ("i", "j"))
+        given = f"""    for (int32_t i = 0; i < {n}; i++) {{
+        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = {_entry(kinds[0], f"a[{left}]")};
+        for (int32_t j = 0; j < {columns}; j++) right[{columns} * i + j] = {_entry(kinds[1], f"b[{right}]")};
+    }}
+"""
         return f"""/* ({n} x {n}) x = ({n} x {columns}) */
 static FG_APART void {name}(const {kinds[0]} *restrict a, const {kinds[1]} *restrict b,
                             fg_real *restrict out)
 {{
     fg_real matrix[{n * n}], right[{n * columns}];
-    for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {n}; j++) matrix[{n} * i + j] = {_entry(kinds[0], f"a[{left}]")};
-    for (int32_t i = 0; i < {n}; i++)
-        for (int32_t j = 0; j < {columns}; j++)
-            right[{columns} * i + j] = {_entry(kinds[1], f"b[{right}]")};
-    {eliminate}(matrix, right, {n}, {columns});
+{given}    const fg_mask sound = {plain}(matrix, right, {n}, {columns});
+    if (fg_mask_any(~sound)) {{
+        fg_real found[{n * columns}];
+        for (int32_t k = 0; k < {n * columns}; k++) found[k] = right[k];
+{given}        {exchanging}(matrix, right, {n}, {columns});
+        for (int32_t k = 0; k < {n * columns}; k++) right[k] = fg_real_pick(sound, found[k], right[k]);
+    }}
     for (int32_t i = 0; i < {n}; i++)
         for (int32_t j = 0; j < {columns}; j++)
             out[{index(out.strides[-2:], ("i", "j"))}] = right[{columns} * i + j];
@@ -148,6 +155,23 @@ def _reduce(w: LaneWriter, m: Macro) -> None:
         w.line("}")
 
 
+def _choose(w: LaneWriter, m: Macro) -> None:
+    """What is rarely taken is computed where a lane takes it."""
+    other, out = m.inputs[0], m.output
+    where = w.promoted(m.args[0])
+    w.line("{")
+    w.depth += 1
+    w.line(f"const fg_mask taken = {where if m.extra['truth'] else f'~({where})'};")
+    w.line("const bool any = fg_mask_any(taken);")
+    w.line(f"if (any) {choice_call(w, m)}")
+    with Loops(w, out.shape) as at:
+        there, made = element(w, other, at), element(w, out, at)
+        there = w.write.splat("real", there) if other.buffer.kind == "const" else there
+        w.line(f"{made} = any ? fg_real_pick(taken, {made}, {there}) : {there};")
+    w.depth -= 1
+    w.line("}")
+
+
 def _random(w: LaneWriter, m: Macro) -> None:
     draws, blocks = m.extra["draws"], m.output.buffer.size // 4
     for needed in ("fg_philox", f"fg_one_{draws}"):
@@ -165,6 +189,7 @@ _MACROS = {
     "solve": _solve,
     "reduce": _reduce,
     "random": _random,
+    "choose": _choose,
 }
 
 RANDOM = """\
@@ -211,9 +236,40 @@ static FG_INLINE void NAME(fg_real *a, int32_t n) {
 }
 """
 
+PLAIN = """\
+/* a x = b in place of b (n x m) in lanes with a symmetric positive matrix, which needs no exchange of rows;
+   which those are */
+static FG_INLINE fg_mask NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
+    fg_mask sound = fg_mask_of(-1);
+    for (int32_t j = 0; j < n; j++) {
+        for (int32_t i = j + 1; i < n; i++) {
+            const fg_real apart = a[n * i + j] - a[n * j + i];
+            sound &= (fg_mask)(apart * apart <= 1e-20 * (a[n * i + i] * a[n * j + j]));
+        }
+    }
+    for (int32_t j = 0; j < n; j++) {
+        sound &= (fg_mask)(a[n * j + j] > fg_real_of(0.0));
+        const fg_real inverse = 1.0 / a[n * j + j];
+        a[n * j + j] = inverse;
+        for (int32_t i = j + 1; i < n; i++) {
+            const fg_real f = a[n * i + j] * inverse;
+            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
+            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
+        }
+    }
+    for (int32_t j = n - 1; j >= 0; j--) {
+        for (int32_t i = j + 1; i < n; i++) {
+            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
+        }
+        for (int32_t k = 0; k < m; k++) b[m * j + k] *= a[n * j + j];
+    }
+    return sound;
+}
+"""
+
 SOLVE = """\
 /* a x = b in place of b (n x m), by elimination with row exchange; NaN in lanes where a is singular */
-static FG_INLINE void NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
+static FG_APART void NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
     fg_mask good = fg_mask_of(-1);
     for (int32_t j = 0; j < n; j++) {
         fg_real most = fg_real_size(a[n * j + j]);

@@ -60,7 +60,7 @@ class _LaneFile(File):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.expressions = LaneExpressions()
+        self.expressions = LaneExpressions(self.choice)
 
     def turn(self, name: str, case: Case, sizes: tuple[int, int]) -> str:
         raise no_lanes("a replay", self.pipeline.name)
@@ -92,8 +92,8 @@ class _LaneFile(File):
             PRELUDE,
             helper_text(self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),
-            *(text for _, text in self.expressions.functions.values()),
             self._structs(),
+            *(text for _, text in self.expressions.functions.values()),
             *reactions,
             self._loop(),
         ]
@@ -114,7 +114,7 @@ class _LaneFile(File):
         lines += [_member(n, c) for n, c in zip(self._cell_names(), cells, strict=True)]
         sizes = [(d, k, n) for d, slots in sorted(self.pool.items()) for k, n in enumerate(slots)]
         lines.append("    fg_uint seed[2];")  # up to here it is laid out from outside
-        lines += [f"    {TYPES[d]} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
+        lines += [f"    {TYPES[d.rpartition('_')[2]]} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
         return "\n".join([*lines, f"}} {m}_state;", ""])
 
     def _loop(self) -> str:
@@ -226,6 +226,11 @@ PRELUDE = f"""#define FG_LANES {WIDTH}
 {_vectors()}
 static FG_INLINE fg_real fg_real_size(fg_real x) {{
     return (fg_real)((fg_ulong)x & fg_ulong_of(UINT64_C(0x7FFFFFFFFFFFFFFF)));
+}}
+static FG_INLINE bool fg_mask_any(fg_mask m) {{
+    int64_t any = 0;
+    for (int32_t l = 0; l < FG_LANES; l++) any |= m[l];
+    return any != 0;
 }}
 static FG_INLINE fg_real fg_real_root(fg_real x) {{
     union {{ fg_real all; double one[FG_LANES]; }} a, made;
