@@ -159,9 +159,8 @@ def calibrate(
         likely = _Tried(problem, watch)
         likely.places = places
         for f in offsets:
-            said, spread = _by_likelihood(f, found, deviations[f.name], likely)
-            notes += said
-            deviations[f.name] = spread
+            other, deviations[f.name] = _by_likelihood(f, found, deviations[f.name], likely)
+            notes += other
         count += likely.count
     return Calibrated(graph, found, deviations, count, guesses, tuple(dict.fromkeys(notes)))
 

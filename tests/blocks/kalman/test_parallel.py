@@ -96,4 +96,4 @@ def test_what_does_not_fit_is_refused():
         linear_pass(steps, mean, covariance, way="backwards")
     with pytest.raises(DeclarationError, match="do not fit") as error:
         linear_pass(steps._replace(u=steps.u[:2]), mean, covariance)
-    assert "u (2, 4)" in error.value.got
+    assert "u (2, 4)" in str(error.value.got)
