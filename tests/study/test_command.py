@@ -23,6 +23,9 @@ from tests.recordings import DATA, recordings
 pytest.importorskip("pyarrow")
 
 COMMAND = [sys.executable, "-c", "from flowgraph.cli import main; main()"]
+HEARS = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {COMMAND[-1]}"
+"""The same where Ctrl-C was not to be heard, as in the background of a shell."""
+
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "orientation_study.toml"
 SHORT = 'graphs = ["ekf"]\ndata = ["sim"]\nseeds = {seeds}\n[parameters]\nduration = 1.5\n"imu.rate" = 50\n'
 
@@ -37,7 +40,7 @@ class Terminal:
     def __init__(self, *arguments):
         ours, theirs = pty.openpty()
         self.process = subprocess.Popen(
-            [*COMMAND, *map(str, arguments)], stdin=theirs, stdout=theirs, stderr=theirs,
+            [sys.executable, "-c", HEARS, *map(str, arguments)], stdin=theirs, stdout=theirs, stderr=theirs,
             start_new_session=True, env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
         )  # fmt: skip
         os.close(theirs)
