@@ -238,6 +238,7 @@ def serve(descriptor: int) -> NoReturn:
     code = 0
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        sys.unraisablehook = _leave
         _serve(descriptor)
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
@@ -248,6 +249,13 @@ def serve(descriptor: int) -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(code)
+
+
+def _leave(swallowed: Any) -> None:
+    """An exit that was asked for within a callback of the interpreter, which takes no exception further."""
+    if isinstance(swallowed.exc_value, SystemExit):
+        os._exit(128 + signal.SIGTERM)
+    sys.__unraisablehook__(swallowed)
 
 
 def _serve(descriptor: int) -> None:

@@ -51,13 +51,27 @@ def _double() -> Iterator[Any]:
         jax.config.update("jax_enable_x64", before)
 
 
+class _Smooth:
+    """`jax.numpy` in which the length of nothing has a slope, 0, where JAX has NaN."""
+
+    def __init__(self, jnp: Any) -> None:
+        self._jnp = jnp
+
+    def sqrt(self, x: Any) -> Any:
+        some = x > 0.0
+        return self._jnp.where(some, self._jnp.sqrt(self._jnp.where(some, x, 1.0)), 0.0)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._jnp, name)
+
+
 def linearised(problem: Problem) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`move(x, u) -> (x', F, Q)` and `see(x) -> (z, H, R)`, with the derivatives of JAX."""
     motion, seen, dt = problem.motion, problem.measurement, problem.step
     space, t = motion.space, motion.space.tangent
 
     with _double() as jax:
-        jnp = jax.numpy
+        jnp = _Smooth(jax.numpy)
 
         def moved(c: Any, x: Any, after: Any, told: dict[str, Any] | None) -> Any:
             makes: Any = problem.control_type
@@ -94,7 +108,7 @@ def _dynamax(problem: Problem, run: Drawn) -> tuple[Any, Any]:
     from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM  # a peer, with the extra `bench` alone
 
     with _double() as jax:
-        jnp = jax.numpy
+        jnp = _Smooth(jax.numpy)
         motion, seen, dt = problem.motion, problem.measurement, problem.step
         move, see = linearised(problem)
         _, _, Q = move(np.array(problem.start.mean), None)

@@ -354,7 +354,7 @@ def test_biases_of_several_flights_are_found(seeds, seconds):
     for name, least in (("position_rmse_m", 1.8), ("velocity_rmse_mps", 2.5), ("attitude_rmse_deg", 1.7)):
         assert rms(theirs, name) > least * rms(ours, name), name
     assert np.mean([score["nees_mean"] for score in ours]) < 12.0
-    assert all(score["position_3sigma"] > 0.99 for score in ours)
+    assert all(score["position_3sigma"] > 0.98 for score in ours)
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ SINGLE = {
     "tracker": 1e-4,
     "ins_particle": 0.2,  # of 60 particles; one that is drawn in place of another moves the mean
     "rbpf_indoor": 5e-2,
-    "rbpf_outdoor": 5e-2,
+    "rbpf_outdoor": 0.1,  # m and m/s; as above
     "imu_calibration": 0.05,  # counts of 1024, means of growing sums
 }
 """Largest difference of the estimate in single precision, in its own units, over a second of flight."""
