@@ -137,7 +137,7 @@ class Functions(Nodes, abc.ABC):
         if known is not None:
             return self._folded(z.logarithm(np.int64(known), np.int64(fraction), np.int64(out)))
         above = self.compared("greater", x, self.zero, 0, 0)
-        size = self.sum([Term("SEL", x, above), Term("SELN", self.one, above)])
+        size = self.sum([Term("SEL", x, above), Term("SELN", self.one, above)], mode="RAW")  # it may be wide
         length = self.sum([Term("BITS", size, self.one)], mode="RAW")
         begun = self.begin("logarithm", [Term("DYN", size, length, -31)])
         digits = self.take(begun, mode="RAW")
