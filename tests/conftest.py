@@ -14,10 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from flowgraph import MissingDependencyError
 from tests import times
 from tests.support import Install
+
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")  # a machine that is busy is no fault of a law
 
 COMPILER = shutil.which(os.environ.get("CC") or "cc")
 
