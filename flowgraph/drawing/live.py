@@ -20,6 +20,7 @@ import threading
 import time as clock
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -77,7 +78,8 @@ class LiveServer:
             self._last.append(made)
             for viewer in self._viewers:
                 if viewer.full():
-                    viewer.get_nowait()
+                    with suppress(queue.Empty):  # its thread may have emptied it meanwhile
+                        viewer.get_nowait()
                 viewer.put_nowait(made)
 
     def wait(self, there: bool, seconds: float | None = None) -> bool:
@@ -90,7 +92,8 @@ class LiveServer:
         with self._changed:
             for viewer in self._viewers:
                 if viewer.full():
-                    viewer.get_nowait()
+                    with suppress(queue.Empty):  # its thread may have emptied it meanwhile
+                        viewer.get_nowait()
                 viewer.put_nowait(None)
         self._server.shutdown()
         self._server.server_close()
