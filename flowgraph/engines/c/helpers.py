@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.engines.c.elimination import SUBSTITUTED, eliminated
 from flowgraph.engines.c.syntax import number
 from flowgraph.engines.c.vector_math import vector_texts
 from flowgraph.recorder.random import ROUNDS, segments
@@ -137,21 +138,8 @@ static FG_INLINE bool fg_solve_plain({real} *a, {real} *b, int32_t n, int32_t m)
     if (!sound) return false;
     for (int32_t j = 0; j < n; j++) {{
         sound = sound && a[n * j + j] > 0;
-        const {real} inverse = 1 / a[n * j + j];
-        a[n * j + j] = inverse;
-        for (int32_t i = j + 1; i < n; i++) {{
-            const {real} f = a[n * i + j] * inverse;
-            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
-            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
-        }}
-    }}
-    for (int32_t j = n - 1; j >= 0; j--) {{
-        for (int32_t i = j + 1; i < n; i++) {{
-            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
-        }}
-        for (int32_t k = 0; k < m; k++) b[m * j + k] *= a[n * j + j];
-    }}
-    return sound;
+{eliminated(real, "1")}    }}
+{SUBSTITUTED}    return sound;
 }}
 """,
         ),
@@ -180,21 +168,8 @@ static FG_APART void fg_solve({real} *a, {real} *b, int32_t n, int32_t m) {{
             for (int32_t k = 0; k < n * m; k++) b[k] = NAN;
             return;
         }}
-        const {real} inverse = 1 / a[n * j + j];
-        for (int32_t i = j + 1; i < n; i++) {{
-            const {real} f = a[n * i + j] * inverse;
-            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
-            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
-        }}
-    }}
-    for (int32_t j = n - 1; j >= 0; j--) {{
-        for (int32_t i = j + 1; i < n; i++) {{
-            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
-        }}
-        const {real} inverse = 1 / a[n * j + j];
-        for (int32_t k = 0; k < m; k++) b[m * j + k] *= inverse;
-    }}
-}}
+{eliminated(real, "1")}    }}
+{SUBSTITUTED}}}
 """,
         ),
         "fg_philox": (

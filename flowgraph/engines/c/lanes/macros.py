@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from flowgraph.engines.c.elimination import SUBSTITUTED, eliminated
 from flowgraph.engines.c.lanes.expressions import no_lanes
 from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.macros import Loops, call, choice_call, element, index
@@ -236,7 +237,8 @@ static FG_INLINE void NAME(fg_real *a, int32_t n) {
 }
 """
 
-PLAIN = """\
+PLAIN = (
+    """\
 /* a x = b in place of b (n x m) in lanes with a symmetric positive matrix, which needs no exchange of rows;
    which those are */
 static FG_INLINE fg_mask NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
@@ -249,25 +251,18 @@ static FG_INLINE fg_mask NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
     }
     for (int32_t j = 0; j < n; j++) {
         sound &= (fg_mask)(a[n * j + j] > fg_real_of(0.0));
-        const fg_real inverse = 1.0 / a[n * j + j];
-        a[n * j + j] = inverse;
-        for (int32_t i = j + 1; i < n; i++) {
-            const fg_real f = a[n * i + j] * inverse;
-            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
-            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
-        }
-    }
-    for (int32_t j = n - 1; j >= 0; j--) {
-        for (int32_t i = j + 1; i < n; i++) {
-            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
-        }
-        for (int32_t k = 0; k < m; k++) b[m * j + k] *= a[n * j + j];
-    }
+"""
+    + eliminated("fg_real", "1.0")
+    + "    }\n"
+    + SUBSTITUTED
+    + """\
     return sound;
 }
 """
+)
 
-SOLVE = """\
+SOLVE = (
+    """\
 /* a x = b in place of b (n x m), by elimination with row exchange; NaN in lanes where a is singular */
 static FG_APART void NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
     fg_mask good = fg_mask_of(-1);
@@ -294,20 +289,12 @@ static FG_APART void NAME(fg_real *a, fg_real *b, int32_t n, int32_t m) {
             }
         }
         good &= (fg_mask)(a[n * j + j] != fg_real_of(0.0));
-        const fg_real inverse = 1.0 / a[n * j + j];
-        for (int32_t i = j + 1; i < n; i++) {
-            const fg_real f = a[n * i + j] * inverse;
-            for (int32_t k = j + 1; k < n; k++) a[n * i + k] -= f * a[n * j + k];
-            for (int32_t k = 0; k < m; k++) b[m * i + k] -= f * b[m * j + k];
-        }
-    }
-    for (int32_t j = n - 1; j >= 0; j--) {
-        for (int32_t i = j + 1; i < n; i++) {
-            for (int32_t k = 0; k < m; k++) b[m * j + k] -= a[n * j + i] * b[m * i + k];
-        }
-        const fg_real inverse = 1.0 / a[n * j + j];
-        for (int32_t k = 0; k < m; k++) b[m * j + k] *= inverse;
-    }
+"""
+    + eliminated("fg_real", "1.0")
+    + "    }\n"
+    + SUBSTITUTED
+    + """\
     for (int32_t k = 0; k < n * m; k++) b[k] = fg_real_pick(good, b[k], fg_real_of(NAN));
 }
 """
+)
