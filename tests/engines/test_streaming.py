@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import DataError, DeclarationError, Scalar, Series, Stream, graph, latest, scan, simulate
+from flowgraph import (
+    DataError,
+    DeclarationError,
+    OutputError,
+    Scalar,
+    Series,
+    Stream,
+    graph,
+    latest,
+    scan,
+    simulate,
+)
 from flowgraph.engines.streaming import NOTE, simulate_to_parquet
 from tests.support import scalars
 
 dataset = pytest.importorskip("pyarrow.dataset")
+parquet = pytest.importorskip("pyarrow.parquet")
 
 
 @graph
@@ -116,6 +129,19 @@ def test_what_the_folder_holds_is_respected(tmp_path):
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "a", resume=True)
     with pytest.raises(DeclarationError, match="pieces"):
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "c", ticks=0)
+
+
+def test_a_part_that_cannot_be_closed_is_not_there(tmp_path, monkeypatch):
+    close = parquet.ParquetWriter.close
+
+    def full(writer: Any) -> None:
+        close(writer)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(parquet.ParquetWriter, "close", full)
+    with pytest.raises(OutputError, match="No space left"):
+        simulate_to_parquet(two.build(), inputs(10), tmp_path)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
 def test_nothing_in_is_nothing_out(tmp_path):

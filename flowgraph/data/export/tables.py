@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -64,7 +64,7 @@ class ParquetParts:
     def __init__(self, folder: str | Path, number: int, about: Mapping[str, str]) -> None:
         self._arrow, self._parquet = (needed(p, "Parquet", "parquet") for p in ("pyarrow", "pyarrow.parquet"))
         self._folder, self._number, self._about = Path(folder), number, about
-        self._open = ExitStack()
+        self._open, self._closing = ExitStack(), ExitStack()
         self._writers: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -76,14 +76,19 @@ class ParquetParts:
             table = _table(self._arrow, series, self._about)
             if name not in self._writers:
                 file = self._open.enter_context(whole(part_file(self._folder, name, self._number)))
-                self._writers[name] = self._parquet.ParquetWriter(file, table.schema)
+                writer = self._parquet.ParquetWriter(file, table.schema)
+                self._closing.callback(writer.close)
+                self._writers[name] = writer
             if len(series):
                 self._writers[name].write_table(table)
 
     def __exit__(self, *error: Any) -> bool | None:
         if error[0] is None:
-            for writer in self._writers.values():
-                writer.close()
+            with self._open:  # one that cannot be closed takes the others with it
+                self._closing.close()
+            return None
+        with suppress(Exception):  # what ended the part is said, not what follows from it
+            self._closing.close()
         return self._open.__exit__(*error)
 
 
