@@ -30,7 +30,8 @@ from flowgraph.engines.checkpoint import program_digest
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.parts import run_graph
 from flowgraph.engines.state import load_state, save_state
-from flowgraph.errors import DataError, DeclarationError, writes
+from flowgraph.errors import DataError, writes
+from flowgraph.language.checks import need_count
 from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import ArrayType
 
@@ -87,19 +88,13 @@ def simulate_to_parquet(
             that was not played yet on; of what was played nothing is played again.
 
     Raises:
-        As `simulate`. DataError: for a folder that holds another run, or none to go on with.
-        MissingDependencyError: without pyarrow.
+        As `simulate`. DeclarationError: for less than one tick or part. DataError: for a folder that holds
+        another run, or none to go on with. MissingDependencyError: without pyarrow.
     """
     for name, given in (("ticks", ticks), ("parts", parts)):
-        if given < 1:
-            raise DeclarationError(
-                "a run is streamed in pieces of something", path=name, expected="1 or more", got=str(given),
-                fix=f"leave {name} out",
-            )  # fmt: skip
+        need_count("simulate_to_parquet", name, given, least=1)
     target = Path(folder)
-    options = RunOptions(
-        engine=engine, dtype=dtype, init=init, state=state, seed=seed, diverged=diverged
-    )  # fmt: skip
+    options = RunOptions(engine=engine, dtype=dtype, init=init, state=state, seed=seed, diverged=diverged)
     which = {
         "format": FORMAT, "graph": graph.name, "program": program_digest(graph), "engine": engine,
         "dtype": dtype, "seed": str(seed),

@@ -127,8 +127,10 @@ def test_what_the_folder_holds_is_respected(tmp_path):
     (tmp_path / "a" / NOTE).write_text("{}")
     with pytest.raises(DataError, match="no streamed run"):
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "a", resume=True)
-    with pytest.raises(DeclarationError, match="pieces"):
+    with pytest.raises(DeclarationError, match="whole number as 'ticks'"):
         simulate_to_parquet(two.build(), inputs(10), tmp_path / "c", ticks=0)
+    with pytest.raises(DeclarationError, match="whole number as 'parts'"):
+        simulate_to_parquet(two.build(), inputs(10), tmp_path / "c", parts=0)
 
 
 def test_a_part_that_cannot_be_closed_is_not_there(tmp_path, monkeypatch):
