@@ -148,10 +148,8 @@ def lateness_words(inputs: Flight | Mapping[str, Any] | None) -> dict[str, str]:
     words = {}
     for name, series in streams.items():
         if isinstance(series, Series) and len(series):
-            least, most = (
-                (series.time - series.stamp).min() * 1e-9,
-                (series.time - series.stamp).max() * 1e-9,
-            )
+            late = series.time - series.stamp
+            least, most = late.min() * 1e-9, late.max() * 1e-9
             if most > 0.0:
                 span = f"{most:.3g}" if most - least < 0.01 * most else f"{least:.3g} to {most:.3g}"
                 words[name] = f"{span} s late"
@@ -265,20 +263,12 @@ def timeouts(
             got=repr(after),
             fix='write timeouts(series, "0.5s")',
         )
-    end = (
-        int(series.time[-1])
-        if until is None and len(series)
-        else NEVER
-        if until is None
-        else check_stamp(f"{name}.until", until)
-    )
-    begin = (
-        0
-        if start is None and not len(series)
-        else None
-        if start is None
-        else check_stamp(f"{name}.start", start)
-    )
+    end = int(series.time[-1]) if len(series) else NEVER
+    if until is not None:
+        end = check_stamp(f"{name}.until", until)
+    begin = None if len(series) else 0
+    if start is not None:
+        begin = check_stamp(f"{name}.start", start)
     awaited = series.time if begin is None else np.append(np.int64(begin), series.time[series.time > begin])
     last = awaited <= end - span  # of what has its timeout by then; written so that no sum is beyond int64
     due = awaited[last] + span
