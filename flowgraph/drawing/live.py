@@ -77,10 +77,7 @@ class LiveServer:
         with self._changed:
             self._last.append(made)
             for viewer in self._viewers:
-                if viewer.full():
-                    with suppress(queue.Empty):  # its thread may have emptied it meanwhile
-                        viewer.get_nowait()
-                viewer.put_nowait(made)
+                _put_newest(viewer, made)
 
     def wait(self, there: bool, seconds: float | None = None) -> bool:
         """Wait until somebody looks, or with `there` False until nobody does; whether it came to that."""
@@ -91,10 +88,7 @@ class LiveServer:
         """Say goodbye to all viewers and give the port back."""
         with self._changed:
             for viewer in self._viewers:
-                if viewer.full():
-                    with suppress(queue.Empty):  # its thread may have emptied it meanwhile
-                        viewer.get_nowait()
-                viewer.put_nowait(None)
+                _put_newest(viewer, None)
         self._server.shutdown()
         self._server.server_close()
 
@@ -210,6 +204,14 @@ class _Handler(BaseHTTPRequestHandler):
             sent = bytes(b ^ mask[k % 4] for k, b in enumerate(self.rfile.read(size)))
             if kind == _PING and not viewer.full():
                 viewer.put_nowait(frame(sent, _PONG))
+
+
+def _put_newest(viewer: queue.Queue[bytes | None], message: bytes | None) -> None:
+    """Queue a message for a viewer; the oldest gives way where its queue is full."""
+    if viewer.full():
+        with suppress(queue.Empty):  # its thread may have emptied it meanwhile
+            viewer.get_nowait()
+    viewer.put_nowait(message)
 
 
 def frame(payload: bytes, kind: int = _TEXT) -> bytes:
