@@ -92,7 +92,7 @@ def _matmul(w: Lines, m: Macro) -> None:
 
         packed = type_ == w.write.real and rows >= 4 and columns > 1
         w.write.packs |= packed
-        kept, wide, one = ("fg_pack", f"FG_PACKS({columns})", type_) if packed else (type_, columns, type_)
+        kept, wide = ("fg_pack", f"FG_PACKS({columns})") if packed else (type_, columns)
 
         def block(first: int, last: int, step: int) -> list[str]:
             """Rows from `first` on up to `last`, so many at a time."""
@@ -105,7 +105,7 @@ def _matmul(w: Lines, m: Macro) -> None:
                 *(f"            row{r}[j] = {'none' if packed else '0'};" for r in each),
                 "        }",
                 f"        for (int32_t k = 0; k < {inner}; k++) {{",
-                *(f"            const {one} left{r} = a[{at(r)}];" for r in each),
+                *(f"            const {type_} left{r} = a[{at(r)}];" for r in each),
                 f"            for (int32_t j = 0; j < {wide}; j++) {{",
                 *(f"                row{r}[j] += left{r} * {factor};" for r in each),
                 "            }",
