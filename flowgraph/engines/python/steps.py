@@ -73,11 +73,10 @@ _CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | {"vecdot"}
 
 @dataclass(frozen=True)
 class Line:
-    """An instruction as an expression of its arguments {0}, {1}, ..., and whether it is a Python number."""
+    """An instruction as an expression of its arguments {0}, {1}, ..."""
 
     instruction: Instruction
     form: str
-    number: bool
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
                 same[i.out] = again
                 if again in made.numbers:
                     made.numbers.add(i.out)
-                made.lines.append(Line(replace(i, args=(again,)), "{0}", again in made.numbers))
+                made.lines.append(Line(replace(i, args=(again,)), "{0}"))
                 continue
             form = _number(i, kinds) if made.numbers.issuperset(i.args) else None
             if form is not None:
@@ -150,7 +149,7 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
                 made.scalars.add(i.out)
             else:
                 i = _with_arrays(i, kinds, made, call)
-            made.lines.append(Line(i, form or _array(i, kinds, made, call), form is not None))
+            made.lines.append(Line(i, form or _array(i, kinds, made, call)))
     return made
 
 
@@ -193,7 +192,7 @@ def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written, call: int
             elif lifted not in kinds:
                 spec = i.spec._replace(shape=())
                 line = replace(i, op="asarray", args=(a,), attrs={}, out=lifted, spec=spec)
-                made.lines.append(Line(line, "asarray({0})", False))
+                made.lines.append(Line(line, "asarray({0})"))
             kinds[lifted] = "real"
             given.append(lifted)
         else:
