@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 
-_M = (0xD2511F53, 0xCD9E8D57)
-_W = (0x9E3779B9, 0xBB67AE85)
+MULTIPLIERS, WEYL = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85)
+"""Of Philox4x32: by what words are multiplied, and what a key grows by, in each round."""
+
+COLUMN = np.array([[m] for m in MULTIPLIERS], dtype=np.uint64)
+"""The multipliers (2, 1)."""
+
 _WORD = 0xFFFFFFFF
-_PRODUCTS = np.array([[_M[0]], [_M[1]]], dtype=np.uint64)
 FEW = 16
 """Words up to which Python's integers are quicker."""
 
@@ -36,9 +39,9 @@ def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np
     products = np.empty((2, n), np.uint64)
     halves = products.view(np.uint32).reshape(2, n, 2)
     for r in range(rounds):
-        np.multiply(even, _PRODUCTS, out=products)
+        np.multiply(even, COLUMN, out=products)
         np.bitwise_xor(halves[::-1, :, _HIGH], odd, out=even)
-        even ^= np.array([[(key[0] + _W[0] * r) & _WORD], [(key[1] + _W[1] * r) & _WORD]], np.uint32)
+        even ^= np.array([[(key[0] + WEYL[0] * r) & _WORD], [(key[1] + WEYL[1] * r) & _WORD]], np.uint32)
         if r + 1 < rounds:
             odd = halves[::-1, :, _LOW].copy()
     return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)[:count]
@@ -58,9 +61,9 @@ def _one(
     a, b, c, d = index, name, low, high
     k, q = key
     for _ in range(rounds):
-        left, right = a * _M[0], c * _M[1]
+        left, right = a * MULTIPLIERS[0], c * MULTIPLIERS[1]
         a, b, c, d = (right >> 32) ^ b ^ k, right & _WORD, (left >> 32) ^ d ^ q, left & _WORD
-        k, q = (k + _W[0]) & _WORD, (q + _W[1]) & _WORD
+        k, q = (k + WEYL[0]) & _WORD, (q + WEYL[1]) & _WORD
     return a, c, b, d
 
 

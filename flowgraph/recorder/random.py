@@ -27,8 +27,7 @@ from flowgraph.recorder import numpy_random
 from flowgraph.recorder.namespaces import NUMPY
 
 ROUNDS = 7
-_MULTIPLIERS = np.array([[0xD2511F53], [0xCD9E8D57]], dtype=np.uint64)
-_WEYL = np.array([[0x9E3779B9], [0xBB67AE85]], dtype=np.uint32)
+_WEYL = np.array([[w] for w in numpy_random.WEYL], dtype=np.uint32)
 _WORD = 0xFFFFFFFF
 
 _SEGMENT_BITS = 6  # segments an octave: 64
@@ -59,7 +58,7 @@ def philox(even: Any, odd: Any, key: Any, *, rounds: int = ROUNDS, xp: Any) -> t
         Words 0 and 2, and words 1 and 3, of the result, (2, n) each.
     """
     for r in range(rounds):
-        product = xp.astype(even, xp.uint64) * _MULTIPLIERS
+        product = xp.astype(even, xp.uint64) * numpy_random.COLUMN
         high = xp.astype(product >> np.uint64(32), xp.uint32)
         even = high[::-1] ^ odd ^ (key + _WEYL * np.uint32(r))
         odd = xp.astype(product, xp.uint32)[::-1]
