@@ -189,18 +189,18 @@ class _Search:
         """Formats of so many bits, and their figures on the flights that were held out."""
         for _ in range(_ROUNDS):
             formats = self.sizes.formats(bits, self._margin, self._held_width)
-            player = self._player(formats, self._flights)
+            player = self._player(formats)
             if not self._widened(player, self._flights, "the flights of the sizes", bits):
                 break
         for _ in range(_ROUNDS):
             formats = self.sizes.formats(bits, self._margin, self._held_width)
-            player = self._player(formats, self._held)
+            player = self._player(formats)
             figures = self._judge(formats, player)
             if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
                 break
         return formats, figures
 
-    def _player(self, formats: Formats, flights: Sequence[_Ready]) -> CompiledIntegers:
+    def _player(self, formats: Formats) -> CompiledIntegers:
         patterns = sorted({key for one in (*self._flights, *self._held) for key in one.tape.patterns})
         return CompiledIntegers(replace(self.pipeline, formats=formats), patterns, tabled=True)
 
