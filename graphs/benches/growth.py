@@ -105,17 +105,16 @@ def _series(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[
 
 def _fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The exponents of a series of runs."""
-    number = np.log([r["number"] for r in rows])
-    slope = lambda name: float(np.polyfit(number, np.log([max(r[name], 1e-9) for r in rows]), 1)[0])
+
+    def slope(some: list[dict[str, Any]], name: str) -> float:
+        number, value = ([r[key] for r in some] for key in ("number", name))
+        return float(np.polyfit(np.log(number), np.log(np.maximum(value, 1e-9)), 1)[0])
+
     grows = [r for r in rows if r["memory_bytes"] > LEAST_MEMORY]
-    memory_of = None
-    if len(grows) > 1:
-        memory_of = float(
-            np.polyfit(np.log([r["number"] for r in grows]), np.log([r["memory_bytes"] for r in grows]), 1)[0]
-        )
     return {
         "engine": rows[0]["engine"], "of": rows[0]["of"], "mode": rows[0]["mode"], "number": None,
-        "time_exponent": slope("seconds"), "memory_exponent": memory_of,
+        "time_exponent": slope(rows, "seconds"),
+        "memory_exponent": slope(grows, "memory_bytes") if len(grows) > 1 else None,
     }  # fmt: skip
 
 
@@ -180,7 +179,7 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
         column = 0 if of == "ticks" else 1
         style = {"whole": "-o", "streamed": "--s"}[mode]
         number = [r["number"] for r in some]
-        colour = f"C{('python', 'reference', 'xla', 'c').index(engine) if engine in _KNOWN else 5}"
+        colour = f"C{_KNOWN.index(engine) if engine in _KNOWN else 5}"
         label = f"{engine}, {mode}" if of == "ticks" else engine
         for line, name, unit in ((0, "seconds", 1.0), (1, "memory_bytes", 1e6)):
             values = [max(r[name] / unit, 1e-3 if line == 0 else 0.1) for r in some]
