@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.parameters import Parameters
@@ -99,11 +100,9 @@ class Motion:
 
     def gyro(self, t: np.ndarray) -> np.ndarray:
         """(n, 3), rad/s, body."""
-        # scipy's rotations take half a second, which only a simulated course pays.
-        from scipy.spatial.transform import Rotation
-
-        before, after = Rotation.from_matrix(self.attitude(t - _STEP)), self.attitude(t + _STEP)
-        return np.asarray((before.inv() * Rotation.from_matrix(after)).as_rotvec() / (2.0 * _STEP))
+        turned = scipy.spatial.transform.Rotation.from_matrix
+        before, after = turned(self.attitude(t - _STEP)), turned(self.attitude(t + _STEP))
+        return np.asarray((before.inv() * after).as_rotvec() / (2.0 * _STEP))
 
 
 def motion(seed: int) -> Motion:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import read_mat
@@ -219,10 +220,9 @@ def _attitudes(rots: np.ndarray, file: Path) -> np.ndarray:
             got=f"off by {off[wrong[0]]:.3g}",
             fix="restore the file",
         )
-    # scipy's rotations take half a second, which only this format pays.
-    from scipy.spatial.transform import Rotation
-
     q = np.full((len(rots), 4), np.nan)
     if seen.any():
-        q[seen] = Rotation.from_matrix(rots[seen]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        q[seen] = scipy.spatial.transform.Rotation.from_matrix(rots[seen]).as_quat(canonical=True)[
+            :, [3, 0, 1, 2]
+        ]
     return q

@@ -26,6 +26,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 
 from flowgraph import Flight, Series
 from flowgraph.blocks.datasets.matfile import columns_of, read_structs
@@ -230,20 +231,16 @@ def derived_imu(truth: Series, window: float, rate: float = 100.0) -> Series:
     `window` seconds around each time (Savitzky and Golay, Analytical Chemistry 36, 1964). Where the motion
     capture has no finite row for longer than that, and half a window on either side, there is none.
     """
-    # scipy's rotations take half a second, which only a derived unit pays.
-    from scipy.signal import savgol_filter
-    from scipy.spatial.transform import Rotation, Slerp
-
     truth = truth[np.isfinite(truth["position"]).all(axis=1)]
     step = round(1e9 / rate)
     time = np.arange(truth.time[0], truth.time[-1] + 1, step)
     size = max(round(window * rate) | 1, 5)
     position = np.stack([np.interp(time, truth.time, truth["position"][:, k]) for k in range(3)], axis=1)
-    acceleration = savgol_filter(position, size, 2, deriv=2, delta=1.0 / rate, axis=0)
-    measured = Rotation.from_quat(truth["attitude"][:, [1, 2, 3, 0]])
-    turns = Slerp(truth.time - truth.time[0], measured)(time - truth.time[0])
+    acceleration = scipy.signal.savgol_filter(position, size, 2, deriv=2, delta=1.0 / rate, axis=0)
+    measured = scipy.spatial.transform.Rotation.from_quat(truth["attitude"][:, [1, 2, 3, 0]])
+    turns = scipy.spatial.transform.Slerp(truth.time - truth.time[0], measured)(time - truth.time[0])
     steps = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
-    between = savgol_filter(steps, size, 2, axis=0)
+    between = scipy.signal.savgol_filter(steps, size, 2, axis=0)
     gyro = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
     force = turns.inv().apply(acceleration - np.asarray(GRAVITY))
     imu = Series(time, Imu(gyro=gyro, specific_force=force), name="imu")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 import yaml
 
 from flowgraph.blocks.datasets.settings import NOISE_SETTINGS, imu_noise, number
@@ -205,10 +206,9 @@ def rigid(transform: Any, file: Path) -> tuple[tuple[float, ...], tuple[float, .
             raise ValueError("its 3 x 3 part mirrors, and is no rotation")
         if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
             raise ValueError("its last row is not 0, 0, 0, 1")
-        # scipy's rotations take half a second, which only a mounted sensor pays.
-        from scipy.spatial.transform import Rotation
-
-        w, x, y, z = Rotation.from_matrix(R).as_quat(canonical=True)[[3, 0, 1, 2]].tolist()
+        w, x, y, z = (
+            scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True)[[3, 0, 1, 2]].tolist()
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
             "T_BS is missing or malformed",
