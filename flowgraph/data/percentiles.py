@@ -7,6 +7,8 @@ their length, thirty-two to each doubling, from a nanosecond to an hour.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,3 +43,20 @@ class Durations:
         reached = np.cumsum(self._bins)
         k = int(np.searchsorted(reached, share / 100 * self.count))
         return float(min(2.0 ** ((min(k, _BINS - 1) + 1) / _PER_DOUBLING), self.longest) * 1e-9)
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """How long things took, in s: percentiles to 3 %.
+
+    Args:
+        arrival: from the arrival of the newest event of a tick to its end, what is held back for order too.
+        response: from when a tick was complete to its end.
+        work: in the tick itself.
+        deadline_missed: ticks whose response was longer than the deadline.
+    """
+
+    arrival: Mapping[str, float]
+    response: Mapping[str, float]
+    work: Mapping[str, float]
+    deadline_missed: int

@@ -12,10 +12,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
-from threading import Lock, RLock, Thread
+from threading import Lock, RLock, Thread, get_ident
 from time import perf_counter, perf_counter_ns, sleep
 from types import TracebackType
 from typing import Any
@@ -24,7 +23,7 @@ from flowgraph.data.arrival import stamp_events
 from flowgraph.data.columns import Columns
 from flowgraph.data.inputs import Inputs, need_graph, prepare, rule_of
 from flowgraph.data.notes import note
-from flowgraph.data.percentiles import Durations
+from flowgraph.data.percentiles import Durations, Latencies
 from flowgraph.data.result import Result, statistics
 from flowgraph.data.series import Series
 from flowgraph.data.tape import merged
@@ -46,23 +45,6 @@ RECORDED = ("all", "arrived", "nothing")
 """What is kept of a live run."""
 
 OnOutput = Callable[[str, int, Any], object]
-
-
-@dataclass(frozen=True)
-class Latencies:
-    """How long things took, in s: percentiles to 3 %.
-
-    Args:
-        arrival: from the arrival of the newest event of a tick to its end, what is held back for order too.
-        response: from when a tick was complete to its end.
-        work: in the tick itself.
-        deadline_missed: ticks whose response was longer than the deadline.
-    """
-
-    arrival: Mapping[str, float]
-    response: Mapping[str, float]
-    work: Mapping[str, float]
-    deadline_missed: int
 
 
 class Live:
@@ -146,7 +128,7 @@ class Live:
         if watcher is not None and hasattr(watcher, "facts"):
             watcher.facts = self._facts
         self._error: BaseException | None = None
-        self._ended = False
+        self._ended, self._maker = False, 0
         self._notes: dict[str, str] = {}
         self._pace, self._wall, self._alone = Pace(), 0.0, RLock()
         self._turn, self._queued = Lock(), asyncio.Lock()
@@ -279,6 +261,14 @@ class Live:
 
     def _stop(self) -> None:
         """Take nothing in any more, and make the ticks of all that waits."""
+        if self._maker == get_ident():
+            raise DataError(
+                "a tick cannot end its own run",
+                path=self.graph.name,
+                expected="close() where events are pushed",
+                got="close() in on_output, or in a watcher",
+                fix="remember there that it is to end, and close it where events are pushed",
+            )
         self._boxes.close()
         if self._thread is not None:
             self._thread.join()
@@ -292,7 +282,11 @@ class Live:
     def _ticks(self, ticks: Any, complete: int) -> None:
         for stamp, events in ticks:
             with self._alone:
-                self._tick(stamp, events, complete)
+                self._maker = get_ident()
+                try:
+                    self._tick(stamp, events, complete)
+                finally:
+                    self._maker = 0
 
     def _tick(self, stamp: int, events: list[Event], complete: int) -> None:
         begun = perf_counter_ns()
@@ -359,7 +353,7 @@ class Live:
         """Take nothing in any more, make the ticks of all that waits, and end.
 
         Raises:
-            FlowgraphError: what ended the run before.
+            FlowgraphError: what ended the run before. DataError: from within a tick of this run.
         """
         self._stop()
         if self._error is not None:

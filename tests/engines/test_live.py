@@ -486,3 +486,19 @@ def test_no_push_of_an_event_loop_overtakes_another():
         asyncio.run(pushes())
     assert order == list(range(1, 41))
     assert live.counts["a.late"] == 0
+
+
+@pytest.mark.parametrize("thread", [True, False])
+def test_a_tick_cannot_end_its_own_run(thread):
+    refused: list[DataError] = []
+
+    def ends(name: str, stamp: int, value: Any) -> None:
+        with pytest.raises(DataError, match="a tick cannot end its own run") as caught:
+            live.close()
+        refused.append(caught.value)
+
+    live = Live(SUMMED, on_output=ends, thread=thread)
+    live.push(1, a=1.0)
+    live.push(2, a=1.0)
+    assert live.close().ticks == len(refused) == 2
+    assert "where events are pushed" in str(refused[0])
