@@ -70,11 +70,13 @@ import os, sys
 os.environ["FLOWGRAPH_CACHE"] = sys.argv[1]
 from flowgraph.engines.c.compile import load
 k = 0
+once = len(sys.argv) > 2
 while True:
     k += 1
-    text = "".join(f"double f{n}(double x) {{ return x * {n}.5 + {k % 5}; }}\\n" for n in range(60))
+    which = k % 5 + 5 * (once and k > 5)  # the last is compiled by nobody before: who compiles sweeps
+    text = "".join(f"double f{n}(double x) {{ return x * {n}.5 + {which}; }}\\n" for n in range(60))
     assert load({"a.c": text}).f1 is not None; print(k, flush=True)
-    if len(sys.argv) > 2 and k > 5: break
+    if once and k > 5: break
 """
 
 

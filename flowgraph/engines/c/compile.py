@@ -325,7 +325,7 @@ def _workplace(folder: Path) -> Iterator[Path]:
     try:
         yield work
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        _remove(work)
         os.close(descriptor)
 
 
@@ -376,6 +376,14 @@ def clear(folder: Path) -> int:
     return freed
 
 
+def _remove(folder: Path) -> None:
+    """Remove a folder, in which a compiler that has outlived who started it may still write for a moment."""
+    for _ in range(10):
+        shutil.rmtree(folder, ignore_errors=True)
+        if not folder.exists():
+            return
+
+
 def _sweep(folder: Path) -> None:
     """Remove what killed processes have left: folders to compile in, and halves of libraries."""
     for old in [*folder.glob(f"{_WORK}*"), *folder.glob(".*.so.part"), *folder.glob(".*.json.part")]:
@@ -383,6 +391,6 @@ def _sweep(folder: Path) -> None:
             descriptor = os.open(old, os.O_RDONLY)
             try:
                 if lock(descriptor, wait=False):
-                    shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)
+                    _remove(old) if old.is_dir() else old.unlink(missing_ok=True)
             finally:
                 os.close(descriptor)
