@@ -187,7 +187,7 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
         if slot.writes is not None:
             due.append((t + LATENCY, slot.writes))
     assert len([s for s in found.slots if s]) == sum(len(plan.tick.made(n).terms) for n in plan.order)
-    assert found.words < len(plan.order)  # places are used again
+    assert found.size < len(plan.order)  # places are used again
 
 
 def test_what_is_known_costs_nothing():
