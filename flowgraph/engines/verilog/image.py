@@ -23,7 +23,7 @@ from flowgraph.engines.verilog.nodes import (
 )
 from flowgraph.engines.verilog.plan import Plan
 from flowgraph.engines.verilog.rows import element_of, root_of
-from flowgraph.engines.verilog.schedule import AHEAD, LATENCY, Loop, Schedule, Slot, Word, schedule
+from flowgraph.engines.verilog.schedule import Loop, Schedule, Slot, Word, schedule
 from flowgraph.engines.verilog.tick import Tick, held_values
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -77,7 +77,7 @@ class Image:
         self.wide = max(self.width, self.player.formats.held_width)
         plans = [Plan(Tick(self.player, key)) for key in keys]
         self.has_rows = any(_has_rows(p) for p in plans)
-        schedules = [schedule(p, LATENCY + AHEAD * self.has_rows) for p in plans]
+        schedules = [schedule(p, self.has_rows) for p in plans]
         self.places = self._held()
         base = sum(p.size for p in self.places.values())
         constants: dict[int, int] = {0: base}
@@ -209,7 +209,7 @@ class Image:
 
     def _microword(self, word: Word, at: _At, last: bool) -> int:
         bits = self.place_bits
-        marks = int(word.back) << 5 | int(word.ends) << 6
+        marks = int(word.repeat) << 3 | int(word.back) << 5 | int(word.ends) << 6
         if word.does is None:
             return int(last) << 31 | marks << 32 + 3 * bits
         if isinstance(word.does, Loop):
@@ -237,7 +237,7 @@ class Image:
         return code | to << 32 | b << 32 + bits | a << 32 + 2 * bits | marks << 32 + 3 * bits
 
     def _said(self, word: Word, at: _At) -> str:
-        marks = f"{' back' if word.back else ''}{' round' if word.ends else ''}"
+        marks = f"{' back' * word.back}{' round' * word.ends}{' repeated' * word.repeat}"
         if word.does is None:
             return f"-{marks}"
         if isinstance(word.does, Loop):

@@ -30,7 +30,7 @@ _LEAST = 4
 _ABREAST = 16
 """Elements that a round of a loop makes at most."""
 
-_LONGEST = 1500
+_LONGEST = 2100
 """Microwords of a round, beyond which it makes no more elements at a time."""
 
 Item = tuple[int, int]
@@ -66,11 +66,13 @@ class Word:
         does: that.
         back: whether the loop goes on from its begin, in three steps.
         ends: whether a round ends here.
+        repeat: of nothing, whether it is done as often as the head before says.
     """
 
     does: Slot | Loop | None = None
     back: bool = False
     ends: bool = False
+    repeat: bool = False
 
 
 @dataclass
@@ -85,6 +87,7 @@ class Schedule:
         size: how many places are used.
         index: the same of indices, and how many.
         loops: of each loop its first and last step.
+        repeats: whether the machine has loops.
     """
 
     words: list[Word] = field(default_factory=list)
@@ -93,6 +96,7 @@ class Schedule:
     size: int = 0
     indices: int = 0
     loops: list[tuple[int, int]] = field(default_factory=list)
+    repeats: bool = False
 
     @property
     def slots(self) -> list[Slot | None]:
@@ -100,9 +104,10 @@ class Schedule:
         return [w.does if isinstance(w.does, Slot) else None for w in self.words]
 
 
-def schedule(plan: Plan, latency: int = LATENCY) -> Schedule:
-    """The order of a tick's sums."""
-    made = Schedule()
+def schedule(plan: Plan, rows: bool = False) -> Schedule:
+    """The order of a tick's sums, for a machine with rows or without."""
+    made = Schedule(repeats=rows)
+    latency = LATENCY + AHEAD * rows
     ready: dict[int, int] = {}  # cycles from which a word, or all of a row, can be read
     spans: list[tuple[int, int]] = []
     for stage in plan.stages:
@@ -120,29 +125,47 @@ def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], late
     """Words one by one, with terms that are many between them."""
     order = _Order(plan, [(n, 0) for n in stage.order], latency, ready, made.cycles)
     last: int | None = None
+    idle = 0
     for slot in order.slots:
-        if slot is not None and slot.term.times and last != slot.term.times - 1:
+        if slot is None:
+            idle += 1
+            continue
+        if slot.term.times and last != slot.term.times - 1:
             last = slot.term.times - 1
-            if made.words and made.words[-1] == Word():
-                made.words[-1] = Word(Loop(last))
-            else:
-                made.words.append(Word(Loop(last)))
-                made.cycles += 1
+            _wait(made, idle - 1)
+            made.words.append(Word(Loop(last)))
+            made.cycles += 1
+        elif idle:
+            last = last if _wait(made, idle) else None
+        idle = 0
         made.words.append(Word(slot))
-        made.cycles += 1 if slot is None else slot.term.times or 1
-        if slot is not None and slot.writes is not None:
+        made.cycles += slot.term.times or 1
+        if slot.writes is not None:
             ready[slot.writes] = made.cycles - 1 + latency
+
+
+def _wait(made: Schedule, cycles: int) -> bool:
+    """Steps that do nothing: one that is repeated, where there are many and rows; whether these are none such."""
+    made.cycles += max(cycles, 0)
+    if cycles < _LEAST or not made.repeats:
+        made.words += [Word()] * cycles
+        return True
+    made.words += [Word(Loop(cycles - 2)), Word(repeat=True)]
+    return False
 
 
 def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], latency: int) -> None:
     """All rows of one length: a round as often as it takes."""
     best: tuple[float, int, _Order] | None = None
+    least = 0
     for step in range(1, min(_ABREAST, stage.row) + 1):
         if stage.row % step:
             continue
         order = _Order(plan, [(n, k) for n in stage.order for k in range(step)], latency, {}, 0)
         pace = max(len(order.slots), _LEAST) / step
-        if best is None or (pace < 0.9 * best[0] and len(order.slots) <= _LONGEST):
+        longest = max(_LONGEST, 1.3 * least) if least else len(order.slots)
+        least = least or len(order.slots)
+        if best is None or (pace < 0.9 * best[0] and len(order.slots) <= longest):
             best = pace, step, order
         terms = sum(len(plan.tick.made(n).terms) for n in stage.order)
         if len(order.slots) < 1.1 * terms * step:
@@ -161,7 +184,9 @@ def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], laten
                     begin = max(begin, ready.get(n, 0) - t)
     wait = begin - made.cycles
     head = made.words.pop()
-    made.words += [Word()] * wait + [head]
+    made.cycles -= 1
+    _wait(made, wait)
+    made.words.append(head)
     rounds = stage.row // step
     body = [Word(slot) for slot in slots]
     body[-_LEAST] = replace(body[-_LEAST], back=True)
