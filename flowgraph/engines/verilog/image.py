@@ -23,7 +23,7 @@ from flowgraph.engines.verilog.nodes import (
 )
 from flowgraph.engines.verilog.plan import Plan
 from flowgraph.engines.verilog.rows import element_of, root_of
-from flowgraph.engines.verilog.schedule import Loop, Schedule, Slot, Word, schedule
+from flowgraph.engines.verilog.schedule import Loop, Schedule, Word, schedule
 from flowgraph.engines.verilog.tick import Tick, held_values
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -99,7 +99,9 @@ class Image:
         self.indices = max((s.indices for s in schedules), default=0)
         longest = [0, *(w.does.last + 1 for s in schedules for w in s.words if isinstance(w.does, Loop))]
         self.lane_bits = max(1, max(longest).bit_length())
-        self.place_bits = max(4, (self.words - 1).bit_length(), (self.indices - 1).bit_length(), self.lane_bits + 1)
+        self.place_bits = max(
+            4, (self.words - 1).bit_length(), (self.indices - 1).bit_length(), self.lane_bits + 1
+        )
         self.units = sorted(
             {UNITS[s.node.unit] for x in schedules for s in x.slots if s and s.mode == "START"}
         )
@@ -214,8 +216,11 @@ class Image:
             return int(last) << 31 | marks << 32 + 3 * bits
         if isinstance(word.does, Loop):
             marks |= 1 << 8
-            return int(last) << 31 | word.does.step << 32 + bits | word.does.last << 32 + 2 * bits | (
-                marks << 32 + 3 * bits
+            return (
+                int(last) << 31
+                | word.does.step << 32 + bits
+                | word.does.last << 32 + 2 * bits
+                | (marks << 32 + 3 * bits)
             )
         slot = word.does
         t, node = slot.term, slot.node

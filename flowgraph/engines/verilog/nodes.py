@@ -76,8 +76,8 @@ class Sum:
         floor: shifts round down; for NORM_EVEN, that the fraction is odd.
         unit: of a START or TAKE.
         row: how many such words there are, each of the elements of the rows among its operands; 0 for one.
-        gather: of terms with `times`, whether each element is the sum so far ("running"), or instead of the sum
-            the largest is taken ("peak").
+        gather: of terms with `times`, whether each element is the sum so far ("running"), or the largest of
+            them is taken and no sum ("peak").
     """
 
     terms: tuple[Term, ...]
@@ -223,7 +223,8 @@ class Nodes:
 
         Args:
             terms: with shifts of any size.
-            end, mode, limit, floor, row, gather: as in `Sum`; rows among the operands make a row by themselves.
+            end, mode, limit, floor, gather: as in `Sum`.
+            row: likewise, where no row among the operands says so.
         """
         mode = self._fitting(mode)
         kept: list[Term] = []
@@ -250,7 +251,9 @@ class Nodes:
 
     def _rows(self, terms: Iterable[Term]) -> int:
         """How long the row is that terms make."""
-        found = {self.row(n) for t in terms if not t.times for n in ((t.b,) if t.kind == "GET" else (t.a, t.b))}
+        found = {
+            self.row(n) for t in terms if not t.times for n in ((t.b,) if t.kind == "GET" else (t.a, t.b))
+        }
         found.discard(0)
         assert len(found) < 2, f"{self.here}: rows of {sorted(found)}"
         return found.pop() if found else 0

@@ -1,9 +1,9 @@
 """What a tick needs, with what must come before what, in stages: words one by one, and loops over rows.
 
-A stage makes words, or all rows of one length in one loop, in which each element is made of the elements beside
-it. What reads a row otherwise (its sum, one of its elements, a part of it) belongs to a later stage. Every sum
-comes as late as what reads it allows. The registers are written in the last stages, when nobody reads them
-any more.
+A stage makes words, or all rows of one length in one loop, in which each element is made of the elements
+beside it. What reads a row otherwise (its sum, one of its elements, a part of it) belongs to a later stage.
+Every sum comes as late as what reads it allows. The registers are written in the last stages, when nobody
+reads them any more.
 """
 
 from __future__ import annotations
@@ -88,16 +88,19 @@ class Plan:
             if isinstance(node, Sum):
                 for r, _ in self.reads(node):
                     uses[r] = uses.get(r, 0) + 1
-        for n in (r for n in wanted for r in self.sources(n)):
+        for n in [r for w in wanted for r in self.sources(w)]:
             uses[n] = uses.get(n, 0) + 1
             node = nodes[n]
-            if isinstance(node, Held) and n not in self.outputs:
-                if node in self._registers or (node.row and node.value in written):
-                    self.outputs[n] = self._copy(n, node.row)
+            if not isinstance(node, Held) or n in self.outputs:
+                continue
+            if node in self._registers or (node.row and node.value in written):
+                self.outputs[n] = self._copy(n, node.row)
         taken: set[int] = set()
         for held, source in tick.writes.items():
             node = nodes[source]
-            alone = isinstance(node, Sum) and not uses.get(source) and source not in taken and not tick.shortest
+            alone = (
+                isinstance(node, Sum) and not uses.get(source) and source not in taken and not tick.shortest
+            )
             if alone and not any(isinstance(nodes[r], Held) for r, _ in self.reads(tick.made(source))):
                 taken.add(source)
                 self.fixed[source] = held
@@ -171,9 +174,10 @@ class Plan:
         self.rows = {}
         for n in self.order:
             for r, beside in self.reads(made(n)):
-                if isinstance(nodes[r], Sum) and made(r).row and made(r).mode != "START":
-                    if stage_of[r] != stage_of[n] or not beside or self.class_of(r) == 0:
-                        self.rows[r] = max(self.rows.get(r, 0), stage_of[n])
+                if not isinstance(nodes[r], Sum) or not made(r).row or made(r).mode == "START":
+                    continue
+                if stage_of[r] != stage_of[n] or not beside or self.class_of(r) == 0:
+                    self.rows[r] = max(self.rows.get(r, 0), stage_of[n])
             if n in self.kept and made(n).row:
                 self.rows[n] = len(self.stages)
         for n in self.fixed:

@@ -160,7 +160,7 @@ class Rows(Nodes, abc.ABC):
         return x if len(x) == most else self.long(x)
 
     def _axis(self, shape: tuple[int, ...], words: Sequence[np.ndarray]) -> int | None:
-        """The axis that rows run along: one with an element of a row behind another, or else the last long one."""
+        """The axis that rows run along: one on which they do already, or else the last long one."""
         long = [a for a in reversed(range(len(shape))) if self.shortest and shape[a] >= self.shortest]
         for axis in long:
             for a in words:
@@ -181,14 +181,16 @@ class Rows(Nodes, abc.ABC):
                 return None
             lines.append(found)
         rows = [n for n in lines if self.row(n)]
-        if all(isinstance(self.nodes[n], Table) for n in rows) and all(
-            self.known(n) is not None or self.row(n) for n in lines
-        ) and rows:
+        if (
+            all(isinstance(self.nodes[n], Table) for n in rows)
+            and all(self.known(n) is not None or self.row(n) for n in lines)
+            and rows
+        ):
             return None  # all is known
         return [make(*lines, *(row[0] for row in shifts))]
 
     def along(self, kind: str, rows: Iterable[tuple[int, int, int]], minus: bool = False) -> list[Term]:
-        """Terms of a sum of many, those along a row as one; each is two numbers as arrays have them and a shift."""
+        """Terms of two numbers, as arrays have them, and a shift each; those along a row are one."""
         left = list(rows)
         found: list[Term] = []
         k = 0

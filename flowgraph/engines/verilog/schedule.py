@@ -145,7 +145,7 @@ def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], late
 
 
 def _wait(made: Schedule, cycles: int) -> bool:
-    """Steps that do nothing: one that is repeated, where there are many and rows; whether these are none such."""
+    """Steps that do nothing; where many can be one that is repeated, they are, and the answer is no."""
     made.cycles += max(cycles, 0)
     if cycles < _LEAST or not made.repeats:
         made.words += [Word()] * cycles
@@ -362,7 +362,7 @@ def _places(plan: Plan, made: Schedule, spans: list[tuple[int, int]]) -> None:
 
 
 def _row_places(plan: Plan, made: Schedule, index: bool, first: int) -> int:
-    """Places for rows, behind the words: where there is room between those that are read in a stage or later."""
+    """Places for rows, behind the words: where there is room between those that are still read."""
     used: list[tuple[int, int, int]] = []  # first place, the one behind the last, and the last stage
     most = first
     for k, stage in enumerate(plan.stages):

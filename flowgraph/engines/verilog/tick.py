@@ -10,8 +10,8 @@ import numpy as np
 from flowgraph.engines.fixed import absent, shifts
 from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.lookup import Lookup
 from flowgraph.engines.verilog.nodes import Held, Term
-from flowgraph.engines.verilog.places import Places
 from flowgraph.engines.verilog.real import COMPARE, no_form
 from flowgraph.engines.verilog.rows import root_of
 from flowgraph.engines.verilog.whole import stacked
@@ -24,12 +24,15 @@ from flowgraph.recorder.ops import OPS, Spec
 _PARTICLES = 8
 """Fewer are written out."""
 
+_SHORT = 6
+"""And shorter axes always."""
+
 _MAY_BE_NONE = frozenset(
     ["add", "subtract", "multiply", "where", "negative", "abs", "positive", "materialise"]
 ) | frozenset(("isnan", "isfinite", *COMPARE)) | (shifts.MOVES - {"take"})  # fmt: skip
 
 
-class Tick(Places):
+class Tick(Lookup):
     """The words of one pattern of present inputs.
 
     Args:
@@ -277,7 +280,10 @@ class Tick(Places):
                 for to, n in (
                     [(root_of(flat[k]), source)]
                     if source is not None
-                    else [(self.word(to), self.word(n)) for to, n in zip(flat[k : k + size], wanted[k : k + size], strict=True)]
+                    else [
+                        (self.word(to), self.word(n))
+                        for to, n in zip(flat[k : k + size], wanted[k : k + size], strict=True)
+                    ]
                 ):
                     held = self.nodes[to]
                     assert isinstance(held, Held)
@@ -295,7 +301,7 @@ def held_values(pipeline: Pipeline) -> dict[int, Spec]:
 
 
 def shortest_row(pipeline: Pipeline) -> int:
-    """From which length on an axis is made in loops: three quarters of the particles, or 0 without such.
+    """From which length on an axis is made in loops: a quarter of the particles, or 0 without such.
 
     Particles are the last axis of registers of several shapes. Their random words come four at a time.
     """
@@ -305,7 +311,7 @@ def shortest_row(pipeline: Pipeline) -> int:
             if c.shape and c.shape[-1] >= _PARTICLES and c.shape[-1] not in c.shape[:-1]:
                 ends.setdefault(c.shape[-1], set()).add(c.shape[:-1])
     sizes = [n for n, shapes in ends.items() if len(shapes) > 1]
-    return min(sizes) * 3 // 4 if sizes else 0
+    return max(-(-min(sizes) // 4), _SHORT) if sizes else 0
 
 
 __all__ = ["NOT_A_NUMBER", "Tick", "held_values"]

@@ -168,7 +168,9 @@ class Whole(Real):
             )
             low = self.plain(part) if k == top else Term("AND", part, self.constant((1 << digit) - 1))
             number = self.sum([*rest, low], mode="RAW", limit=NO_LIMIT)
-            divided = self.sum([Term("MUL", number, factor)], end=shift, mode="RAW", limit=NO_LIMIT, floor=True)
+            divided = self.sum(
+                [Term("MUL", number, factor)], end=shift, mode="RAW", limit=NO_LIMIT, floor=True
+            )
             rest = [self.plain(number, -digit), Term("MUL", divided, b[0], -digit, True)]
             found.append(self.plain(divided, -digit * k))
         return self.wrapped(found, s.i.spec.dtype)

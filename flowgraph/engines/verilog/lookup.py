@@ -1,4 +1,4 @@
-"""What reads an array at a computed place, or keeps a sum as it goes: `take`, `searchsorted`, running sums."""
+"""Arrays that are read at computed places, and sums as they go: `take`, `searchsorted`, `cumulative_sum`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowgraph.engines.verilog.real import no_form
 from flowgraph.engines.verilog.whole import Pair, Whole
 
 
-class Places(Whole):
+class Lookup(Whole):
     """Nodes that know rows by places in them."""
 
     def _take(self, s: Site, args: list[np.ndarray], real: bool) -> np.ndarray:
@@ -90,7 +90,10 @@ class Places(Whole):
             if not halving:
                 below = [
                     self.sum(
-                        [*(self.plain(self.word(w), at - 32 * k) for k, w in enumerate(row)), *minus(value, by)],
+                        [
+                            *(self.plain(self.word(w), at - 32 * k) for k, w in enumerate(row)),
+                            *minus(value, by),
+                        ],
                         mode=mode,
                         limit=NO_LIMIT,
                     )
@@ -135,7 +138,9 @@ class Places(Whole):
             np.moveaxis(np.broadcast_to(a, shape), axis, -1).reshape(-1, size).tolist() for a in (by, ends)
         )
         made = [
-            self._real_sums(line[:, 0].tolist(), b, e, limit) if real else self._whole_sums(line, i.spec.dtype)
+            self._real_sums(line[:, 0].tolist(), b, e, limit)
+            if real
+            else self._whole_sums(line, i.spec.dtype)
             for line, b, e in zip(lines, moved, last, strict=True)
         ]
         most = max(m.shape[-1] for m in made)
