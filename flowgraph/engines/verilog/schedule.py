@@ -117,6 +117,9 @@ def schedule(plan: Plan, rows: bool = False) -> Schedule:
         else:
             _words(plan, stage, made, ready, latency)
         spans.append((start, len(made.words) - 1))
+    if made.words and made.words[-1].ends:  # the program halts behind its last loop
+        made.words.append(Word())
+        made.cycles += 1
     _places(plan, made, spans)
     return made
 

@@ -303,12 +303,13 @@ def held_values(pipeline: Pipeline) -> dict[int, Spec]:
 def shortest_row(pipeline: Pipeline) -> int:
     """From which length on an axis is made in loops: a quarter of the particles, or 0 without such.
 
-    Particles are the last axis of registers of several shapes. Their random words come four at a time.
+    Particles are an axis that has a name, the last of registers of several shapes. Their random words come four at a time.
     """
     ends: dict[int, set[tuple[int, ...]]] = {}
     for r in pipeline.registers:
         for c in r.cells:
-            if c.shape and c.shape[-1] >= _PARTICLES and c.shape[-1] not in c.shape[:-1]:
+            named = len(c.axes) == len(c.shape) > 0 and c.axes[-1]
+            if named and c.shape[-1] >= _PARTICLES and c.shape[-1] not in c.shape[:-1]:
                 ends.setdefault(c.shape[-1], set()).add(c.shape[:-1])
     sizes = [n for n, shapes in ends.items() if len(shapes) > 1]
     return max(-(-min(sizes) // 4), _SHORT) if sizes else 0

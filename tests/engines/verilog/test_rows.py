@@ -27,8 +27,8 @@ N = 24
 class Cloud(Signal):
     """A weight and a place in the plane of each particle."""
 
-    weight: Array = real(N)
-    place: Array = real(2, N)
+    weight: Array = real("particles")
+    place: Array = real(2, "particles")
 
 
 class Kept(Signal):
@@ -160,16 +160,20 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
             place, word = place_of(n, k, x)
             assert lies[place] == word, (n, nth, x)
 
-    def step(slot, lane):
-        nonlocal now, due
-        for when, place, word in [d for d in due if d[0] <= now]:
+    def arrive():
+        nonlocal due
+        for _, place, word in [d for d in due if d[0] <= now]:
             lies[place] = word
         due = [d for d in due if d[0] > now]
+
+    def step(slot, lane):
+        arrive()
         t = slot.term
         if t.kind != "TAKE":
             for n in (t.a, t.b):
                 if plan.base(n) == n:
-                    look(n, slot.nth, lane, t.kind == "GET" and n == t.a)
+                    every = t.kind == "GET" and n == t.a
+                    look(n, 0 if every else slot.nth, lane, every)
         if slot.writes is not None and slot.writes not in plan.fixed:
             place, word = place_of(slot.writes, slot.nth, lane)
             due.append((now + LATENCY + 4, place, word))
@@ -199,7 +203,8 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
                 last = lane == times - 1 or slot.node.gather == "running"
                 if last or slot.writes is None:
                     step(slot, lane if slot.node.gather == "running" else 0 if times == 1 else lane)
-                elif slot.writes is not None and slot.term.times:
+                else:
+                    arrive()
                     for n in (slot.term.a, slot.term.b):
                         if plan.base(n) == n:
                             look(n, 0, lane, False)
