@@ -106,8 +106,10 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def flown(name: str, seed: int, duration: float) -> Flown:
+def flown(name: str, seed: int, duration: float, particles: int = 0) -> Flown:
     spec, given = FLIGHTS.get(name, ("sim", {}))
+    if particles and "particles" in given:
+        given = {**given, "particles": str(particles)}
     graph = find_graph(name)
     assert graph.prepare is not None
     mine, rest = parsed_settings(

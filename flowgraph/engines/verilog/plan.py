@@ -42,6 +42,7 @@ class Plan:
         self.tick = tick
         self.fixed: dict[int, Held] = {}
         self.outputs: dict[int, int] = {}
+        self.rows: dict[int, int] = {}
         self._registers = set(tick.writes)
         self.joined = {r: x.parts for x in tick.nodes if isinstance(x, Joined) for r in x.parts}
         self._copies()
@@ -147,7 +148,7 @@ class Plan:
         kinds = [0, *sorted({self.class_of(n) for n in self.order} - {0})]
         many = len(kinds)
         if many == 1:
-            self.stages, self.rows = [Stage(0, self.order)], {}
+            self.stages = [Stage(0, self.order)]
             return
         place = {row: k for k, row in enumerate(kinds)}
         depth: dict[int, int] = {}  # stages from the end; the first `many` write the registers
@@ -171,7 +172,6 @@ class Plan:
             orders.setdefault(depth[n], []).append(n)
         self.stages = [Stage(kinds[d % many], orders[d]) for d in sorted(orders, reverse=True)]
         stage_of = {n: k for k, stage in enumerate(self.stages) for n in stage.order}
-        self.rows = {}
         for n in self.order:
             for r, beside in self.reads(made(n)):
                 if not isinstance(nodes[r], Sum) or not made(r).row or made(r).mode == "START":

@@ -241,9 +241,9 @@ class _Order:
         later: dict[Item, list[Item]] = {x: [] for x in items}
         missing = {x: len(needs[x]) for x in items}
         for n, k in items:
-            for r in self.plan.after.get(n, ()):
-                if (r, k) in self.within:
-                    later[(r, k)].append((n, k))
+            for held in self.plan.after.get(n, ()):
+                if (held, k) in self.within:
+                    later[(held, k)].append((n, k))
                     missing[(n, k)] += 1
         urgent: dict[Item, int] = {}
         for x in sorted(items, reverse=True):

@@ -303,7 +303,8 @@ def held_values(pipeline: Pipeline) -> dict[int, Spec]:
 def shortest_row(pipeline: Pipeline) -> int:
     """From which length on an axis is made in loops: a quarter of the particles, or 0 without such.
 
-    Particles are an axis that has a name, the last of registers of several shapes. Their random words come four at a time.
+    Particles are an axis that has a name, the last of registers of several shapes. Their random words come
+    four at a time.
     """
     ends: dict[int, set[tuple[int, ...]]] = {}
     for r in pipeline.registers:
