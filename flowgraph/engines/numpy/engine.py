@@ -18,7 +18,7 @@ from flowgraph.engines.stretches import joined
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import DTYPES
 
-TICKS = 4096
+TICKS = 8192
 """How many are done at once: what a value takes then stays within a processor's cache."""
 
 
