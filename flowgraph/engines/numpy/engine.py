@@ -89,11 +89,11 @@ class _Prepared(Player):
         found = []
         every = self.plan.every
         for port, (flag, leaves) in zip(self.pipeline.outputs, self.plan.program.outputs, strict=True):
-            if flag is None:
+            where = 0 if flag is None else self.plan.bounds.get(flag, (0, every))[1]
+            if flag is None or not where:
                 none = [np.zeros((0, *leaf.shape), DTYPES[leaf.dtype]) for leaf in port.leaves]
                 found.append((np.zeros(0, np.int64), none))
                 continue
-            where = self.plan.bounds.get(flag, (0, every))[1]
             present = ticks.full(flag, where)
             whole = present.all()
             times = ticks.times[ticks.rows(where)]

@@ -203,7 +203,7 @@ class _Planner:
 
     def loop(self, cells: list[int], inside: list[Instruction], part: set[int]) -> Step:
         taken = dict.fromkeys(a for i in inside for a in i.args if a not in part)
-        sides = {i.out: side for i in inside if (side := self.side(i)) is not None}
+        sides = {i.out: self.bounds[i.args[0]] for i in inside if i.op == "where" and i.args[0] in self.bounds}
         wanted = tuple(
             (n, self.program.specs[n], self.every if n in self.written else self.needed[n])
             for n in sorted(part)
@@ -254,8 +254,9 @@ def ordered(nodes: Iterable[int], needs: Callable[[int], Iterable[int]]) -> list
                 if way:
                     least[way[-1][0]] = min(least[way[-1][0]], least[n])
                 if least[n] == number[n]:
-                    place = waiting.index(n)
-                    parts.append(waiting[place:])
-                    del waiting[place:]
-                    open_.difference_update(parts[-1])
+                    part = [waiting.pop()]
+                    while part[-1] != n:
+                        part.append(waiting.pop())
+                    parts.append(part)
+                    open_.difference_update(part)
     return parts

@@ -239,13 +239,14 @@ class Scan(Step):
     def play(self, ticks: Stretch) -> None:
         cell, where = ticks.cells[self.read], self.where
         taken = np.ones(len(ticks.rows(where)), bool)
-        for n, wanted in self.conditions:
+        for n, wanted in self.conditions if len(taken) else ():
             taken &= ticks.at(n, where) == wanted
-        given, count = ticks.full(self.given, where), len(taken)
-        if not taken.all():
-            given, count = given[..., taken], int(taken.sum())
+        count = int(taken.sum())
         held = np.empty((*cell.shape, 1 + count), cell.dtype)
-        held[..., :1], held[..., 1:] = cell[..., None], given
+        held[..., :1] = cell[..., None]
+        if count:
+            given = ticks.full(self.given, where)
+            held[..., 1:] = given if count == len(taken) else given[..., taken]
         if self.ufunc is not None:
             held = self.ufunc.accumulate(held, axis=-1, dtype=cell.dtype)
         ever = count == len(ticks.times)
@@ -266,7 +267,7 @@ class Loop(Step):
         cells: (read, write) of the registers.
         instructions: in order, each with the patterns in which it is needed.
         outside: what they take of the values that are there.
-        sides: of a selection by presence, the patterns in which it takes the first side.
+        sides: of a selection, the patterns in which it surely takes the first side, and may.
         wanted: the values that others take, with their specs and patterns.
         count: of the patterns.
         real: what `real` is.
@@ -275,7 +276,7 @@ class Loop(Step):
     cells: tuple[tuple[int, int], ...]
     instructions: tuple[tuple[Instruction, Patterns], ...]
     outside: tuple[int, ...]
-    sides: Mapping[int, Patterns]
+    sides: Mapping[int, tuple[Patterns, Patterns]]
     wanted: tuple[tuple[int, Spec, Patterns], ...]
     count: int
     real: Any
@@ -297,9 +298,9 @@ class Loop(Step):
         for i, where in self.instructions:
             if not where >> p & 1:
                 continue
-            if i.out in self.sides:
-                chosen = i.args[1 if self.sides[i.out] >> p & 1 else 2]
-                found.append((_Taken(i.spec, self.real), (chosen,), i.out))
+            low, high = (b >> p & 1 for b in self.sides.get(i.out, (0, -1)))
+            if low == high:
+                found.append((_Taken(i.spec, self.real), (i.args[1 if low else 2],), i.out))
             else:
                 found.append((at_one_tick(i, self.real), i.args, i.out))
         return found
@@ -307,7 +308,7 @@ class Loop(Step):
     def play(self, ticks: Stretch) -> None:
         env = {read: ticks.cells[read] for read, _ in self.cells}
         env.update({n: ticks.fixed[n][..., 0] for n in self.outside if n in ticks.fixed})
-        moving = [n for n in self.outside if n not in ticks.fixed]
+        moving = [n for n in self.outside if n in ticks.values]  # what is never needed is not there
         feeds = [(n, ticks.values[n][0], iter(_columns(ticks.values[n][1]))) for n in moving]
         kept: list[tuple[int, Patterns, list[Any]]] = [(n, where, []) for n, _, where in self.wanted]
         coming = [[(n, feed) for n, where, feed in feeds if where >> p & 1] for p in range(self.count)]
