@@ -23,7 +23,9 @@ TICKS = 8192
 
 
 class _Prepared(Player):
-    def __init__(self, pipeline: Pipeline, patterns: tuple[int, ...], real: Any, passes: Sequence[str]) -> None:
+    def __init__(
+        self, pipeline: Pipeline, patterns: tuple[int, ...], real: Any, passes: Sequence[str]
+    ) -> None:
         self.pipeline, self.patterns, self.real = pipeline, patterns, real
         self.plan = planned(pipeline, patterns, real, passes)
 

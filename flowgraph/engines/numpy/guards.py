@@ -61,6 +61,9 @@ def needed_in(program: Program, bounds: Bounds, every: Patterns) -> dict[int, Pa
             need(i.args[0], here)
             need(i.args[1], here & high)
             need(i.args[2], here & ~low)
+        elif i.op == "logical_and" and not i.spec.shape:  # false where the other surely is, whatever it is
+            need(i.args[0], here & bounds[i.args[1]][1] if i.args[1] in bounds else here)
+            need(i.args[1], here & bounds[i.args[0]][1] if i.args[0] in bounds else here)
         else:
             for a in i.args:
                 need(a, here)

@@ -8,7 +8,7 @@ others are a `Loop`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -69,11 +69,23 @@ class Plan:
 
 def planned(pipeline: Pipeline, patterns: Sequence[int], real: Any, passes: Iterable[str]) -> Plan:
     """The plan for ticks of these patterns of present inputs."""
-    program = optimise(specialise(pipeline, None), tuple(passes))
+    program = optimise(_without_draws(specialise(pipeline, None), pipeline), tuple(passes))
     every = (1 << len(patterns)) - 1
     bounds = bounds_of(program, pipeline.inputs, patterns)
     needed = needed_in(program, bounds, every)
     return _Planner(pipeline, program, real, every, bounds, needed).plan()
+
+
+def _without_draws(program: Program, pipeline: Pipeline) -> Program:
+    """The program without what makes random numbers: a site's are drawn for all ticks by a function."""
+    sites = {s.value for s in pipeline.random}
+    wanted = {*program.writes, *(n for flag, leaves in program.outputs for n in (flag, *leaves))}
+    kept = []
+    for i in reversed(program.instructions):
+        if i.out in wanted and i.out not in sites:
+            kept.append(i)
+            wanted.update(i.args)
+    return replace(program, instructions=tuple(reversed(kept)))
 
 
 class _Planner:
@@ -203,7 +215,7 @@ class _Planner:
 
     def loop(self, cells: list[int], inside: list[Instruction], part: set[int]) -> Step:
         taken = dict.fromkeys(a for i in inside for a in i.args if a not in part)
-        sides = {i.out: self.bounds[i.args[0]] for i in inside if i.op == "where" and i.args[0] in self.bounds}
+        known = {n: self.bounds[n] for i in inside for n in (i.args[0], i.out) if n in self.bounds}
         wanted = tuple(
             (n, self.program.specs[n], self.every if n in self.written else self.needed[n])
             for n in sorted(part)
@@ -212,8 +224,8 @@ class _Planner:
         return Loop(
             tuple((r, self.written[r]) for r in cells),
             tuple((i, self.needed[i.out]) for i in inside),
-            tuple(taken),
-            sides,
+            tuple((n, self.needed.get(n, 0)) for n in taken),
+            known,
             wanted,
             self.every.bit_length(),
             self.real,

@@ -8,11 +8,12 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.numpy.guards import Patterns
+from flowgraph.engines.numpy.guards import Bounds, Patterns
 from flowgraph.engines.numpy.rules import at_one_tick, bound
 from flowgraph.pipeline.pipeline import RandomSite
 from flowgraph.recorder.ops import Spec
@@ -71,6 +72,8 @@ class Stretch:
         """A value at the ticks of a set, zero where it was not needed; a last axis of 1: the same in all."""
         if n in self.fixed:
             return self.fixed[n]
+        if n not in self.values:  # a condition beside one that never holds
+            return np.zeros(1, bool)
         had, value = self.values[n]
         if had == where:
             return value
@@ -266,8 +269,8 @@ class Loop(Step):
     Args:
         cells: (read, write) of the registers.
         instructions: in order, each with the patterns in which it is needed.
-        outside: what they take of the values that are there.
-        sides: of a selection, the patterns in which it surely takes the first side, and may.
+        outside: what they take of the values that are there, and the patterns in which it is needed.
+        known: for Booleans, the patterns in which they are surely true, and may be.
         wanted: the values that others take, with their specs and patterns.
         count: of the patterns.
         real: what `real` is.
@@ -275,8 +278,8 @@ class Loop(Step):
 
     cells: tuple[tuple[int, int], ...]
     instructions: tuple[tuple[Instruction, Patterns], ...]
-    outside: tuple[int, ...]
-    sides: Mapping[int, tuple[Patterns, Patterns]]
+    outside: tuple[tuple[int, Patterns], ...]
+    known: Bounds
     wanted: tuple[tuple[int, Spec, Patterns], ...]
     count: int
     real: Any
@@ -287,7 +290,7 @@ class Loop(Step):
 
     @property
     def takes(self) -> tuple[int, ...]:
-        return self.outside
+        return tuple(n for n, _ in self.outside)
 
     def __post_init__(self) -> None:
         self.lists = [self._list(p) for p in range(self.count)]
@@ -298,18 +301,21 @@ class Loop(Step):
         for i, where in self.instructions:
             if not where >> p & 1:
                 continue
-            low, high = (b >> p & 1 for b in self.sides.get(i.out, (0, -1)))
-            if low == high:
+            choice = i.args[0] if i.op == "where" else i.out
+            low, high = (b >> p & 1 for b in self.known.get(choice, (0, -1)))
+            if low == high and i.op == "where":
                 found.append((_Taken(i.spec, self.real), (i.args[1 if low else 2],), i.out))
+            elif low == high:
+                found.append((partial(np.bool_, bool(low)), (), i.out))
             else:
                 found.append((at_one_tick(i, self.real), i.args, i.out))
         return found
 
     def play(self, ticks: Stretch) -> None:
         env = {read: ticks.cells[read] for read, _ in self.cells}
-        env.update({n: ticks.fixed[n][..., 0] for n in self.outside if n in ticks.fixed})
-        moving = [n for n in self.outside if n in ticks.values]  # what is never needed is not there
-        feeds = [(n, ticks.values[n][0], iter(_columns(ticks.values[n][1]))) for n in moving]
+        env.update({n: ticks.fixed[n][..., 0] for n, _ in self.outside if n in ticks.fixed})
+        moving = [(n, where) for n, where in self.outside if n not in ticks.fixed and where]
+        feeds = [(n, where, iter(_columns(ticks.at(n, where)))) for n, where in moving]
         kept: list[tuple[int, Patterns, list[Any]]] = [(n, where, []) for n, _, where in self.wanted]
         coming = [[(n, feed) for n, where, feed in feeds if where >> p & 1] for p in range(self.count)]
         going = [[(n, rows) for n, where, rows in kept if where >> p & 1] for p in range(self.count)]

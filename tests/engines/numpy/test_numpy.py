@@ -30,12 +30,12 @@ from flowgraph.blocks.flights.figure import figure
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.engines.numpy import engine as whole
 from flowgraph.engines.numpy.plan import ordered, planned
-from flowgraph.engines.numpy.steps import Before, Choose, Draw, Loop, Scan
+from flowgraph.engines.numpy.steps import Before, Draw, Loop, Scan
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import ELEMENTWISE, OPS
 from tests.engines.c.test_expand import SHAPES, outputs
 from tests.engines.test_engines import RANDOM, RECIPES, TIMES, random_data, random_graph
-from tests.support import scalars, same
+from tests.support import same, scalars
 
 NOISY: dict[str, Any] = {
     "rate": 50.0,
@@ -84,7 +84,11 @@ def test_random_graphs_are_equal(recipe, times_x, times_y, seed, size):
 
 def test_a_flight_made_by_a_graph_is_equal_to_the_bit(stretch):
     end = 1_600_000_001
-    clocks = {"start": ticks(end, until=end), "imu": ticks("20ms", until=end), "vicon": ticks("250ms", until=end)}
+    clocks = {
+        "start": ticks(end, until=end),
+        "imu": ticks("20ms", until=end),
+        "vicon": ticks("250ms", until=end),
+    }
     built = figure.build(**NOISY)
     want, got = (simulate(built, clocks, engine=e, seed=2**40 + 7) for e in ("reference", "numpy"))
     same(want, got, exact=True)
@@ -256,7 +260,10 @@ def test_what_loops_in_another_way_is_played_tick_by_tick_between_the_rest(stret
     assert plan.loops == 2
     assert Scan in kinds(plan)
     random = np.random.default_rng(5)
-    data = {"x": scalars(np.arange(20) * 2, random.normal(size=20)), "y": scalars(np.arange(15) * 3, random.normal(size=15))}
+    data = {
+        "x": scalars(np.arange(20) * 2, random.normal(size=20)),
+        "y": scalars(np.arange(15) * 3, random.normal(size=15)),
+    }
     want, got = (simulate(built, data, engine=e) for e in ("reference", "numpy"))
     same(want, got, exact=True)
     (loop, *_) = (s for s in plan.steps if isinstance(s, Loop))
@@ -265,7 +272,11 @@ def test_what_loops_in_another_way_is_played_tick_by_tick_between_the_rest(stret
 
 def test_single_precision_is_that_of_the_reference(stretch):
     end = 400_000_001
-    clocks = {"start": ticks(end, until=end), "imu": ticks("20ms", until=end), "vicon": ticks("100ms", until=end)}
+    clocks = {
+        "start": ticks(end, until=end),
+        "imu": ticks("20ms", until=end),
+        "vicon": ticks("100ms", until=end),
+    }
     built = figure.build(**NOISY)
     want, got = (simulate(built, clocks, engine=e, dtype="float32", seed=3) for e in ("reference", "numpy"))
     for name, series in want.series.items():
