@@ -93,13 +93,15 @@ class _Prepared(Player):
         for port, (flag, leaves) in zip(self.pipeline.outputs, self.plan.program.outputs, strict=True):
             where = 0 if flag is None else self.plan.bounds.get(flag, (0, every))[1]
             if flag is None or not where:
-                none = [np.zeros((0, *leaf.shape), DTYPES[leaf.dtype]) for leaf in port.leaves]
+                none: list[np.ndarray] = [
+                    np.zeros((0, *leaf.shape), DTYPES[leaf.dtype]) for leaf in port.leaves
+                ]
                 found.append((np.zeros(0, np.int64), none))
                 continue
             present = ticks.full(flag, where)
             whole = present.all()
             times = ticks.times[ticks.rows(where)]
-            columns = []
+            columns: list[np.ndarray] = []
             for n, leaf in zip(leaves, port.leaves, strict=True):
                 column = ticks.full(n, where)
                 column = np.moveaxis(column if whole else column[..., present], -1, 0)

@@ -297,7 +297,7 @@ class Loop(Step):
 
     def _list(self, p: int) -> list[Any]:
         """What one tick of a pattern does."""
-        found = []
+        found: list[Any] = []
         for i, where in self.instructions:
             if not where >> p & 1:
                 continue
