@@ -262,6 +262,16 @@ def test_a_worker_killed_in_the_middle_changes_nothing(kind, undisturbed, tmp_pa
     assert told(read_table(tmp_path)) == rows
 
 
+def address_in(file, seconds=90.0):
+    """Of a scheduler, once it has written all of it down."""
+    deadline = time.monotonic() + seconds
+    while True:
+        with contextlib.suppress(OSError, json.JSONDecodeError):
+            return json.loads(file.read_text())["address"]
+        assert time.monotonic() < deadline, "no scheduler came"
+        time.sleep(0.05)
+
+
 @pytest.fixture
 def cluster(tmp_path):
     """The address of a Dask scheduler with two workers, each a process of its own without a nurse."""
@@ -278,10 +288,7 @@ def cluster(tmp_path):
             )  # fmt: skip
             all_of.callback(process.wait)
             all_of.callback(process.kill)
-        deadline = time.monotonic() + 90
-        while not file.exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        yield json.loads(file.read_text())["address"]
+        yield address_in(file)
 
 
 @pytest.mark.slow
