@@ -366,9 +366,11 @@ class OnDask(_Closing):
                 self._send(self._suspects.popleft(), alone=True)
 
     def close(self) -> None:
-        self._client.close(timeout=5)
+        with suppress(TimeoutError):  # what has been done is there, however long they take to go
+            self._client.close(timeout=5)
         if self._cluster is not None:
-            self._cluster.close(timeout=10)
+            with suppress(TimeoutError):
+                self._cluster.close(timeout=10)
 
 
 def _ask(distributed: Any, address: str, patience: float) -> None:
