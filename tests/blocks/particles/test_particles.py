@@ -124,7 +124,7 @@ def test_weights_stay_normalised_however_unlikely_all_particles_are():
     hopeless = LogLikelihood(value=np.array([-1e4, -1e4 - 1.0, -2e4, -3e4, -1e6]))
     nothing = LogLikelihood(value=np.zeros(N))
     weight = np.exp(reweight.step(cloud, hopeless, nothing, xp=np).log_weight)
-    assert weight.sum() == pytest.approx(1.0, abs=1e-12)
+    assert weight.sum() == pytest.approx(1.0, abs=1e-11)  # a logarithm of 1e4 is rounded by 1e-12
     before = np.exp(cloud.log_weight)
     assert weight[1] / weight[0] == pytest.approx(before[1] / before[0] * np.exp(-1.0), rel=1e-9)
 
