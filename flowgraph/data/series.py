@@ -90,7 +90,8 @@ class Series:
                 got=str(stamps.max()),
                 fix="check the unit of the stamps: they are nanoseconds",
             )
-        self.time = stamps.astype(np.int64)
+        self.time = stamps if _is_settled(stamps) else stamps.astype(np.int64)
+        self.time.flags.writeable = False  # what is made of it may share it
         self._stamp = None if stamp is None else _true_at(stamp, self.time, name)
         self.name, self.gaps = name, gaps
         self.type = type if type is not None else _one_of(values, name)
@@ -249,6 +250,14 @@ class Series:
     def __repr__(self) -> str:
         span = f"{(self.time[-1] - self.time[0]) * 1e-9:.3f} s" if len(self) else "empty"
         return f"<Series {self.name}: {len(self)} x {self.type}, {span}>"
+
+
+def _is_settled(stamps: np.ndarray) -> bool:
+    """Whether these are stamps that nobody can write to any more."""
+    owner: Any = stamps
+    while isinstance(owner, np.ndarray) and not owner.flags.writeable:
+        owner = owner.base
+    return owner is None and stamps.dtype == np.int64
 
 
 def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:

@@ -21,11 +21,15 @@ from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
 
 _WIDE = 64
+_FIRST, _MANY = 1024, 32
 
 
 @dataclass(frozen=True)
 class Tape:
-    """Ticks of recorded sources: `time[i]` in ns, and `key[i]` with bit k set where source k is present."""
+    """Ticks of recorded sources: `time[i]` in ns, and `key[i]` with bit k set where source k is present.
+
+    The keys are of the smallest kind of integer that has so many bits.
+    """
 
     time: np.ndarray
     key: np.ndarray
@@ -35,17 +39,18 @@ class Tape:
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
         time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [None if len(s) == len(time) else _rows(time, s.time) for s in series]
-        if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
+        rows = [_rows(time, s.time) for s in series]
+        if any(r is None for r in rows):
             time = np.concatenate([s.time for s in series])
             time.sort(kind="stable")  # merges runs that are sorted already
             time = time[np.concatenate([[True], time[1:] != time[:-1]])]
+            time.flags.writeable = False  # outputs share it
             rows = [np.searchsorted(time, s.time) for s in series]
         if len(time):
             need_near(int(time[0]), int(time[-1]))
-        key = np.zeros(len(time), np.int64)
+        key = np.zeros(len(time), bits(len(series)))
         for k, r in enumerate(rows):
-            key[... if r is None else r] |= 1 << k
+            key[r] |= 1 << k
         return cls(time, key, series)
 
     def first(self, ticks: int) -> Tape:
@@ -62,11 +67,26 @@ class Tape:
     @property
     def patterns(self) -> tuple[int, ...]:
         """The keys that occur, in order."""
-        if len(self.series) > 16:
-            return tuple(np.unique(self.key).tolist())
-        seen = np.zeros(1 << len(self.series), bool)
-        seen[self.key] = True
-        return tuple(np.flatnonzero(seen).tolist())
+        return patterns_of(self.key)
+
+
+def bits(sources: int) -> Any:
+    """The smallest kind of integer with a bit for each of so many sources."""
+    return next((k for k in (np.uint8, np.uint16, np.uint32) if np.iinfo(k).bits >= sources), np.int64)
+
+
+def patterns_of(key: np.ndarray) -> tuple[int, ...]:
+    """The keys that occur, in order: those at the start, and what else is found behind."""
+    found: set[int] = set()
+    while len(key):
+        found.update(key[:_FIRST].tolist())
+        if len(found) > _MANY:
+            return tuple(sorted(found.union(np.unique(key).tolist())))
+        others = np.ones(len(key), dtype=bool)
+        for known in found:
+            others &= key != known
+        key = key[others]
+    return tuple(sorted(found))
 
 
 def check_stamp(name: str, time: Any) -> int:
@@ -110,8 +130,21 @@ def need_near(first: int, time: int) -> None:
         )
 
 
-def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Where `some` times lie among all; counted where these are equally far apart, and else looked for."""
+def _rows(time: np.ndarray, some: np.ndarray) -> slice | np.ndarray | None:
+    """Where `some` times lie among all; None if one of them is not there."""
+    if some is time or (len(some) == len(time) and np.array_equal(some, time)):
+        return slice(None)
+    if len(some) > 1:  # each n-th of them
+        first, second = np.searchsorted(time, some[:2]).tolist()
+        every = slice(first, first + (second - first) * len(some), max(second - first, 1))
+        if np.array_equal(time[every], some):
+            return every
+    rows = _looked_up(time, some)
+    return rows if np.array_equal(time.take(rows, mode="clip"), some) else None
+
+
+def _looked_up(time: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Rows of `some` times among all; counted where these are equally far apart, and else looked for."""
     if len(time) > 1 and len(some) and time[0] <= some[0] and some[-1] <= time[-1]:
         step = (int(time[-1]) - int(time[0])) // (len(time) - 1)
         if step > 0 and int(time[-1]) - int(time[0]) < 2**63:
@@ -119,11 +152,6 @@ def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
             if rows[-1] < len(time) and np.array_equal(time.take(rows, mode="clip"), some):
                 return np.asarray(rows)
     return np.searchsorted(time, some)
-
-
-def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
-    """`time[rows]`; all of it without rows, and the last where a row is past the end."""
-    return time if rows is None else time.take(rows, mode="clip")
 
 
 def tape(

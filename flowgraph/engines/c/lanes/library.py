@@ -130,7 +130,7 @@ class Lanes(Outputs):
             For each run how many rows each output has now, and (T,) uint64 with bit k set where output k was
             present.
         """
-        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
+        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key, np.int64)
         outputs = len(self.pipeline.outputs)
         made = np.empty((WIDTH, len(time)), np.uint64)
         counts = np.zeros((WIDTH, max(outputs, 1)), np.int64)
