@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from flowgraph.data.arrival import with_stamps
 from flowgraph.data.series import Flight, Series, unmasked
+from flowgraph.data.stamps import extreme_steps
 from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
@@ -24,8 +25,6 @@ from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import StructType, Type, as_value, check_fits, flatten
 
 Inputs = Flight | Mapping[str, Any]
-
-_PIECE = 16384
 
 NOT_FINITE = ("raise", "absent", "keep")
 """What a value with a NaN or an infinity may be: an error, no event, or data."""
@@ -224,7 +223,7 @@ def _check_after(name: str, time: int, resumed: int) -> None:
 
 def _checked(name: str, series: Series, timing: Timing, before: int = NEVER) -> Series:
     check_finite(name, series)
-    check_times(name, series.time, timing, before)
+    check_times(name, series.time, timing, before, series.steps)
     return series
 
 
@@ -248,24 +247,28 @@ def _not_finite(name: str, time: int, where: str, *, live: bool = False) -> None
     )
 
 
-def _extreme_steps(stamps: np.ndarray) -> tuple[int, int]:
-    """The shortest and the longest step, looked for a piece at a time: it stays in the cache."""
-    least, most = 2**63 - 1, 0
-    for start in range(0, len(stamps) - 1, _PIECE):
-        part = stamps[start : start + _PIECE + 1]
-        steps = part[1:] - part[:-1]
-        least, most = min(least, int(steps.min())), max(most, int(steps.max()))
-    return least, most
+def check_times(
+    name: str,
+    time: np.ndarray,
+    timing: Timing,
+    before: int = NEVER,
+    extremes: tuple[int, int] | None = None,
+) -> None:
+    """Check stamps (int64 ns) of one source against its declared clock.
 
-
-def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER) -> None:
-    """Check stamps (int64 ns) of one source against its declared clock; `before` is the stamp that came last.
+    Args:
+        name, time, timing: of the source.
+        before: the stamp that came last.
+        extremes: the shortest and the longest step of these, where they are known.
 
     Raises:
         DataError: out of order, or two at one time. ClockError: not as declared.
     """
-    stamps = time if before == NEVER else np.r_[before, time]
-    least, most = _extreme_steps(stamps)
+    least, most = extremes or extreme_steps(time)
+    stamps = time
+    if before != NEVER:
+        first, last = extreme_steps(np.array([before, *time[:1]], np.int64))
+        least, most, stamps = min(least, first), max(most, last), np.r_[before, time]
     if least <= 0:
         steps = np.diff(stamps)
         row = int(np.flatnonzero(steps <= 0)[0])

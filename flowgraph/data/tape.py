@@ -10,7 +10,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves
 
 _WIDE = 64
 _FIRST, _MANY = 1024, 32
+Rows = slice | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -34,24 +35,26 @@ class Tape:
     time: np.ndarray
     key: np.ndarray
     series: tuple[Series, ...]
+    found: tuple[Rows, ...] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
-        time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [_rows(time, s.time) for s in series]
+        longest = max(series, key=len, default=None)
+        time = np.zeros(0, np.int64) if longest is None else longest.time
+        rows: list[Any] = [_rows(longest, s) for s in series] if longest is not None else []
         if any(r is None for r in rows):
             time = np.concatenate([s.time for s in series])
             time.sort(kind="stable")  # merges runs that are sorted already
             time = time[np.concatenate([[True], time[1:] != time[:-1]])]
             time.flags.writeable = False  # outputs share it
-            rows = [np.searchsorted(time, s.time) for s in series]
+            rows = [_looked_up(time, s.time) for s in series]
         if len(time):
             need_near(int(time[0]), int(time[-1]))
         key = np.zeros(len(time), bits(len(series)))
         for k, r in enumerate(rows):
             key[r] |= 1 << k
-        return cls(time, key, series)
+        return cls(time, key, series, tuple(rows))
 
     def first(self, ticks: int) -> Tape:
         """The tape of the first ticks alone."""
@@ -63,6 +66,13 @@ class Tape:
         rows = [(int((before >> k & 1).sum()), int((key >> k & 1).sum())) for k in range(len(self.series))]
         series = tuple(s[n : n + count] for s, (n, count) in zip(self.series, rows, strict=True))
         return Tape(self.time[first:last], key, series)
+
+    @property
+    def rows(self) -> tuple[Rows, ...]:
+        """For each source at which ticks it is present: a slice where that is each n-th, or their places."""
+        if self.found is not None:
+            return self.found
+        return tuple(np.flatnonzero(self.key >> k & 1) for k in range(len(self.series)))
 
     @property
     def patterns(self) -> tuple[int, ...]:
@@ -130,17 +140,35 @@ def need_near(first: int, time: int) -> None:
         )
 
 
-def _rows(time: np.ndarray, some: np.ndarray) -> slice | np.ndarray | None:
-    """Where `some` times lie among all; None if one of them is not there."""
-    if some is time or (len(some) == len(time) and np.array_equal(some, time)):
+def _rows(every: Series, some: Series) -> Rows | None:
+    """Where the times of some values lie among those of a longer series; None if one is not there."""
+    time, wanted = every.time, some.time
+    if wanted is time or (len(wanted) == len(time) and np.array_equal(wanted, time)):
         return slice(None)
-    if len(some) > 1:  # each n-th of them
-        first, second = np.searchsorted(time, some[:2]).tolist()
-        every = slice(first, first + (second - first) * len(some), max(second - first, 1))
-        if np.array_equal(time[every], some):
-            return every
-    rows = _looked_up(time, some)
-    return rows if np.array_equal(time.take(rows, mode="clip"), some) else None
+    if _is_even(every) and _is_even(some):
+        return _each_nth(int(wanted[0]) - int(time[0]), some.steps[0], len(wanted), every)
+    if len(wanted) > 1:
+        first, second = np.searchsorted(time, wanted[:2]).tolist()
+        ticks = slice(first, first + (second - first) * len(wanted), max(second - first, 1))
+        if np.array_equal(time[ticks], wanted):
+            return ticks
+    rows = _looked_up(time, wanted)
+    return rows if np.array_equal(time.take(rows, mode="clip"), wanted) else None
+
+
+def _is_even(series: Series) -> bool:
+    """Whether its times are equally far apart."""
+    least, most = series.steps
+    return least == most > 0
+
+
+def _each_nth(after: int, period: int, count: int, every: Series) -> slice | None:
+    """The ticks of `count` values, the first `after` that of an even series; None where one has none."""
+    first, past = divmod(after, every.steps[0])
+    step, rest = divmod(period, every.steps[0])
+    if past or rest or first < 0 or first + step * (count - 1) >= len(every):
+        return None
+    return slice(first, first + step * count, step)
 
 
 def _looked_up(time: np.ndarray, some: np.ndarray) -> np.ndarray:
@@ -169,7 +197,7 @@ def tape(
         s.time is other.time or np.array_equal(s.time, other.time)
         for s, other in zip(series, like.series, strict=True)
     ):
-        return Tape(like.time, like.key, series)
+        return Tape(like.time, like.key, series, like.found)
     return Tape.of(series)
 
 

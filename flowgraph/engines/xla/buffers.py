@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.tape import Rows
+
 _ALIGNMENT = 64
 
 
@@ -50,7 +52,6 @@ class Buffers:
             )
             for port in inputs
         )
-        self._taken = [0] * len(inputs)
 
     @property
     def arrays(self) -> tuple[Any, ...]:
@@ -61,11 +62,18 @@ class Buffers:
         self,
         choice: np.ndarray,
         time: np.ndarray,
-        key: np.ndarray,
+        rows: Sequence[Rows],
         inputs: Sequence[Sequence[np.ndarray]],
         here: slice,
     ) -> None:
-        """Take the ticks `here` of a recording, in order; those that are short of a chunk are idle."""
+        """Take the ticks `here` of a recording; those that are short of a chunk are idle.
+
+        Args:
+            choice, time: of all ticks, (T,).
+            rows: for each input port at which ticks it has its rows.
+            inputs: for each input port its leaves, as they were given to the constructor.
+            here: from one tick to before another.
+        """
         count = here.stop - here.start
         self._choice[:count] = choice[here]
         self._choice[count:] = self._idle
@@ -73,24 +81,29 @@ class Buffers:
             self._time[:count] = time[here]
             self._time[count:] = time[here.stop - 1]
         before = (slice(None),) * self._axis
-        for k, (port, leaves) in enumerate(zip(inputs, self._leaves, strict=True)):
-            rows: Any = None
+        for at, port, leaves in zip(rows, inputs, self._leaves, strict=True):
+            places, part = _within(at, here)
             for array, kept in zip(port, leaves, strict=True):
-                if array.shape[self._axis] == len(time):
-                    kept[(*before, slice(count))] = array[(*before, here)]
+                if isinstance(at, slice) and at.step is None:  # at all ticks
                     kept[(*before, slice(count, None))] = 0
-                    continue
-                if rows is None:
-                    rows = np.flatnonzero(key[here] & (1 << k) != 0)
-                first = self._taken[k]
-                kept[...] = 0
-                kept[rows] = array[first : first + len(rows)]
-            if rows is not None:
-                self._taken[k] += len(rows)
+                else:
+                    kept[...] = 0
+                kept[(*before, places)] = array[(*before, part)]
 
     def holds(self, array: np.ndarray) -> bool:
         """Whether an array lies in one of these, and so will not stay as it is."""
         return any(np.may_share_memory(array, kept) for port in self._leaves for kept in port)
+
+
+def _within(rows: Rows, here: slice) -> tuple[Rows, slice]:
+    """Of some ticks those `here`, counted from its start, and which of them these are."""
+    if isinstance(rows, np.ndarray):
+        first, last = np.searchsorted(rows, (here.start, here.stop)).tolist()
+        return rows[first:last] - here.start, slice(first, last)
+    start, step = rows.start or 0, rows.step or 1
+    last = here.stop if rows.stop is None else min(here.stop, rows.stop)
+    before, within = (max(0, -(-(tick - start) // step)) for tick in (here.start, last))
+    return slice(start + before * step - here.start, max(last - here.start, 0), step), slice(before, within)
 
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:

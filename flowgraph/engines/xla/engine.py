@@ -35,7 +35,7 @@ class _Compiled(Player):
         done = 0
         start = perf_counter()
         outputs = gathered(self._scan.pipeline, tape)
-        for part, after in self._scan(cells, seed, tape.time, tape.key, columns):
+        for part, after in self._scan(cells, seed, tape.time, tape.key, columns, tape.rows):
             cells = after
             for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
                 output.add(mask, leaves)

@@ -9,14 +9,14 @@ the last chunk is filled up with ticks in which nothing is present.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from flowgraph.data.tape import bits
+from flowgraph.data.tape import Rows, bits
 from flowgraph.engines.xla.buffers import Buffers
 from flowgraph.engines.xla.namespace import JaxNamespace
 from flowgraph.errors import MissingDependencyError
@@ -181,6 +181,7 @@ class Scan:
         time: np.ndarray,
         key: np.ndarray,
         inputs: list[list[np.ndarray]],
+        rows: Sequence[Rows],
     ) -> Iterator[tuple[Chunk, list[Any]]]:
         """Play all ticks; yields each chunk of outputs with the register cells after it.
 
@@ -189,10 +190,11 @@ class Scan:
             seed: (2,) uint32.
             time: (T,) int64 ns.
             key: (T,), bit k set where input k is present.
-            inputs: for each input port its leaves, a row an event, or a row a tick: (T, ...).
+            inputs: for each input port its leaves, (n, ...).
+            rows: for each input port at which ticks it has its rows.
 
-        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs, and
-        inputs have a row a tick. Outputs that are present everywhere may be views of what XLA has made.
+        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs. Outputs
+        may be views of what XLA has made.
         """
         varies = any(known is not None and not known.all() for known in self.follows)
         pattern = _places(self.keys, key) if varies or self.branches is not None else key
@@ -204,7 +206,7 @@ class Scan:
             count = min(self.chunk, len(time) - start)
             kept = (slice(None),) * self._output_axis + (slice(count),)
             part = pattern[start : start + count]
-            buffers.fill(choice, time, key, inputs, slice(start, start + count))
+            buffers.fill(choice, time, rows, inputs, slice(start, start + count))
             with self.jax.enable_x64(True):
                 now, ys = self._compiled(now, seed, buffers.arrays)
                 outputs = [
