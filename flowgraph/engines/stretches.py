@@ -27,12 +27,11 @@ class Gathered:
         self._whole: list[np.ndarray] | None = []
         self._parts: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
-    def add(self, mask: np.ndarray, leaves: list[np.ndarray]) -> None:
-        """The next ticks: whether it is present at each, and its leaves at all of them or where it is."""
-        here = slice(self._done, self._done + len(mask))
-        count = int(np.count_nonzero(mask))
-        if self._whole is not None and count == len(mask):
-            if len(mask) == len(self._time):
+    def add(self, ticks: int, times: np.ndarray, leaves: list[np.ndarray]) -> None:
+        """The next ticks: how many, the times of those in which it is present, and its leaves there."""
+        here = slice(self._done, self._done + ticks)
+        if self._whole is not None and len(times) == ticks:
+            if ticks == len(self._time):
                 self._whole = leaves
             else:
                 if not self._done:
@@ -43,9 +42,7 @@ class Gathered:
             if self._whole is not None and self._done:
                 self._parts = [(self._time[: self._done], [x[: self._done] for x in self._whole])]
             self._whole = None
-            times = self._time[here]
-            times = times if count == len(mask) else times[mask]
-            self._parts.append((times, [x if len(x) == count else x[mask] for x in leaves]))
+            self._parts.append((times, leaves))
         self._done = here.stop
 
     def rows(self) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -53,7 +50,9 @@ class Gathered:
         if self._whole is not None and self._done:
             return self._time[: self._done], self._whole
         if not self._parts:
-            none = [np.zeros((0, *leaf.shape), DTYPES[leaf.dtype]) for leaf in self._port.leaves]
+            none: list[np.ndarray] = [
+                np.zeros((0, *leaf.shape), DTYPES[leaf.dtype]) for leaf in self._port.leaves
+            ]
             return self._time[:0], none
         times = np.concatenate([t for t, _ in self._parts])
         columns = zip(*(leaves for _, leaves in self._parts), strict=True)

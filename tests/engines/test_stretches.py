@@ -26,15 +26,14 @@ def built() -> Graph:
 
 @pytest.mark.parametrize("cuts", [[0, 6], [0, 2, 6], [0, 1, 2, 3, 6]])
 @pytest.mark.parametrize("there", [[1, 1, 1, 1, 1, 1], [1, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1], [0] * 6])
-@pytest.mark.parametrize("packed", [True, False])
-def test_rows_come_together_from_stretches(cuts, there, packed):
-    """Whether a stretch has a row a tick, or only those that are there."""
+def test_rows_come_together_from_stretches(cuts, there):
+    """Present at every tick, at some, in none of a stretch, or never."""
     time, mask = np.arange(6) * 10, np.array(there, dtype=bool)
     values = np.arange(6.0) ** 2
     gathered = Gathered(lower(built()).outputs[0], time)
     for first, last in itertools.pairwise(cuts):
-        part = values[first:last].copy()
-        gathered.add(mask[first:last], [part[mask[first:last]] if packed else part])
+        here = mask[first:last]
+        gathered.add(last - first, time[first:last][here], [values[first:last][here]])
     times, leaves = gathered.rows()
     np.testing.assert_array_equal(times, time[mask])
     np.testing.assert_array_equal(leaves[0], values[mask])

@@ -47,11 +47,12 @@ class _Loaded(Player):
         outputs = gathered(library.pipeline, tape)
         for part, after in library.play(cells, seed, tape.time, tape.key, rows):
             cells = after
+            times = tape.time[done : done + part.ticks]
             for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
-                output.add(mask, leaves)
+                output.add(part.ticks, times if mask.all() else times[mask], leaves)
             done += part.ticks
             if progress is not None:
-                progress.update(done, int(tape.time[done - 1]))
+                progress.update(done, int(times[-1]))
         collected = [output.rows() for output in outputs]
         return Outcome(cells, collected, perf_counter() - start)
 

@@ -37,11 +37,13 @@ class _Compiled(Player):
         outputs = gathered(self._scan.pipeline, tape)
         for part, after in self._scan(cells, seed, tape.time, tape.key, columns, tape.rows):
             cells = after
+            times = tape.time[done : done + part.ticks]
             for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
-                output.add(mask, leaves)
+                there = (times, leaves) if mask.all() else (times[mask], [leaf[mask] for leaf in leaves])
+                output.add(part.ticks, *there)
             done += part.ticks
             if progress is not None:
-                progress.update(done, int(tape.time[done - 1]))
+                progress.update(done, int(times[-1]))
         rows = [output.rows() for output in outputs]
         return Outcome(cells, rows, perf_counter() - start)
 
