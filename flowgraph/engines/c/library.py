@@ -21,6 +21,7 @@ from flowgraph.engines.c.loop import loop_text
 from flowgraph.engines.c.names import names_of
 from flowgraph.engines.c.source import every_pattern, generate
 from flowgraph.engines.c.texts import kept_text, presence_of_rows, presence_rows
+from flowgraph.engines.c.units import units
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
@@ -164,7 +165,7 @@ class Compiled(Outputs):
             )
             m = source.names.module
             loop = loop_text(pipeline, source)
-            files = {f"{m}.h": source.header, f"{m}.c": source.source, "fg_loop.c": loop}
+            files = {f"{m}.h": source.header, **units(source), "fg_loop.c": loop}
             presence = presence_rows(source.presence)
             return {"files": files, "longest": source.longest, "presence": presence}
 
