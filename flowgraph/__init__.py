@@ -10,11 +10,12 @@ if _TYPE_CHECKING:
     from flowgraph.data.arrival import batched, delayed, reorder, replayed, timeouts
     from flowgraph.data.batch import Batch
     from flowgraph.data.export.text import write_table, write_tum
+    from flowgraph.data.flight import Flight
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
-    from flowgraph.data.series import Flight, Series
+    from flowgraph.data.series import Series
     from flowgraph.drawing.live import LiveView
     from flowgraph.engines.live import Live
     from flowgraph.engines.many import simulate_many
@@ -145,7 +146,7 @@ _LATER = {
     "find_graph": "flowgraph.data.registry",
     "load_flight": "flowgraph.data.registry",
     "Result": "flowgraph.data.result",
-    "Flight": "flowgraph.data.series",
+    "Flight": "flowgraph.data.flight",
     "Series": "flowgraph.data.series",
     "LiveView": "flowgraph.drawing.live",
     "simulate_many": "flowgraph.engines.many",

@@ -15,7 +15,7 @@ Install = Callable[[str, Mapping[str, str], Mapping[str, Mapping[str, str]]], No
 """The fixture `install`: (distribution, text by module, {group: {name: "module:object"}})."""
 
 MS = 1_000_000
-ENGINES = ("python", "reference", "xla", "c")
+ENGINES = ("python", "reference", "xla", "c", "numpy")
 
 
 def scalars(times: Any, values: Any = None) -> Series:

@@ -22,8 +22,6 @@ from flowgraph.blocks.world import AT_REST, figure_motion, figure_shape
 from flowgraph.data.experiment import Experiment
 from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
-from flowgraph.engines.registry import find_engine
-from flowgraph.errors import MissingDependencyError
 
 __all__ = ["figure", "load_figure"]
 
@@ -67,7 +65,7 @@ _NO_SHAPE = FigureShape(
 
 
 def load_figure(*, seed: int, settings: Mapping[str, float]) -> Flight:
-    """Make a flight by a run of the graph, in C where there is a compiler, else block by block.
+    """Make a flight by a run of the graph, all its ticks at once.
 
     Args:
         seed: of the figure and of all noise.
@@ -78,7 +76,7 @@ def load_figure(*, seed: int, settings: Mapping[str, float]) -> Flight:
     """
     world = _world(tuple(settings.items()))
     told = world.settings
-    flown = simulate(_built(tuple(settings.items())), world.ticks, engine=_engine(), seed=seed)
+    flown = simulate(_built(tuple(settings.items())), world.ticks, engine="numpy", seed=seed)
     return Flight(
         name=f"sim-figure-{seed}",
         streams={name: flown[name] for name in ("imu", "vicon")},
@@ -116,11 +114,3 @@ def _world(settings: tuple[tuple[str, float], ...]) -> Experiment:
 def _built(settings: tuple[tuple[str, float], ...]) -> Graph:
     world = _world(settings)
     return figure.build(**clocks_of(world.ticks), **world.settings)
-
-
-def _engine() -> str:
-    try:
-        find_engine("c").need()
-    except MissingDependencyError:
-        return "python"
-    return "c"

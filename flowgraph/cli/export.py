@@ -7,9 +7,9 @@ from pathlib import Path
 
 from flowgraph.cli.terminal import writing
 from flowgraph.data.export.forms import Form, forms_of
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight
 from flowgraph.errors import DeclarationError
 
 EXPORT_HELP = "csv, parquet, mcap, rerun, with commas: the run and its flight, written into --out."

@@ -49,11 +49,12 @@ from flowgraph.cli.terminal import (
 )
 from flowgraph.data.export.text import write_tum
 from flowgraph.data.files import need_place, put
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
 from flowgraph.data.progress import ProgressBar
 from flowgraph.data.registry import KINDS, Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.engines.options import Checkpoint
 from flowgraph.engines.registry import engine_names
 from flowgraph.engines.simulate import simulate

@@ -13,9 +13,9 @@ import numpy as np
 import typer
 
 from flowgraph.data.files import text_of
+from flowgraph.data.flight import Flight
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
-from flowgraph.data.series import Flight
 from flowgraph.data.settings import parsed_settings, text
 from flowgraph.engines.registry import engine_names
 from flowgraph.errors import DataError, DeclarationError

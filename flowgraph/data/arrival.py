@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.data.tape import check_stamp
 from flowgraph.errors import DataError, DeclarationError, UnknownNameError
 from flowgraph.language.clock import nanoseconds

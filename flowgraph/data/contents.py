@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import installed
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.errors import FlowgraphError
 from flowgraph.types import leaves_of
 

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph.data.arrival import with_stamps
-from flowgraph.data.series import Flight, Series, unmasked
+from flowgraph.data.flight import Flight
+from flowgraph.data.series import Series, unmasked
 from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.errors import DataError, UnknownNameError
 
 __all__ = ["doubtful_span", "joined", "numbered", "of_a_truth", "parts_of", "shared", "with_truth"]

@@ -29,7 +29,7 @@ from types import ModuleType
 from typing import Any
 
 from flowgraph.data.files import content_of
-from flowgraph.data.series import Flight
+from flowgraph.data.flight import Flight
 from flowgraph.data.settings import keyword_types, parsed_settings
 from flowgraph.errors import DataError, DeclarationError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction

@@ -20,7 +20,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.flight import Flight
+from flowgraph.data.series import Series
 from flowgraph.errors import DeclarationError
 
 

@@ -21,16 +21,18 @@ from typing import Any
 
 from flowgraph.data.arrival import LATENCY, delayed_flight
 from flowgraph.data.consistency import far_nis, measured
+from flowgraph.data.flight import Flight
 from flowgraph.data.inputs import Inputs
 from flowgraph.data.joint import joined, numbered, of_a_truth, parts_of, shared, with_truth
 from flowgraph.data.notes import note, said
 from flowgraph.data.own import flight_in_file, graph_in_file, is_in_file, kind_and_place, settings_by_text
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.data.suspect import suspect_readings
 from flowgraph.errors import DataError, FlowgraphError, PluginError, UnknownNameError
 from flowgraph.language.declare import GraphFunction
 from flowgraph.language.graph import Graph
+from flowgraph.recorder.random import seed_words
 from flowgraph.verbs import verb
 
 if typing.TYPE_CHECKING:
@@ -255,9 +257,10 @@ def load_flight(
     Raises:
         UnknownNameError: for a kind that is not installed, or a setting that it does not have.
         PluginError: for a kind whose package cannot be imported.
-        DeclarationError: for a setting that is not usable; DataError: where files are missing or wrong, or
-            parts do not fit together.
+        DeclarationError: for a seed or a setting that is not usable; DataError: where files are missing or
+            wrong, or parts do not fit together.
     """
+    seed_words(seed)
     late = {k: v for k, v in (settings or {}).items() if k.endswith(LATENCY)}
     rest = {k: v for k, v in (settings or {}).items() if k not in late}
     flight = _load(spec, seed, rest, truth)

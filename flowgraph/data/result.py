@@ -12,7 +12,8 @@ from flowgraph.data.export.rerun_file import write_rerun
 from flowgraph.data.export.tables import write_parquet
 from flowgraph.data.export.text import write_table
 from flowgraph.data.export.trees import to_xarray
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.flight import Flight
+from flowgraph.data.series import Series
 from flowgraph.errors import DeclarationError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.verbs import verb

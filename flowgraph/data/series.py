@@ -7,15 +7,12 @@ run gives back. Signals are batch-first: each leaf has the time axis in front.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flowgraph.data.experiment import Experiment
 from flowgraph.data.frames import frame_of, signal_of, stamps_of
-from flowgraph.data.notes import said
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import (
     DTYPES,
@@ -385,65 +382,3 @@ def _drop_axis(declared: ArrayType | None, values: Any, name: str) -> ArrayType:
     if declared is not None:
         return ArrayType(batch.shape[1:], declared.dtype, declared.unit, declared.frame)
     return ArrayType(batch.shape[1:], batch.dtype)
-
-
-@dataclass(frozen=True)
-class Flight:
-    """A recording: named streams, the truth where it is known, and what else its source says.
-
-    Args:
-        name: what to call it.
-        streams: a `Series` for each sensor.
-        truth: a `Series` with at least `position` and `attitude`, or None.
-        info: calibration and noise, by name.
-        notes: what was dropped, shifted or assumed when it was read, a sentence each, which begins with a
-            word of `flowgraph.data.notes`.
-        experiment: the graph of which a run is this flight; None of a recording.
-
-    Raises:
-        DeclarationError: for a note that does not.
-    """
-
-    name: str
-    streams: Mapping[str, Series]
-    truth: Series | None = None
-    info: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    experiment: Experiment | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "notes", said(self.notes))
-
-    def _repr_html_(self) -> str:
-        return str(verb("Flight._repr_html_")(self))
-
-    def need(self, graph: str, *names: str, fix: str = "choose another flight") -> dict[str, Series]:
-        """The streams of these names, for a graph that cannot run without them.
-
-        Args:
-            graph: who asks.
-            names: of the streams.
-            fix: what to do where one is missing.
-
-        Raises:
-            DataError: where one is missing, or holds no event.
-        """
-        missing = [name for name in names if name not in self.streams]
-        if missing:
-            raise DataError(
-                f"this flight lacks what {graph} needs",
-                path=self.name,
-                expected=f"streams {', '.join(names)}",
-                got=", ".join(self.streams) or "no stream",
-                fix=f"{fix}, or a graph that fits: flowgraph inspect names them",
-            )
-        for name in names:
-            if not len(self.streams[name]):
-                raise DataError(
-                    f"this flight's stream {name!r} is empty, and {graph} needs it",
-                    path=f"{self.name}: {name}",
-                    expected="at least one event",
-                    got="none",
-                    fix="choose a longer flight, or an earlier first measurement",
-                )
-        return {name: self.streams[name] for name in names}

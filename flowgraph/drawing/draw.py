@@ -18,7 +18,7 @@ from typing import Any
 
 from flowgraph.data.arrival import lateness_words
 from flowgraph.data.files import put
-from flowgraph.data.series import Flight
+from flowgraph.data.flight import Flight
 from flowgraph.drawing.fonts import without_font_warnings
 from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.text import (

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.arrival import lateness_words
-from flowgraph.data.series import Flight
+from flowgraph.data.flight import Flight
 from flowgraph.drawing.text import (
     block_words,
     clock_words,

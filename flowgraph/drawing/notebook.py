@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowgraph.data.contents import contents
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.drawing import canvas
 from flowgraph.drawing.draw import draw
 from flowgraph.drawing.page import diagram_page, written

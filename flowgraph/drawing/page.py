@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph.data.files import put
-from flowgraph.data.series import Flight
+from flowgraph.data.flight import Flight
 from flowgraph.drawing.model import describe
 from flowgraph.drawing.text import doc_words, folded_scopes
 from flowgraph.errors import writes

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.inputs import Inputs
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.drawing.canvas import deviation
 from flowgraph.drawing.fields import SIZES
 from flowgraph.language.graph import CallNode, Graph, RegisterNode, SourceNode, Wire

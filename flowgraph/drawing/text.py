@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from flowgraph.data.arrival import lateness_words
-from flowgraph.data.series import Flight
+from flowgraph.data.flight import Flight
 from flowgraph.errors import DeclarationError
 from flowgraph.language.clock import Condition, Counted, atoms, either
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire

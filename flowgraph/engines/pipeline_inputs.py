@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.arrival import with_stamps
+from flowgraph.data.flight import Flight
 from flowgraph.data.inputs import prepare
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.data.tape import Tape, tape
 from flowgraph.engines.state import check_settable
 from flowgraph.errors import ClockError, DataError, UnknownNameError

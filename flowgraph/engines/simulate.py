@@ -75,8 +75,9 @@ def simulate(
         inputs: a `Flight`, or for each source a `Series`, `(times, values)`, or an iterable of
             `(time, value)`.
         engine: "python" (NumPy, event by event), "reference" (the lowered pipeline's instructions in NumPy),
-            "xla" (the same instructions in one compiled scan; needs JAX), "c" (generated, compiled by the
-            system's C compiler and called in this process) or "fixed" (in integers, in number formats).
+            "numpy" (each of them over all ticks at once), "xla" (the same instructions in one compiled scan;
+            needs JAX), "c" (generated, compiled by the system's C compiler and called in this process) or
+            "fixed" (in integers, in number formats).
         dtype: what `real` is, "float64" or "float32", for "c" also "fixed"; the Python engine has float64
             only.
         init: other initial values, by register path.

@@ -26,8 +26,8 @@ from flowgraph.types import Type, annotation_type, bind, check_fits, without_non
 T = typing.TypeVar("T")
 
 if typing.TYPE_CHECKING:
+    from flowgraph.data.flight import Flight
     from flowgraph.data.registry import Case
-    from flowgraph.data.series import Flight
 
 
 def delay(init: T, *, name: str | None = None, type: Any = None) -> Held[T]:
@@ -196,7 +196,8 @@ class GraphFunction:
         """This graph, built and started for a flight.
 
         Raises:
-            DeclarationError: where no function was registered with `on_flight`.
+            DeclarationError: where no function was registered with `on_flight`, or this is no flight.
+            UnknownNameError: for a setting that this function does not have.
         """
         if self.prepare is None:
             raise DeclarationError(
@@ -206,6 +207,19 @@ class GraphFunction:
                 got="none",
                 fix="build the graph yourself and call simulate(graph, inputs)",
             )
+        if not hasattr(flight, "streams"):
+            raise DeclarationError(
+                "a case is of a flight",
+                path=self.name,
+                expected="a Flight",
+                got=repr(flight)[:80],
+                fix=f'load it first: {self.name}.case(load_flight("sim"))',
+            )
+        known = inspect.signature(self.prepare).parameters
+        if not any(p.kind is p.VAR_KEYWORD for p in known.values()):
+            for key in settings:
+                if key not in known:
+                    raise UnknownNameError("setting", key, list(known)[1:], path=self.name)
         return self.prepare(flight, **settings)
 
     def __getattr__(self, name: str) -> typing.NoReturn:

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.flight import Flight
+from flowgraph.data.series import Series
 from flowgraph.language.graph import CallNode, Graph
 from flowgraph.pipeline.pipeline import Pipeline, Port, Register
 

@@ -30,8 +30,8 @@ from flowgraph.types import DTYPES, ArrayType, StructType, Type
 from flowgraph.verbs import verb
 
 if TYPE_CHECKING:
+    from flowgraph.data.flight import Flight
     from flowgraph.data.result import Result
-    from flowgraph.data.series import Flight
 
 FORMAT, VERSION = "flowgraph-pipeline", 2
 READ = (1, 2)

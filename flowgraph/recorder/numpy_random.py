@@ -30,12 +30,25 @@ def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np
     """`count` random words (uint32) of Philox4x32; see `random.words`."""
     if count <= FEW:
         return np.array(few_words(count, name, int(time), seed, rounds), np.uint32)
-    n = -(-count // 4)
-    time, key = int(time), (int(seed[0]), int(seed[1]))
-    low, high = time & _WORD, (time >> 32) & _WORD
+    time, n = int(time), -(-count // 4)
     even = np.empty((2, n), np.uint32)
-    even[0], even[1] = np.arange(n, dtype=np.uint32), low
-    odd: np.ndarray = np.array([[name], [high]], np.uint32)
+    even[0], even[1] = np.arange(n, dtype=np.uint32), time & _WORD
+    return _mixed(even, np.array([[name], [(time >> 32) & _WORD]], np.uint32), seed, rounds)[:count]
+
+
+def words_at(count: int, name: int, times: np.ndarray, seed: np.ndarray, rounds: int) -> np.ndarray:
+    """The words (count, n) of n times (int64)."""
+    blocks, n = -(-count // 4), len(times)
+    even, odd = np.empty((2, blocks, n), np.uint32), np.empty((2, blocks, n), np.uint32)
+    even[0], even[1] = np.arange(blocks, dtype=np.uint32)[:, None], times & _WORD
+    odd[0], odd[1] = name, (times >> 32) & _WORD
+    made = _mixed(even.reshape(2, -1), odd.reshape(2, -1), seed, rounds)
+    return made.reshape(4 * blocks, n)[:count]
+
+
+def _mixed(even: np.ndarray, odd: np.ndarray, seed: np.ndarray, rounds: int) -> np.ndarray:
+    """The words (4 n) of n counters: even (2, n) is written over, odd (2, n), or (2, 1) for all."""
+    n, key = even.shape[1], (int(seed[0]), int(seed[1]))
     products = np.empty((2, n), np.uint64)
     halves = products.view(np.uint32).reshape(2, n, 2)
     for r in range(rounds):
@@ -44,7 +57,7 @@ def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np
         even ^= np.array([[(key[0] + WEYL[0] * r) & _WORD], [(key[1] + WEYL[1] * r) & _WORD]], np.uint32)
         if r + 1 < rounds:
             odd = halves[::-1, :, _LOW].copy()
-    return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)[:count]
+    return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)
 
 
 def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> list[int]:

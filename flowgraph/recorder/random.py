@@ -149,8 +149,23 @@ def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.
     bits = numpy_random.words(count, name, time, seed, ROUNDS)
     if kind == "uniform":
         return uniform_from(bits, xp=NUMPY).reshape(shape)
-    made = numpy_random.normals(bits, _pairs(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
-    return made.reshape(shape)
+    return _normals(bits).reshape(shape)
+
+
+def numbers_at(kind: str, shape: tuple[int, ...], name: int, times: np.ndarray, seed: np.ndarray) -> Any:
+    """The draws (*shape, n) of a site at n times (int64 ns): those of `Site.numbers` at each.
+
+    Args:
+        kind: "normal" or "uniform".
+        name: the hash of the site.
+    """
+    bits = numpy_random.words_at(math.prod(shape), name, times, seed, ROUNDS)
+    made = uniform_from(bits, xp=NUMPY) if kind == "uniform" else _normals(bits.ravel())
+    return made.reshape(*shape, len(times))
+
+
+def _normals(bits: np.ndarray) -> Any:
+    return numpy_random.normals(bits, _pairs(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
 
 
 @lru_cache(maxsize=1)

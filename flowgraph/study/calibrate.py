@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
-from flowgraph.data.series import Flight
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.pipeline.digests import digest
 from flowgraph.study.coordinates import Coordinates, Fit, Parameter

@@ -13,8 +13,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import find_graph, load_flight
-from flowgraph.data.series import Flight
 from flowgraph.data.settings import text
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.registry import find_engine

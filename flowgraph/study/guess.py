@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.flight import Flight
+from flowgraph.data.series import Series
 
 __all__ = ["Guess", "guess_offset"]
 

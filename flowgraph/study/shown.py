@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
 from flowgraph.data.registry import Case
-from flowgraph.data.series import Flight
 from flowgraph.drawing.recorder import Recorder
 from flowgraph.drawing.run_page import describe_run
 from flowgraph.engines.watched import simulate_watched

@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.engines.contract import PipelineEngine
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.playback import play

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.batch import Batch
+from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.data.settings import of_any_stream, parsed_settings, text
 from flowgraph.engines.many import run_many
 from flowgraph.engines.options import RunOptions

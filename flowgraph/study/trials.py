@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight
 from flowgraph.data.settings import text
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.parts import run_graph

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.experiment import Experiment
+from flowgraph.data.flight import Flight
 from flowgraph.data.inputs import timing_of
 from flowgraph.data.registry import Case
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.parts import run_graph
 from flowgraph.language.block import Block

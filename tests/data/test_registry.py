@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from flowgraph import PluginError, UnknownNameError, find_graph, load_flight
+from flowgraph import DeclarationError, PluginError, UnknownNameError, find_graph, load_flight
 from flowgraph.cli import app
 from flowgraph.data.registry import KINDS, find_bench, find_entry, graph_names, installed
 from flowgraph.engines.registry import find_engine, find_pipeline_engine, writers
@@ -139,3 +139,9 @@ def test_an_unknown_name_lists_what_there_is(group, kind):
     with pytest.raises(UnknownNameError, match=f"no {kind} is called 'nothing'") as caught:
         find("nothing")
     assert caught.value.valid == sorted(installed(group)[0])
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", 2**64, True])
+def test_a_seed_is_that_of_a_run(seed):
+    with pytest.raises(DeclarationError, match="this is no seed"):
+        load_flight("sim", seed=seed)

@@ -110,6 +110,21 @@ def test_a_flight_is_only_its_parts():
     assert flight.info == {}
 
 
+@pytest.mark.parametrize(
+    ("parts", "place"),
+    [
+        ({"streams": {"imu": [1, 2]}}, "x: imu"),
+        ({"streams": None}, "x: streams"),
+        ({"streams": {}, "truth": np.zeros(3)}, "x: truth"),
+        ({"streams": {"truth": None}}, "x: truth"),
+    ],
+)
+def test_what_is_no_series_is_refused_where_it_stands(parts, place):
+    with pytest.raises(DataError, match="a flight is made of series") as error:
+        Flight("x", **parts)
+    assert error.value.path == place
+
+
 def test_what_a_graph_needs_of_a_flight():
     flight = Flight("walk", {"imu": a_series(), "vicon": a_series(0)})
     assert list(flight.need("ekf", "imu")) == ["imu"]

@@ -21,9 +21,10 @@ import pytest
 from flowgraph import Scalar, Stream, block, delay, graph, match, periodic
 from flowgraph.cli.options import case_of
 from flowgraph.cli.pages import recorder_of, write_page
+from flowgraph.data.flight import Flight
 from flowgraph.data.registry import Case
 from flowgraph.data.result import Result
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.drawing.live import LiveServer, Sender, live_page
 from flowgraph.drawing.page import diagram_page
 from flowgraph.drawing.run_page import describe_run, run_page, runs_of_page

@@ -11,6 +11,7 @@ from flowgraph import (
     Array,
     CycleError,
     DeclarationError,
+    Flight,
     Run,
     Scalar,
     Signal,
@@ -471,6 +472,21 @@ def test_a_graph_without_a_flight_says_so():
 
     with pytest.raises(DeclarationError, match="g: this graph does not know how to start on a flight"):
         g.case(None)  # type: ignore[arg-type]
+
+
+def test_a_case_is_of_a_flight_and_of_settings_that_there_are():
+    @graph
+    def g(x: Stream[Scalar]):
+        return x
+
+    g.on_flight(lambda flight, *, gain: flight)
+    for none in (None, "sim"):
+        with pytest.raises(DeclarationError, match="g: a case is of a flight") as error:
+            g.case(none)  # type: ignore[arg-type]
+        assert repr(none) in str(error.value)
+    with pytest.raises(UnknownNameError, match="g: no setting is called 'gian'") as unknown:
+        g.case(Flight("f", {}), gian=1.0)
+    assert unknown.value.valid == ["gain"]
 
 
 def line(graph_function: Any, below: int) -> str:

@@ -102,6 +102,16 @@ def _sum(w: Any, *, xp: Any) -> Any:
     return xp.sum(w.values) + 100.0 * xp.astype(w.count, xp.float64)
 
 
+def _resample(n: dict[str, Any], a: Stream[Any], b: Stream[Any]) -> Stream[Any]:
+    how = {"how": n["how"], "size": n["size"], "full": n["full"]}
+    if n["how"] != "slerp":
+        return resample_at(a, b, **how).map(lambda p, *, xp: p[1] + 1e-6 * xp.astype(p[0], xp.float64))
+    turned = a.map(lambda v, *, xp: xp.stack([xp.cos(v), 0.0 * v, 0.0 * v, xp.sin(v)]))
+    return resample_at(turned, b, **how).map(
+        lambda p, *, xp: p[1][0] + 2.0 * p[1][3] + 1e-6 * xp.astype(p[0], xp.float64)
+    )
+
+
 def _optional(n: dict[str, Any], a: Stream[Any], z: Stream[Any]) -> Stream[Any]:
     return corrected(latest(a, init=n["init"]).at(a | z), z)
 
@@ -145,9 +155,7 @@ BUILD: dict[str, Callable[..., Any]] = {
     "high_pass": lambda n, a: high_pass(a, **_share(n)),
     "delta_time": lambda n, a: delta_time(a).map(lambda v: 1.0 * v),  # seconds fit no other unit
     "integrate": lambda n, a: integrate(a, rule=n["rule"]),
-    "resample": lambda n, a, b: resample_at(a, b, how=n["how"], size=n["size"], full=n["full"]).map(
-        lambda p, *, xp: p[1] + 1e-6 * xp.astype(p[0], xp.float64)
-    ),
+    "resample": _resample,
     "absent": lambda n, a, at: absent_for(a, 6 * MS, at=at).map(lambda v, *, xp: xp.astype(v, xp.float64)),
     "label": lambda n, a: label_data(a, lambda t, *, xp: xp.astype(t, xp.float64) * 1e-6).map(PAIR),
     "stamp": lambda n, a: stamp_of(a).map(lambda t, *, xp: xp.astype(t, xp.float64) * 1e-6),

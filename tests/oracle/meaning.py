@@ -27,6 +27,16 @@ def times(*streams: Events) -> list[int]:
     return sorted({t for s in streams for t, _ in s})
 
 
+def arc(v: float, x: float) -> float:
+    """The shortest way from a turn about one axis to another, in halves of the turns; q and -q are one."""
+    return (x - v + math.pi / 2) % math.pi - math.pi / 2
+
+
+def seen(half: float) -> float:
+    """A number of the quaternion of a turn about z, by half of its angle."""
+    return math.cos(half) + 2 * math.sin(half)
+
+
 def last(s: Events, t: int, otherwise: Any, *, before: bool = False) -> Any:
     """The value of a stream at or before a time, or strictly before it."""
     found = [v for u, v in s if (u < t if before else u <= t)]
@@ -299,8 +309,9 @@ class Meaning:
                 u, v = [e for e in a if e[0] <= asked][-1]
                 if u < asked:
                     w, x = next(e for e in a if e[0] > asked)
-                    v = v + (x - v) * ((asked - u) / (w - u))
-                made.append((t, v + asked))
+                    along = arc(v, x) if n["how"] == "slerp" else x - v
+                    v = v + along * ((asked - u) / (w - u))
+                made.append((t, (seen(v) if n["how"] == "slerp" else v) + asked))
             if len(waits) > n["size"]:
                 waits.pop(0)
                 self.counts["expired"] += 1

@@ -209,7 +209,7 @@ KINDS: dict[str, Callable[[Draw, str], None]] = {
     "integrate": _one("integrate", rule=lambda d: d.random.choice(("rectangle", "trapezoid"))),
     "resample": _two(
         "resample",
-        how=lambda d: d.random.choice(("linear", "hold")),
+        how=lambda d: d.random.choice(("linear", "slerp", "hold")),
         size=lambda d: d.random.randint(1, 6),
         full=_full,
     ),

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flowgraph.data.files import put
+from flowgraph.data.flight import Flight
 from flowgraph.data.frames import part_words
-from flowgraph.data.series import Flight, Series
+from flowgraph.data.series import Series
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import leaves_of
 

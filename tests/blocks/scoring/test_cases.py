@@ -111,7 +111,7 @@ def test_settings_are_checked_before_the_flight_is_looked_at():
 
 
 def test_a_setting_that_is_not_there_is_refused_in_code_and_in_words():
-    with pytest.raises(TypeError, match=r"for_flight\(\) got an unexpected keyword argument 'gian'"):
+    with pytest.raises(UnknownNameError, match="doubled: no setting is called 'gian'"):
         registered().case(a_flight(), gian=1.0)
     prepare = registered().prepare
     assert prepare is not None
