@@ -1,4 +1,4 @@
-"""`bench registers`: with few bits in its registers a particle filter resamples otherwise, with many alike."""
+"""`bench registers`: of few bits they make a particle filter resample otherwise, of many alike."""
 
 from __future__ import annotations
 
