@@ -39,6 +39,7 @@ def hardware(
     flights: int = 2,
     duration: float = 3.0,
     compared: float = 0.5,
+    particles: int = 0,
     routed: bool = False,
     folder: str = "",
     seed: int = 0,
@@ -52,24 +53,26 @@ def hardware(
         flights: simulated ones, that the formats are found on; one more judges.
         duration: of a flight, s.
         compared: seconds of it that are played in Verilator.
+        particles: of the filters that have some; as many as `bench fixed` takes if left out.
         routed: whether to synthesise, place and route each.
         folder: where the files of each go; a temporary one if left out.
         seed: of the first flight.
 
     Returns:
-        A row a graph: `graph`, `width`, `lanes`, `multipliers` (of 34 bits), `position_difference_rms_m`,
-        `attitude_difference_rms_deg`, `saturations`, `values_compared`, `values_differing`, `cycles` (of the
-        shortest tick) and `cycles_all_aids` (of the longest), `steps` of the program and `words` of memory,
-        `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not routed), `us_per_tick` (with all aids, at
-        that clock, or else at 100 MHz), and `reason`, why there is no machine.
+        A row a graph: `graph`, `particles` (the setting above), `width`, `lanes`, `multipliers` (of 34 bits),
+        `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
+        `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
+        the program and `words` of memory, `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
+        routed), `us_per_tick` (with all aids, at that clock, or else at 100 MHz), and `reason`, why
+        there is no machine.
     """
     rows = []
     for name in (n.strip() for n in graphs.split(",") if n.strip()):
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
-            "graph": name, "width": width, "lanes": 1, "multipliers": 1,
+            "graph": name, "particles": particles or None, "width": width, "lanes": 1, "multipliers": 1,
         }  # fmt: skip
         try:
-            some = [flown(name, seed + k, duration) for k in range(flights + 1)]
+            some = [flown(name, seed + k, duration, particles) for k in range(flights + 1)]
             found = quantise(some[:-1], some[-1:], width=width, least=width, bounds={RELATIVE: bound})
             row |= {k: v for k, v in found.figures.items() if k in row}
             _played(row, replace(found.pipeline, formats=found.formats), some[-1], compared)
@@ -85,9 +88,10 @@ def hardware(
 
 
 _COLUMNS = (
-    "graph", "width", "lanes", "multipliers", "position_difference_rms_m", "attitude_difference_rms_deg",
-    "saturations", "values_compared", "values_differing", "cycles", "cycles_all_aids", "steps", "words",
-    "lut", "ff", "dsp", "bram", "fmax_hz", "us_per_tick", "reason",
+    "graph", "particles", "width", "lanes", "multipliers", "position_difference_rms_m",
+    "attitude_difference_rms_deg", "saturations", "values_compared", "values_differing",
+    "cycles", "cycles_all_aids", "steps", "words", "lut", "ff", "dsp", "bram", "fmax_hz", "us_per_tick",
+    "reason",
 )  # fmt: skip
 
 

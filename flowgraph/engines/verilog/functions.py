@@ -11,11 +11,12 @@ import abc
 import numpy as np
 
 from flowgraph.engines.fixed import integers as z
-from flowgraph.engines.verilog.nodes import Nodes, Term
+from flowgraph.engines.verilog.nodes import Term
+from flowgraph.engines.verilog.rows import Rows
 from flowgraph.errors import LoweringError
 
 
-class Functions(Nodes, abc.ABC):
+class Functions(Rows, abc.ABC):
     """Nodes that know functions of one element."""
 
     @property

@@ -9,8 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowgraph.engines.fixed.engine import Integers
-from flowgraph.engines.verilog.nodes import KINDS, MODES, UNITS, Constant, Held, Sum, in_memory
-from flowgraph.engines.verilog.schedule import Plan, Schedule, Slot, schedule
+from flowgraph.engines.verilog.nodes import (
+    KINDS,
+    MODES,
+    UNITS,
+    Constant,
+    Held,
+    Joined,
+    Sum,
+    Table,
+    View,
+    in_memory,
+)
+from flowgraph.engines.verilog.plan import Plan
+from flowgraph.engines.verilog.rows import element_of, root_of
+from flowgraph.engines.verilog.schedule import Loop, Schedule, Word, schedule
 from flowgraph.engines.verilog.tick import Tick, held_values
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -22,7 +35,7 @@ class Entry:
     Args:
         key: bit k tells that input k is present.
         start: its first step.
-        cycles: microwords in it; the machine is ready some cycles later.
+        cycles: that its microwords take; the machine is ready some cycles later.
         outputs: for each output, where the truth value lies that tells whether it is there, and for each leaf
             the places of its words, with an axis of one or two halves behind those of a leaf that is no real;
             None where the output never is there.
@@ -51,6 +64,9 @@ class Image:
         entries: for each of `keys`.
         listing: a line for each microword.
         units: names of those that are used.
+        has_rows: whether there are loops, or rows that are read at computed places.
+        indices: how many of these places are kept.
+        lane_bits: of the number of an element.
     """
 
     def __init__(self, pipeline: Pipeline, keys: Sequence[int]) -> None:
@@ -60,7 +76,8 @@ class Image:
         self.width = self.player.formats.width
         self.wide = max(self.width, self.player.formats.held_width)
         plans = [Plan(Tick(self.player, key)) for key in keys]
-        schedules = [schedule(p) for p in plans]
+        self.has_rows = any(_has_rows(p) for p in plans)
+        schedules = [schedule(p, self.has_rows) for p in plans]
         self.places = self._held()
         base = sum(p.size for p in self.places.values())
         constants: dict[int, int] = {0: base}
@@ -70,13 +87,27 @@ class Image:
                 if isinstance(node, Constant):
                     constants.setdefault(node.word, base + len(constants))
         self.constants = constants
+        self.tables: dict[tuple[int, ...], int] = {}
         first = base + len(constants)
-        self.words = first + max((s.words for s in schedules), default=0)
-        self.place_bits = max(4, (self.words - 1).bit_length())
+        for p in plans:
+            for n in self._used(p):
+                node = p.tick.nodes[n]
+                if isinstance(node, Table) and node.words not in self.tables:
+                    self.tables[node.words] = first
+                    first += node.row
+        self.words = first + max((s.size for s in schedules), default=0)
+        self.indices = max((s.indices for s in schedules), default=0)
+        longest = [0, *(w.does.last + 1 for s in schedules for w in s.words if isinstance(w.does, Loop))]
+        self.lane_bits = max(1, max(longest).bit_length())
+        self.place_bits = max(
+            4, (self.words - 1).bit_length(), (self.indices - 1).bit_length(), self.lane_bits + 1
+        )
         self.units = sorted(
             {UNITS[s.node.unit] for x in schedules for s in x.slots if s and s.mode == "START"}
         )
         self.memory = [0] * self.words
+        for words, place in self.tables.items():
+            self.memory[place : place + len(words)] = map(in_memory, words)
         for word, place in constants.items():
             self.memory[place] = in_memory(word)
         for c, v in zip(cells, self.player.cells, strict=True):
@@ -131,24 +162,38 @@ class Image:
     def _append(self, key: int, plan: Plan, made: Schedule, first: int) -> None:
         nodes = plan.tick.nodes
 
-        def at(n: int) -> int:
+        def at(n: int, nth: int = 0) -> tuple[int, bool]:
+            """The place of a word, or of the first element of a row of which a round makes the nth."""
             node = nodes[n]
+            if isinstance(node, View):
+                return at(node.of)[0] + node.offset + nth * bool(node.row), bool(node.row)
+            if isinstance(node, Joined):
+                return at(node.parts[0], nth)
+            if isinstance(node, Table):
+                return self.tables[node.words] + nth, True
             if isinstance(node, Constant):
-                return self.constants[node.word]
+                return self.constants[node.word], False
             held = plan.fixed.get(n) if isinstance(node, Sum) else node
             if isinstance(held, Held):
-                return int(self.places[held.value].reshape(-1)[self._part(held)])
-            return first + made.place[n]
+                place = int(self.places[held.value].reshape(-1)[self._part(held)])
+                return (place + nth, True) if held.row else (place, False)
+            lies = first if plan.tick.made(n).mode != "INDEX" else 0
+            if n in plan.rows:
+                return lies + made.place[(n, 0)] + nth, True
+            return lies + made.place.get((n, nth), made.place.get((n, 0), -1)), False
 
-        def ended(n: int) -> int:
-            return at(plan.outputs.get(n, n))
+        def ended(number: int) -> int:
+            n = root_of(number)
+            node = nodes[n]
+            offset, n = (node.offset, node.of) if isinstance(node, View) else (0, n)
+            return at(plan.outputs.get(n, n))[0] + offset + element_of(number)
 
         start = len(self.program)
-        slots = made.slots or [None]
-        for t, slot in enumerate(slots):
-            last = t == len(slots) - 1
-            self.program.append(self._microword(slot, at, last))
-            self.listing.append(f"{start + t:6d} {self._said(slot, at)}{' halt' if last else ''}")
+        words = made.words or [Word()]
+        for t, word in enumerate(words):
+            last = t == len(words) - 1
+            self.program.append(self._microword(word, at, last))
+            self.listing.append(f"{start + t:6d} {self._said(word, at)}{' halt' if last else ''}")
         outputs: list[tuple[int, list[np.ndarray]] | None] = []
         for flag, leaves in plan.tick.outputs:
             if flag is None:
@@ -157,40 +202,79 @@ class Image:
             rows = [[ended(n) for n in x.ravel().tolist()] for x in leaves]
             places = [np.array(r, dtype=np.int64).reshape(x.shape) for r, x in zip(rows, leaves, strict=True)]
             outputs.append((ended(flag), places))
-        self.entries.append(Entry(key, start, len(slots), outputs, sum(s is not None for s in slots)))
+        terms = sum(s is not None for s in made.slots)
+        self.entries.append(Entry(key, start, made.cycles, outputs, terms))
 
     def _part(self, held: Held) -> int:
         halves = 1 if held.width else self.places[held.value].shape[-1]
         return held.place * halves + int(held.high)
 
-    def _microword(self, slot: Slot | None, at: Callable[[int], int], last: bool) -> int:
-        if slot is None:
-            return int(last) << 31
+    def _microword(self, word: Word, at: _At, last: bool) -> int:
+        bits = self.place_bits
+        marks = int(word.repeat) << 3 | int(word.back) << 5 | int(word.ends) << 6
+        if word.does is None:
+            return int(last) << 31 | marks << 32 + 3 * bits
+        if isinstance(word.does, Loop):
+            marks |= 1 << 8
+            return (
+                int(last) << 31
+                | word.does.step << 32 + bits
+                | word.does.last << 32 + 2 * bits
+                | (marks << 32 + 3 * bits)
+            )
+        slot = word.does
         t, node = slot.term, slot.node
-        to = 0
+        to, to_moves = 0, False
         if slot.mode == "START":
             to = node.unit
         elif slot.writes is not None:
-            to = at(slot.writes)
+            to, to_moves = at(slot.writes, slot.nth)
         ends = slot.mode not in ("", "HOLD")
-        a = 0 if t.kind == "TAKE" else at(t.a)
-        b = node.unit if t.kind == "TAKE" else at(t.b)
+        a, a_moves = (0, False) if t.kind == "TAKE" else at(t.a, 0 if t.kind == "GET" else slot.nth)
+        b, b_moves = (node.unit, False) if t.kind == "TAKE" else at(t.b, slot.nth)
         code = KINDS.index(t.kind)
         code |= (t.shift & 0xFF) << 4
         code |= int(t.minus) << 12 | int(slot.first) << 13 | node.limit << 14
         code |= ((node.end if ends else 0) & 0xFF) << 18
         code |= int(node.floor) << 26 | MODES.index(slot.mode) << 27 | int(last) << 31
-        bits = self.place_bits
-        return code | to << 32 | b << 32 + bits | a << 32 + 2 * bits
+        marks |= int(a_moves and t.kind != "GET") | int(b_moves) << 1 | int(to_moves) << 2
+        marks |= int(t.times > 0) << 3 | int(node.gather == "running") << 4 | int(node.gather == "peak") << 7
+        return code | to << 32 | b << 32 + bits | a << 32 + 2 * bits | marks << 32 + 3 * bits
 
-    def _said(self, slot: Slot | None, at: Callable[[int], int]) -> str:
-        if slot is None:
-            return "-"
+    def _said(self, word: Word, at: _At) -> str:
+        marks = f"{' back' * word.back}{' round' * word.ends}{' repeated' * word.repeat}"
+        if word.does is None:
+            return f"-{marks}"
+        if isinstance(word.does, Loop):
+            return f"loop to {word.does.last} by {word.does.step}"
+        slot = word.does
         t = slot.term
+
+        def said(n: int, nth: int) -> str:
+            place, moves = at(n, nth)
+            return f"[{place}{' + k' if moves else ''}]"
+
         sign = "-" if t.minus else "+"
-        words = f"unit {UNITS[slot.node.unit]}" if t.kind == "TAKE" else f"[{at(t.a)}] [{at(t.b)}]"
+        words = (
+            f"unit {UNITS[slot.node.unit]}"
+            if t.kind == "TAKE"
+            else f"{said(t.a, 0 if t.kind == 'GET' else slot.nth)} {said(t.b, slot.nth)}"
+        )
         text = f"{'' if slot.first else '  '}{sign} {t.kind} {words} >> {t.shift}"
+        if t.times:
+            text += f" {slot.node.gather} for k < {t.times}"
         if slot.mode:
-            to = UNITS[slot.node.unit] if slot.writes is None else f"[{at(slot.writes)}]"
+            to = UNITS[slot.node.unit] if slot.writes is None else said(slot.writes, slot.nth)
             text += f"  => {slot.mode} >> {slot.node.end} {to}  // {slot.line}"
-        return text
+        return text + marks
+
+
+_At = Callable[[int, int], tuple[int, bool]]
+
+
+def _has_rows(plan: Plan) -> bool:
+    """Whether a machine needs loops or computed places."""
+    return any(
+        node.row or node.mode == "INDEX" or any(t.times for t in node.terms)
+        for node in map(plan.tick.made, plan.order)
+    )

@@ -10,7 +10,7 @@ and of a symmetric matrix each entry is computed once.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import SupportsInt
 
 from flowgraph.engines.fixed import integers as z
@@ -30,16 +30,18 @@ KINDS = (
     "NORM_EVEN",
     "TAKE",
     "ISNAN",
+    "GET",
 )
 """What a term makes of its words a and b, by number in a microword.
 
 MUL a b; SEL a where b is not 0, SELN where it is; DYN a 2^-b; AND, OR, XOR of bits; BITS the length of |a|;
-NORM |a| at full length, NORM_EVEN with an even shift; TAKE what unit b has made; ISNAN whether a is none.
+NORM |a| at full length, NORM_EVEN with an even shift; TAKE what unit b has made; ISNAN whether a is none;
+GET the element of the row a whose number the index b is.
 """
 
-MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START", "WIDE")
+MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START", "WIDE", "INDEX")
 """What becomes of a sum: cut to a word of a real number, kept, 32 bits of it, compared with 0, given to a
-unit, or cut to a wider word."""
+unit, cut to a wider word, or made an index: a place in a row, 0 for what is less."""
 
 UNITS = ("divide", "root", "logarithm", "angle")
 
@@ -49,18 +51,22 @@ NO_LIMIT = 15
 
 @dataclass(frozen=True)
 class Term:
-    """A term of a sum: `a` and `b` are numbers of words, `shift` is to the right."""
+    """A term of a sum: `a` and `b` are numbers of words, `shift` is to the right.
+
+    With `times` it is so many terms, one for each element of the rows among a and b.
+    """
 
     kind: str
     a: int
     b: int
     shift: int = 0
     minus: bool = False
+    times: int = 0
 
 
 @dataclass(frozen=True)
 class Sum:
-    """A word that is computed.
+    """A word that is computed, or a row of them.
 
     Args:
         terms: at least one; those of a START go to its unit, one after the other.
@@ -69,6 +75,9 @@ class Sum:
         limit: terms are cut to 2^(62 - limit).
         floor: shifts round down; for NORM_EVEN, that the fraction is odd.
         unit: of a START or TAKE.
+        row: how many such words there are, each of the elements of the rows among its operands; 0 for one.
+        gather: of terms with `times`, whether each element is the sum so far ("running"), or the largest of
+            them is taken and no sum ("peak").
     """
 
     terms: tuple[Term, ...]
@@ -77,6 +86,8 @@ class Sum:
     limit: int = 0
     floor: bool = False
     unit: int = 0
+    row: int = 0
+    gather: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,15 +106,45 @@ class Held:
         place: of the element in the value.
         high: whether it is the upper half of a whole number of 64 bits.
         width: bits of a word of a real number; 0 for what is none.
+        row: how many words from there on are meant, for a row.
     """
 
     value: int
     place: int
     high: bool = False
     width: int = 0
+    row: int = 0
 
 
-Node = Sum | Constant | Held
+@dataclass(frozen=True)
+class Table:
+    """A row of words that are known."""
+
+    words: tuple[int, ...]
+
+    @property
+    def row(self) -> int:
+        return len(self.words)
+
+
+@dataclass(frozen=True)
+class View:
+    """Elements of a row from `offset` on: so many, or one where `row` is 0."""
+
+    of: int
+    offset: int
+    row: int = 0
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Rows one behind the other, as one; each lies in no other."""
+
+    parts: tuple[int, ...]
+    row: int
+
+
+Node = Sum | Constant | Held | Table | View | Joined
 
 
 @dataclass
@@ -144,7 +185,7 @@ class Nodes:
                 passing = any(
                     t.a in self.doubtful or (t.kind == "MUL" and t.b in self.doubtful) for t in node.terms
                 )
-                if passing and all(t.kind in ("MUL", "SEL", "SELN", "DYN") for t in node.terms):
+                if passing and all(t.kind in ("MUL", "SEL", "SELN", "DYN", "GET") for t in node.terms):
                     self.doubtful.add(found)
         return found
 
@@ -155,6 +196,11 @@ class Nodes:
         """The word, where it is known."""
         node = self.nodes[n]
         return node.word if isinstance(node, Constant) else None
+
+    def row(self, n: int) -> int:
+        """How many elements the row n has; 0 for a word."""
+        node = self.nodes[n]
+        return 0 if isinstance(node, Constant) else node.row
 
     def made(self, n: int) -> Sum:
         """The sum of that number."""
@@ -170,12 +216,15 @@ class Nodes:
         mode: str = "FIT",
         limit: int = 0,
         floor: bool = False,
+        row: int = 0,
+        gather: str = "",
     ) -> int:
         """The number of a sum, made as simple as it can be.
 
         Args:
             terms: with shifts of any size.
-            end, mode, limit, floor: as in `Sum`.
+            end, mode, limit, floor, gather: as in `Sum`.
+            row: likewise, where no row among the operands says so.
         """
         mode = self._fitting(mode)
         kept: list[Term] = []
@@ -192,25 +241,35 @@ class Nodes:
             return self.constant(self._ended(total, end, mode, floor))
         if total:
             kept += self._of_known(total)
-        elif len(kept) == 1 and (same := self._same(kept[0], end, mode)) is not None:
+        elif len(kept) == 1 and not row and (same := self._same(kept[0], end, mode)) is not None:
             return same
         end = 63 if end > 62 else max(end, -62)
         if end == 63:
             return self.constant(0)
         kept.sort(key=lambda t: (t.a, t.b, t.kind, t.shift, t.minus))
-        return self.add(Sum(tuple(kept), mode, end, limit, floor))
+        return self.add(Sum(tuple(kept), mode, end, limit, floor, 0, row or self._rows(kept), gather))
+
+    def _rows(self, terms: Iterable[Term]) -> int:
+        """How long the row is that terms make."""
+        found = {
+            self.row(n) for t in terms if not t.times for n in ((t.b,) if t.kind == "GET" else (t.a, t.b))
+        }
+        found.discard(0)
+        assert len(found) < 2, f"{self.here}: rows of {sorted(found)}"
+        return found.pop() if found else 0
 
     def begin(self, unit: str, operands: Sequence[Term], *, odd: bool = False) -> int:
         """Start a unit; `odd` is for NORM_EVEN."""
         place = UNITS.index(unit)
-        return self.add(Sum(tuple(operands), "START", 0, 0, odd, place))
+        return self.add(Sum(tuple(operands), "START", 0, 0, odd, place, self._rows(operands)))
 
     def take(
         self, begun: int, *, shift: int = 0, minus: bool = False, mode: str = "FIT", floor: bool = False
     ) -> int:
         """What a unit has made of what it was given."""
         unit, mode = self.made(begun).unit, self._fitting(mode)
-        return self.add(Sum((Term("TAKE", begun, unit, shift, minus),), mode, 0, 0, floor, unit))
+        row = self.row(begun)
+        return self.add(Sum((Term("TAKE", begun, unit, shift, minus),), mode, 0, 0, floor, unit, row))
 
     def _fitting(self, mode: str) -> str:
         return "WIDE" if mode == "FIT" and self.now != self.width else mode
@@ -222,18 +281,18 @@ class Nodes:
             if chosen is not None:
                 taken = (chosen != 0) == (t.kind == "SEL")
                 return (
-                    Term("MUL", t.a, self.one, t.shift, t.minus)
+                    Term("MUL", t.a, self.one, t.shift, t.minus, t.times)
                     if taken
                     else Term("ZERO", self.one, self.one)
                 )
         if t.kind == "DYN" and (by := self.known(t.b)) is not None:
             return Term("MUL", t.a, self.one, t.shift + by, t.minus)
         if t.kind == "MUL" and self.known(t.a) is not None and self.known(t.b) is None:
-            t = Term("MUL", t.b, t.a, t.shift, t.minus)
+            t = replace(t, a=t.b, b=t.a)
         if t.kind == "MUL" and self.known(t.a) is None and self.known(t.b) is None and t.b < t.a:
-            t = Term("MUL", t.b, t.a, t.shift, t.minus)
+            t = replace(t, a=t.b, b=t.a)
         shift = 63 if t.shift > 62 else max(t.shift, -62)
-        return t if shift == t.shift else Term(t.kind, t.a, t.b, shift, t.minus)
+        return t if shift == t.shift else replace(t, shift=shift)
 
     def _value(self, t: Term, floor: bool, cut: bool) -> int | None:
         """The value of a term before its sign, where it is known."""
@@ -283,8 +342,11 @@ class Nodes:
 
     def _same(self, t: Term, end: int, mode: str) -> int | None:
         """The word that a sum of one term is, if it is one unchanged."""
+        if mode == "U32" and self._word32(t) and not t.shift and not end:
+            return t.a
         if (
             t.minus
+            or t.times
             or t.kind != "MUL"
             or mode not in ("FIT", "WIDE", "RAW")
             or (mode != "RAW" and not self._fits(t.a))
@@ -297,8 +359,20 @@ class Nodes:
         exact = t.shift <= up <= t.shift + 62 - self.wide
         return t.a if exact and up - t.shift == end else None
 
+    def _word32(self, t: Term) -> bool:
+        """Whether a term is a word of 32 bits without a sign."""
+        node = self.nodes[t.a]
+        plain = t.kind == "MUL" and t.b == self.one and not t.minus and not t.times
+        return plain and isinstance(node, Sum) and node.mode == "U32"
+
     def _fits(self, n: int) -> bool:
         node = self.nodes[n]
+        if isinstance(node, View):
+            return self._fits(node.of)
+        if isinstance(node, Joined):
+            return all(map(self._fits, node.parts))
+        if isinstance(node, Table):
+            return all(abs(w) < 1 << (self.now - 1) for w in node.words)
         if isinstance(node, Held):
             return node.width != 0 and node.width <= self.now
         if isinstance(node, Constant):

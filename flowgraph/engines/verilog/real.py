@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,10 @@ COMPARE = {
 """For each comparison of a and b how a - b, or where it says so b - a, compares with 0."""
 
 
+WORD = 34
+"""Bits of a word that the machine multiplies."""
+
+
 class Real(Functions):
     """What works element by element on real numbers.
 
@@ -45,16 +49,17 @@ class Real(Functions):
             raise no_form(i)
         return np.asarray(make(s, *wide), dtype=np.int64).reshape(shape)
 
-    def _each(self, shape: tuple[int, ...], make: Callable[..., int], *arrays: Any) -> np.ndarray:
-        """`make` of the elements of arrays that broadcast to a shape."""
-        flat = [np.broadcast_to(a, shape).ravel().tolist() for a in arrays]
-        return np.array([make(*row) for row in zip(*flat, strict=True)], dtype=np.int64).reshape(shape)
+    def _each(
+        self, shape: tuple[int, ...], make: Callable[..., int], args: Sequence[np.ndarray], *shifts: Any
+    ) -> np.ndarray:
+        """`make` of the elements of arrays, and shifts, that broadcast to a shape."""
+        return self.each_line(shape, lambda *x: (make(*x),), args, shifts)[..., 0]
 
     def _added(self, s: Site, a: np.ndarray, b: np.ndarray, minus: bool) -> np.ndarray:
         def one(x: int, y: int, p: int, q: int, end: int) -> int:
             return self.sum([self.plain(x, p), self.plain(y, q, minus)], end=end)
 
-        return self._each(s.i.spec.shape, one, a, b, *shifts.shifts_of_sum(s))
+        return self._each(s.i.spec.shape, one, (a, b), *shifts.shifts_of_sum(s))
 
     def _add(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return self._added(s, a, b, False)
@@ -66,10 +71,29 @@ class Real(Functions):
         def one(x: int, y: int, by: int) -> int:
             return self.sum([Term("MUL", x, y, by)])
 
-        return self._each(s.i.spec.shape, one, a, b, shifts.shift_of_product(s))
+        by = shifts.shift_of_product(s)
+        if not self.uneven(by) or (by.max() - by.min()) > WORD - self.now:
+            return self._each(s.i.spec.shape, one, (a, b), by)
+
+        def lifted(x: int, y: int, down: int, most: int) -> int:
+            return one(self.sum([Term("DYN", x, down)], mode="RAW"), y, most)
+
+        return self._each(s.i.spec.shape, lifted, (a, b, self.constants(by - by.max())), by.max())
+
+    def uneven(self, shift: np.ndarray) -> bool:
+        """Whether shifts differ along an axis of rows."""
+        return any(
+            size >= self.shortest > 0 and bool((shift != shift.take([0], axis=a)).any())
+            for a, size in enumerate(shift.shape)
+        )
+
+    def constants(self, numbers: np.ndarray) -> np.ndarray:
+        """Known words."""
+        made = [self.constant(n) for n in numbers.ravel().tolist()]
+        return np.array(made, dtype=np.int64).reshape(numbers.shape)
 
     def _divide(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return self._each(s.i.spec.shape, self.quotient, a, b, shifts.shift_of_quotient(s))
+        return self._each(s.i.spec.shape, self.quotient, (a, b), shifts.shift_of_quotient(s))
 
     def _of_one(self, function: Callable[[int, int, int], int], s: Site, a: np.ndarray) -> np.ndarray:
         f = shifts.bound_fraction(s.real(0))
@@ -78,7 +102,7 @@ class Real(Functions):
             self.here = s.i.line
             return function(x, fraction, out)
 
-        return self._each(s.i.spec.shape, one, a, f, s.out)
+        return self._each(s.i.spec.shape, one, (a,), f, s.out)
 
     def _sqrt(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._of_one(self.square_root, s, a)
@@ -100,15 +124,13 @@ class Real(Functions):
 
     def _atan2(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         f, g = (shifts.bound_fraction(s.real(k)) for k in (0, 1))
-        return self._each(s.i.spec.shape, self.angle, a, b, f, g, s.out)
+        return self._each(s.i.spec.shape, self.angle, (a, b), f, g, s.out)
 
     def _where(self, s: Site, c: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return self._each(
             s.i.spec.shape,
             self.chosen,
-            c,
-            a,
-            b,
+            (c, a, b),
             shifts.between(s.real(1), s.out),
             shifts.between(s.real(2), s.out),
         )
@@ -126,7 +148,7 @@ class Real(Functions):
     def comparison(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Truth values of two arrays of reals."""
         p, q, _ = shifts.aligned(s)
-        return self._each(s.i.spec.shape, lambda *x: self.compared(s.i.op, *x), a, b, p, q)
+        return self._each(s.i.spec.shape, lambda *x: self.compared(s.i.op, *x), (a, b), p, q)
 
     def _picked(self, s: Site, a: np.ndarray, b: np.ndarray, op: str) -> np.ndarray:
         p, q, _ = shifts.aligned(s)
@@ -137,8 +159,7 @@ class Real(Functions):
         return self._each(
             s.i.spec.shape,
             one,
-            a,
-            b,
+            (a, b),
             p,
             q,
             shifts.between(s.real(0), s.out),
@@ -165,7 +186,7 @@ class Real(Functions):
             size = self.size(x, by)
             return self.sum([Term("SEL", size, below, 0, True), Term("SELN", size, below)])
 
-        return self._each(s.i.spec.shape, one, a, b, shifts.between(s.real(0), s.out))
+        return self._each(s.i.spec.shape, one, (a, b), shifts.between(s.real(0), s.out))
 
     def _sign(self, s: Site, a: np.ndarray) -> np.ndarray:
         def one(x: int, out: int) -> int:
@@ -175,7 +196,7 @@ class Real(Functions):
             )
             return self.sum([self.plain(above), self.plain(below, 0, True)], end=-out)
 
-        return self._each(s.i.spec.shape, one, a, s.out)
+        return self._each(s.i.spec.shape, one, (a,), s.out)
 
     def whole(self, how: str, x: int, f: int, end: int) -> int:
         """The whole part of a word of fraction f, shifted by `end`."""
@@ -190,17 +211,23 @@ class Real(Functions):
         if how == "trunc":
             below = self.sum([self.plain(x)], mode="LT")
             return self.sum([Term("SEL", up, below, 0, True), Term("SELN", down, below)], end=end)
-        # half to even: up where the rest is more than a half, or is one and the number below is odd
+        return self.whole_to_even(x, f, end)
+
+    def whole_to_even(self, x: int, f: int, end: int | None = None) -> int:
+        """The whole number nearest to x 2^-f, of two the even one, shifted by `end`; or as it is."""
+        down = self.sum([self.plain(x)], end=f, mode="RAW", floor=True)
+        # up where the rest is more than a half, or is one and the number below is odd
         rest = self.sum([self.plain(x, -1), self.plain(down, -f - 1, True)], mode="RAW")
         one = self.constant(1 << f)
         more, half = self.compared("greater", rest, one, 0, 0), self.compared("equal", rest, one, 0, 0)
         odd = self.sum([Term("AND", down, self.one), self.plain(half)], end=0, mode="RAW")
         both = self.compared("equal", odd, self.constant(2), 0, 0)
-        return self.sum([self.plain(down), self.plain(more), self.plain(both)], end=end)
+        mode = "RAW" if end is None else "FIT"
+        return self.sum([self.plain(down), self.plain(more), self.plain(both)], end=end or 0, mode=mode)
 
     def _wholes(self, how: str, s: Site, a: np.ndarray) -> np.ndarray:
         f = shifts.bound_fraction(s.real(0))
-        return self._each(s.i.spec.shape, lambda x, p, out: self.whole(how, x, p, -out), a, f, s.out)
+        return self._each(s.i.spec.shape, lambda x, p, out: self.whole(how, x, p, -out), (a,), f, s.out)
 
     def _floor(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._wholes("floor", s, a)
@@ -216,11 +243,11 @@ class Real(Functions):
 
     def _remainder(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         p, q, at = shifts.aligned(s)
-        return self._each(s.i.spec.shape, self.rest, a, b, p, q, at - s.out)
+        return self._each(s.i.spec.shape, self.rest, (a, b), p, q, at - s.out)
 
     def _floor_divide(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         p, q, _ = shifts.aligned(s)
-        return self._each(s.i.spec.shape, self.floor_quotient, a, b, p, q, -s.out)
+        return self._each(s.i.spec.shape, self.floor_quotient, (a, b), p, q, -s.out)
 
     # -- along axes ----------------------------------------------------------------------------------------
 
@@ -247,14 +274,19 @@ class Real(Functions):
         last = np.broadcast_to(last, [1 if n in axes else size for n, size in enumerate(shape)])
         limit = max(count - 1, 0).bit_length()
         inner = [a for a in range(len(shape)) if a not in axes]
-        order = [*inner, *axes]
-        rows = [np.transpose(x, order).reshape(-1, count).tolist() for x in (left, right, by)]
-        ends = np.transpose(last, order).reshape(-1).tolist()
-        made = [
-            self.sum([Term("MUL", a, b, n) for a, b, n in zip(*row, strict=True)], end=end, limit=limit)
-            for *row, end in zip(*rows, ends, strict=True)
-        ]
-        return np.array(made, dtype=np.int64).reshape(i.spec.shape)
+        over = tuple(shape[a] for a in inner)
+        left, right, by, last = (
+            np.transpose(x, [*inner, *axes]).reshape(*over, -1) for x in (left, right, by, last)
+        )
+
+        def one(*x: int) -> tuple[int, ...]:
+            a, b, n, end = x[:count], x[count : 2 * count], x[2 * count : -1], x[-1]
+            return (self.sum(self.along("MUL", zip(a, b, n, strict=True)), end=end, limit=limit),)
+
+        args = [x[..., k] for x in (left, right) for k in range(count)]
+        moved = [*(by[..., k] for k in range(count)), last[..., 0]]
+        made = self.each_line(over, one, args, moved, elements=True)
+        return np.asarray(made[..., 0]).reshape(i.spec.shape)
 
 
 def no_form(i: Instruction) -> LoweringError:

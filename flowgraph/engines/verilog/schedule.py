@@ -1,24 +1,40 @@
 """When each sum is made, and where its word lies: list scheduling on one lane, and memory used again.
 
 A sum of n terms takes n cycles one after the other; its word can be read some cycles after the last. Of the
-sums that could be made, the one goes first from which the way to the end is longest. Words of registers are
-overwritten once nobody reads them any more in the tick, so that a tick ends with its registers in place.
+sums that could be made, the one goes first from which the way to the end is longest. A loop begins its next
+round at once: its words are read before they are written again. Where a round would wait, it makes several
+elements at a time. Words of registers are overwritten once nobody reads them any more in the tick, so that a
+tick ends with its registers in place.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from flowgraph.engines.verilog.nodes import UNITS, Constant, Held, Sum, Term
-from flowgraph.engines.verilog.tick import Tick
+from flowgraph.engines.verilog.plan import Plan, Stage
 
 LATENCY = 23
 """Cycles from the microword that writes a word to the first that can read it."""
 
+AHEAD = 4
+"""Cycles more where the machine has rows: the places of words are worked out before they are read."""
+
 UNIT_LATENCY = {"divide": 45, "root": 45, "logarithm": 193, "angle": 93}
 """Cycles from the microword that starts a unit to the first that can take what it made."""
+
+_LEAST = 4
+"""Microwords of a loop, since its end is decoded so much earlier."""
+
+_ABREAST = 16
+"""Elements that a round of a loop makes at most."""
+
+_LONGEST = 2100
+"""Microwords of a round, beyond which it makes no more elements at a time."""
+
+Item = tuple[int, int]
+"""A sum and which of the elements of a round it makes."""
 
 
 @dataclass(frozen=True)
@@ -31,217 +47,346 @@ class Slot:
     mode: str
     writes: int | None
     line: str
+    nth: int = 0
 
 
 @dataclass(frozen=True)
+class Loop:
+    """A microword that says how many rounds follow, and how many elements each makes."""
+
+    last: int
+    step: int = 1
+
+
+@dataclass(frozen=True)
+class Word:
+    """What a step of the program does: a term, the head of a loop, or nothing.
+
+    Args:
+        does: that.
+        back: whether the loop goes on from its begin, in three steps.
+        ends: whether a round ends here.
+        repeat: of nothing, whether it is done as often as the head before says.
+    """
+
+    does: Slot | Loop | None = None
+    back: bool = False
+    ends: bool = False
+    repeat: bool = False
+
+
+@dataclass
 class Schedule:
     """A tick in order of time.
 
     Args:
-        slots: a microword a cycle; None is a cycle in which nothing begins.
-        place: of each word that is computed, relative to the first free place; words of registers and
-            constants are not in it.
-        words: how many places are used.
+        words: a step each.
+        cycles: that it takes.
+        place: of each word that is computed and of the first of each row, relative to the first free place;
+            words of registers and constants are not in it.
+        size: how many places are used.
+        index: the same of indices, and how many.
+        loops: of each loop its first and last step.
+        repeats: whether the machine has loops.
     """
 
-    slots: list[Slot | None]
-    place: dict[int, int]
-    words: int
+    words: list[Word] = field(default_factory=list)
+    cycles: int = 0
+    place: dict[Item, int] = field(default_factory=dict)
+    size: int = 0
+    indices: int = 0
+    loops: list[tuple[int, int]] = field(default_factory=list)
+    repeats: bool = False
+
+    @property
+    def slots(self) -> list[Slot | None]:
+        """The term of each step."""
+        return [w.does if isinstance(w.does, Slot) else None for w in self.words]
 
 
-class Plan:
-    """The sums of a tick that something needs, with what must come before what."""
-
-    def __init__(self, tick: Tick) -> None:
-        self.tick = tick
-        self.fixed: dict[int, Held] = {}  # sums whose word is a register's
-        self.outputs: dict[int, int] = {}  # words that outputs are, where they are overwritten: their copies
-        self._registers = set(tick.writes)
-        self._copies()
-        self._live()
-
-    def _copies(self) -> None:
-        tick, nodes = self.tick, self.tick.nodes
-        wanted = [
-            n for flag, leaves in tick.outputs if flag is not None for x in leaves for n in x.ravel().tolist()
-        ]
-        wanted += [flag for flag, _ in tick.outputs if flag is not None]
-        uses: dict[int, int] = {}
-        for node in nodes:
-            if isinstance(node, Sum):
-                for r in _reads(node):
-                    uses[r] = uses.get(r, 0) + 1
-        for n in wanted:
-            uses[n] = uses.get(n, 0) + 1
-            node = nodes[n]
-            if isinstance(node, Held) and node in self._registers and n not in self.outputs:
-                self.outputs[n] = self._copy(n)
-        taken: set[int] = set()
-        for held, source in tick.writes.items():
-            node = nodes[source]
-            alone = isinstance(node, Sum) and not uses.get(source) and source not in taken
-            if alone and not any(isinstance(nodes[r], Held) for r in _reads(tick.made(source))):
-                taken.add(source)
-                self.fixed[source] = held
-                continue
-            if isinstance(node, Held):
-                source = self._copy(source)
-            tick.line.append("registers")
-            tick.nodes.append(Sum((Term("MUL", source, tick.one),), "RAW"))
-            self.fixed[len(tick.nodes) - 1] = held
-
-    def _copy(self, n: int) -> int:
-        self.tick.line.append("registers")
-        self.tick.nodes.append(Sum((Term("MUL", n, self.tick.one),), "RAW"))
-        return len(self.tick.nodes) - 1
-
-    def _live(self) -> None:
-        nodes = self.tick.nodes
-        self.kept = {self.outputs.get(n, n) for n in self._ends()}
-        stack = [*self.kept, *self.fixed]
-        live: set[int] = set()
-        while stack:
-            n = stack.pop()
-            node = nodes[n]
-            if n in live or not isinstance(node, Sum):
-                continue
-            live.add(n)
-            stack += _reads(node)
-        self.order = sorted(live)
-        by_held: dict[Held, list[int]] = {}
-        for n in self.order:
-            for r in _reads(self.tick.made(n)):
-                node = nodes[r]
-                if isinstance(node, Held):
-                    by_held.setdefault(node, []).append(n)
-        self.after = {n: [r for r in by_held.get(held, ()) if r != n] for n, held in self.fixed.items()}
-
-    def _ends(self) -> Iterable[int]:
-        for flag, leaves in self.tick.outputs:
-            if flag is not None:
-                yield flag
-                for x in leaves:
-                    yield from x.ravel().tolist()
+def schedule(plan: Plan, rows: bool = False) -> Schedule:
+    """The order of a tick's sums, for a machine with rows or without."""
+    made = Schedule(repeats=rows)
+    latency = LATENCY + AHEAD * rows
+    ready: dict[int, int] = {}  # cycles from which a word, or all of a row, can be read
+    spans: list[tuple[int, int]] = []
+    for stage in plan.stages:
+        start = len(made.words)
+        if stage.row:
+            _loop(plan, stage, made, ready, latency)
+        else:
+            _words(plan, stage, made, ready, latency)
+        spans.append((start, len(made.words) - 1))
+    if made.words and made.words[-1].ends:  # the program halts behind its last loop
+        made.words.append(Word())
+        made.cycles += 1
+    _places(plan, made, spans)
+    return made
 
 
-def _reads(node: Sum) -> list[int]:
-    """The numbers of the words and units that a sum reads."""
-    return [t.a for t in node.terms] + [t.b for t in node.terms if t.kind != "TAKE"]
-
-
-def schedule(plan: Plan) -> Schedule:
-    """The order of a tick's sums."""
-    nodes, order, made = plan.tick.nodes, plan.order, plan.tick.made
-    needs = {n: sorted({r for r in _reads(made(n)) if isinstance(nodes[r], Sum)}) for n in order}
-    users: dict[int, list[int]] = {n: [] for n in order}
-    for n in order:
-        for r in needs[n]:
-            users[r].append(n)
-    later: dict[int, list[int]] = {n: [] for n in order}
-    for n, readers in plan.after.items():
-        for r in readers:
-            later[r].append(n)
-    missing = {n: len(needs[n]) + len(plan.after.get(n, ())) for n in order}
-    urgent: dict[int, int] = {}
-    for n in sorted(order, reverse=True):
-        node = made(n)
-        behind = max((urgent[u] for u in users[n]), default=0)
-        urgent[n] = behind + _latency(node) + len(node.terms)
-    takes = {n: len(users[n]) for n in order if made(n).mode == "START"}
-    ready: dict[int, int] = {}
-    waiting: list[tuple[int, int]] = []
-    free: list[tuple[int, int]] = []
-    blocked: dict[int, list[tuple[int, int]]] = {k: [] for k in range(len(UNITS))}
-    busy = dict.fromkeys(range(len(UNITS)), 0)
-    slots: list[Slot | None] = []
-    issued: dict[int, int] = {}
-    earliest_after: dict[int, int] = dict.fromkeys(order, 0)
-
-    def offer(n: int) -> None:
-        heapq.heappush(waiting, (max(_start(made(n), ready)[0], earliest_after[n]), n))
-
-    for n in order:
-        if missing[n] == 0:
-            offer(n)
-    while len(issued) < len(order):
-        while waiting and waiting[0][0] <= len(slots):
-            _, n = heapq.heappop(waiting)
-            heapq.heappush(free, (-urgent[n], n))
-        if not free:
-            slots += [None] * (waiting[0][0] - len(slots))
+def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], latency: int) -> None:
+    """Words one by one, with terms that are many between them."""
+    order = _Order(plan, [(n, 0) for n in stage.order], latency, ready, made.cycles)
+    last: int | None = None
+    idle = 0
+    for slot in order.slots:
+        if slot is None:
+            idle += 1
             continue
-        _, n = heapq.heappop(free)
-        node = made(n)
-        if node.mode == "START":
-            if busy[node.unit]:
-                blocked[node.unit].append((-urgent[n], n))
-                continue
-            busy[node.unit] = takes[n]
-        terms = node.terms if node.mode == "START" else [node.terms[k] for k in _start(node, ready)[1]]
-        for k, term in enumerate(terms):
-            last = k == len(terms) - 1
-            mode = node.mode if last else "HOLD" if node.mode == "START" else ""
-            write = n if last and node.mode != "START" else None
-            first = k == 0 or node.mode == "START"
-            slots.append(Slot(term, first, node, mode, write, plan.tick.line[n]))
-        issued[n] = len(slots) - 1
-        ready[n] = issued[n] + _latency(node)
-        if terms[0].kind == "TAKE":
-            busy[node.unit] -= 1
-            if not busy[node.unit]:
-                for one in blocked[node.unit]:
-                    heapq.heappush(free, one)
-                blocked[node.unit] = []
-        for u in users[n]:
-            missing[u] -= 1
-            if not missing[u]:
-                offer(u)
-        for u in later[n]:
-            missing[u] -= 1
-            earliest_after[u] = max(earliest_after[u], len(slots))
-            if not missing[u]:
-                offer(u)
-    place, words = _places(plan, slots, issued)
-    return Schedule(slots, place, words)
+        if slot.term.times and last != slot.term.times - 1:
+            last = slot.term.times - 1
+            _wait(made, idle - 1)
+            made.words.append(Word(Loop(last)))
+            made.cycles += 1
+        elif idle:
+            last = last if _wait(made, idle) else None
+        idle = 0
+        made.words.append(Word(slot))
+        made.cycles += slot.term.times or 1
+        if slot.writes is not None:
+            ready[slot.writes] = made.cycles - 1 + latency
 
 
-def _latency(node: Sum) -> int:
-    return UNIT_LATENCY[UNITS[node.unit]] if node.mode == "START" else LATENCY
+def _wait(made: Schedule, cycles: int) -> bool:
+    """Steps that do nothing; where many can be one that is repeated, they are, and the answer is no."""
+    made.cycles += max(cycles, 0)
+    if cycles < _LEAST or not made.repeats:
+        made.words += [Word()] * cycles
+        return True
+    made.words += [Word(Loop(cycles - 2)), Word(repeat=True)]
+    return False
 
 
-def _start(node: Sum, ready: dict[int, int]) -> tuple[int, list[int]]:
-    """When a sum can begin, and the order of its terms: what is there last comes last."""
-    when = [max(ready.get(t.a, 0), 0 if t.kind == "TAKE" else ready.get(t.b, 0)) for t in node.terms]
-    order = range(len(when)) if node.mode == "START" else sorted(range(len(when)), key=lambda k: when[k])
-    return max(when[k] - n for n, k in enumerate(order)), list(order)
-
-
-def _places(plan: Plan, slots: list[Slot | None], issued: dict[int, int]) -> tuple[dict[int, int], int]:
-    """Places for the words that are computed; a place is used again once its word was last read."""
-    last: dict[int, int] = {}
+def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], latency: int) -> None:
+    """All rows of one length: a round as often as it takes."""
+    best: tuple[float, int, _Order] | None = None
+    least = 0
+    for step in range(1, min(_ABREAST, stage.row) + 1):
+        if stage.row % step:
+            continue
+        order = _Order(plan, [(n, k) for n in stage.order for k in range(step)], latency, {}, 0)
+        pace = max(len(order.slots), _LEAST) / step
+        longest = max(_LONGEST, 1.3 * least) if least else len(order.slots)
+        least = least or len(order.slots)
+        if best is None or (pace < 0.9 * best[0] and len(order.slots) <= longest):
+            best = pace, step, order
+        terms = sum(len(plan.tick.made(n).terms) for n in stage.order)
+        if len(order.slots) < 1.1 * terms * step:
+            break
+    assert best is not None
+    _, step, order = best
+    slots = order.slots + [None] * (_LEAST - len(order.slots))
+    made.words.append(Word(Loop(stage.row - step, step)))
+    made.cycles += 1
+    begin = made.cycles
+    within = set(stage.order)
     for t, slot in enumerate(slots):
         if slot is not None:
-            last[slot.term.a] = t
-            if slot.term.kind != "TAKE":
-                last[slot.term.b] = t
-    place: dict[int, int] = {}
-    spare: list[int] = []
-    ends: list[tuple[int, int]] = []
-    words = 0
+            for n, _ in plan.reads(slot.node):
+                if n not in within:
+                    begin = max(begin, ready.get(n, 0) - t)
+    wait = begin - made.cycles
+    head = made.words.pop()
+    made.cycles -= 1
+    _wait(made, wait)
+    made.words.append(head)
+    rounds = stage.row // step
+    body = [Word(slot) for slot in slots]
+    body[-_LEAST] = replace(body[-_LEAST], back=True)
+    body[-1] = replace(body[-1], ends=True)
+    made.loops.append((len(made.words), len(made.words) + len(body) - 1))
+    made.words += body
+    made.cycles = begin + rounds * len(body)
     for t, slot in enumerate(slots):
+        if slot is not None and slot.writes is not None:
+            at = begin + (rounds - 1) * len(body) + t + latency
+            ready[slot.writes] = max(ready.get(slot.writes, 0), at)
+
+
+class _Order:
+    """The order of sums that are made together: `slots`, a microword a cycle, None where nothing begins."""
+
+    def __init__(self, plan: Plan, items: list[Item], latency: int, ready: dict[int, int], now: int) -> None:
+        self.plan, self.latency = plan, latency
+        self.nodes, self.made = plan.tick.nodes, plan.tick.made
+        self.slots: list[Slot | None] = []
+        self.now = 0  # in cycles
+        self.ready: dict[Item, int] = {}
+        within = set(items)
+        for n, _ in items:
+            for r, _ in plan.reads(self.made(n)):
+                if (r, 0) not in within and r in ready:
+                    self.ready[(r, 0)] = max(ready[r] - now, 0)
+        self.within = within
+        self._make(items)
+
+    def _item(self, n: int, nth: int) -> Item:
+        """What makes the word n for an element."""
+        return (n, nth) if (n, nth) in self.within else (n, 0)
+
+    def _there(self, n: int, nth: int) -> int:
+        """When a word, or all of a row, can be read."""
+        return max(self.ready.get(self._item(r, nth), 0) for r in self.plan.sources(n))
+
+    def _make(self, items: list[Item]) -> None:
+        made, latency = self.made, self.latency
+        needs = {
+            (n, k): sorted({x for r, _ in self.plan.reads(made(n)) if (x := self._item(r, k)) in self.within})
+            for n, k in items
+        }
+        users: dict[Item, list[Item]] = {x: [] for x in items}
+        for x in items:
+            for r in needs[x]:
+                users[r].append(x)
+        later: dict[Item, list[Item]] = {x: [] for x in items}
+        missing = {x: len(needs[x]) for x in items}
+        for n, k in items:
+            for held in self.plan.after.get(n, ()):
+                if (held, k) in self.within:
+                    later[(held, k)].append((n, k))
+                    missing[(n, k)] += 1
+        urgent: dict[Item, int] = {}
+        for x in sorted(items, reverse=True):
+            node = made(x[0])
+            behind = max((urgent[u] for u in users[x]), default=0)
+            urgent[x] = behind + _latency(node, latency) + sum(t.times or 1 for t in node.terms)
+        takes = {x: len(users[x]) for x in items if made(x[0]).mode == "START"}
+        waiting: list[tuple[int, Item]] = []
+        free: list[tuple[int, Item]] = []
+        blocked: dict[int, list[tuple[int, Item]]] = {k: [] for k in range(len(UNITS))}
+        busy = dict.fromkeys(range(len(UNITS)), 0)
+        earliest_after: dict[Item, int] = dict.fromkeys(items, 0)
+
+        def offer(x: Item) -> None:
+            heapq.heappush(waiting, (max(self._start(x)[0], earliest_after[x]), x))
+
+        for x in items:
+            if missing[x] == 0:
+                offer(x)
+        left = len(items)
+        while left:
+            while waiting and waiting[0][0] <= self.now:
+                _, x = heapq.heappop(waiting)
+                heapq.heappush(free, (-urgent[x], x))
+            if not free:
+                self.slots += [None] * (waiting[0][0] - self.now)
+                self.now = waiting[0][0]
+                continue
+            _, x = heapq.heappop(free)
+            node = made(x[0])
+            if node.mode == "START":
+                if busy[node.unit]:
+                    blocked[node.unit].append((-urgent[x], x))
+                    continue
+                busy[node.unit] = takes[x]
+            self._put(x, node)
+            left -= 1
+            self.ready[x] = self.now - 1 + _latency(node, latency)
+            if node.terms[0].kind == "TAKE":
+                busy[node.unit] -= 1
+                if not busy[node.unit]:
+                    for one in blocked[node.unit]:
+                        heapq.heappush(free, one)
+                    blocked[node.unit] = []
+            for u in users[x]:
+                missing[u] -= 1
+                if not missing[u]:
+                    offer(u)
+            for u in later[x]:
+                missing[u] -= 1
+                earliest_after[u] = max(earliest_after[u], self.now)
+                if not missing[u]:
+                    offer(u)
+
+    def _put(self, x: Item, node: Sum) -> None:
+        start = node.mode == "START"
+        terms = node.terms if start else [node.terms[k] for k in self._start(x)[1]]
+        for k, term in enumerate(terms):
+            last = k == len(terms) - 1
+            mode = node.mode if last else "HOLD" if start else ""
+            write = x[0] if last and not start else None
+            line = self.plan.tick.line[x[0]]
+            self.slots.append(Slot(term, k == 0 or start, node, mode, write, line, x[1]))
+            self.now += term.times or 1
+
+    def _start(self, x: Item) -> tuple[int, list[int]]:
+        """When a sum can begin, and the order of its terms: what is there last comes last."""
+        n, nth = x
+        node = self.made(n)
+        when = [
+            max(self._there(t.a, nth), 0 if t.kind == "TAKE" else self._there(t.b, nth)) for t in node.terms
+        ]
+        order = range(len(when)) if node.mode == "START" else sorted(range(len(when)), key=lambda k: when[k])
+        return max(when[k] - n for n, k in enumerate(order)), list(order)
+
+
+def _latency(node: Sum, latency: int) -> int:
+    return UNIT_LATENCY[UNITS[node.unit]] if node.mode == "START" else latency
+
+
+def _places(plan: Plan, made: Schedule, spans: list[tuple[int, int]]) -> None:
+    """Places for the words that are computed; a place is used again once its word was last read."""
+    end_of = {t: end for start, end in made.loops for t in range(start, end + 1)}
+    within = {n: stage.row > 0 for stage in plan.stages for n in stage.order}
+    stage_of = {n: k for k, stage in enumerate(plan.stages) for n in stage.order}
+    at_stage = [k for k, (start, end) in enumerate(spans) for _ in range(start, end + 1)]
+    last: dict[Item, int] = {}
+    for t, slot in enumerate(made.slots):
+        if slot is None:
+            continue
+        for n in (slot.term.a, *(() if slot.term.kind == "TAKE" else (slot.term.b,))):
+            n = plan.base(n)
+            if within.get(n) and stage_of[n] == at_stage[t]:
+                last[(n, slot.nth)] = t
+            else:  # read again in each round
+                last[(n, 0)] = end_of.get(t, t)
+    spare: dict[bool, list[int]] = {False: [], True: []}
+    size = {False: 0, True: 0}
+    ends: list[tuple[int, bool, int]] = []
+    for t, slot in enumerate(made.slots):
         n = None if slot is None else slot.writes
-        if n is None or n in plan.fixed:
+        if slot is None or n is None or n in plan.fixed or n in plan.rows:
             continue
         while ends and ends[0][0] <= t:
-            heapq.heappush(spare, heapq.heappop(ends)[1])
-        if spare:
-            place[n] = heapq.heappop(spare)
+            _, index, place = heapq.heappop(ends)
+            heapq.heappush(spare[index], place)
+        index = slot.mode == "INDEX"
+        if spare[index]:
+            place = heapq.heappop(spare[index])
         else:
-            place[n] = words
-            words += 1
+            place = size[index]
+            size[index] += 1
+        made.place[(n, slot.nth)] = place
         if n not in plan.kept:
-            heapq.heappush(ends, (last.get(n, t), place[n]))
-    return place, words
+            heapq.heappush(ends, (last.get((n, slot.nth), t), index, place))
+    for index in (False, True):
+        size[index] = _row_places(plan, made, index, size[index])
+    made.size, made.indices = size[False], size[True]
 
 
-__all__ = ["LATENCY", "Constant", "Plan", "Schedule", "Slot", "schedule"]
+def _row_places(plan: Plan, made: Schedule, index: bool, first: int) -> int:
+    """Places for rows, behind the words: where there is room between those that are still read."""
+    used: list[tuple[int, int, int]] = []  # first place, the one behind the last, and the last stage
+    most = first
+    for k, stage in enumerate(plan.stages):
+        used = [u for u in used if u[2] >= k]
+        for n in stage.order:
+            node = plan.tick.made(n)
+            if n not in plan.rows or (node.mode == "INDEX") != index or (n, 0) in made.place:
+                continue
+            parts = [r for r in plan.joined.get(n, (n,)) if r in plan.rows]
+            size = sum(plan.tick.made(r).row for r in parts)
+            place = first
+            for start, end, _ in sorted(used):
+                if place + size <= start:
+                    break
+                place = max(place, end)
+            used.append((place, place + size, max(plan.rows[r] for r in parts)))
+            for r in parts:
+                made.place[(r, 0)] = place
+                place += plan.tick.made(r).row
+            most = max(most, place)
+    return most
+
+
+__all__ = ["AHEAD", "LATENCY", "Constant", "Held", "Loop", "Plan", "Schedule", "Slot", "Word", "schedule"]

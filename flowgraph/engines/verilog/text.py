@@ -61,6 +61,7 @@ def _top(image: Image) -> str:
         f"      .WIDTH({image.width}), .WIDE({image.wide}),",
         f"      .PLACE({image.place_bits}), .STEP({image.step_bits}),",
         f"      .WORDS({len(image.memory)}), .STEPS({len(image.program)}),",
+        f"      .ROWS({int(image.has_rows)}), .INDICES({max(image.indices, 2)}), .LANE({image.lane_bits}),",
         "      " + ", ".join(f".{_PARAMETER[u]}({int(u in image.units)})" for u in UNITS) + ",",
         f'      .MEMORY("{name}_memory.hex"), .PROGRAM("{name}_program.hex")',
         "  ) machine (",

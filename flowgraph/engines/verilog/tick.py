@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
 from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.lookup import Lookup
 from flowgraph.engines.verilog.nodes import Held, Term
 from flowgraph.engines.verilog.real import COMPARE, no_form
-from flowgraph.engines.verilog.whole import Whole, stacked
+from flowgraph.engines.verilog.rows import root_of
+from flowgraph.engines.verilog.whole import stacked
 from flowgraph.errors import LoweringError
 from flowgraph.pipeline.formats import NOT_A_NUMBER
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS, Spec
 
+_PARTICLES = 8
+"""Fewer are written out."""
+
+_SHORT = 6
+"""And shorter axes always."""
+
 _MAY_BE_NONE = frozenset(
     ["add", "subtract", "multiply", "where", "negative", "abs", "positive", "materialise"]
 ) | frozenset(("isnan", "isfinite", *COMPARE)) | (shifts.MOVES - {"take"})  # fmt: skip
 
 
-class Tick(Whole):
+class Tick(Lookup):
     """The words of one pattern of present inputs.
 
     Args:
@@ -43,6 +52,7 @@ class Tick(Whole):
         self.pipeline, self.key = player.pipeline, key
         self.formats = player.formats
         self.bound: Bound = player.bind(key)
+        self.shortest = shortest_row(self.pipeline)
         self.values: dict[int, np.ndarray] = {}
         self._begin()
         program = self.bound.program
@@ -65,7 +75,7 @@ class Tick(Whole):
             self.now = widths.get(i.out, self.width)
             self.values[i.out] = made = self._made(site)
             if i.out not in doubtful:
-                self.doubtful.difference_update(made.ravel().tolist())
+                self.doubtful.difference_update(map(root_of, made.ravel().tolist()))
         self.here = "registers"
         self.writes = self._writes()
         self.outputs: list[tuple[int | None, list[np.ndarray]]] = []
@@ -73,7 +83,8 @@ class Tick(Whole):
             if flag is None:
                 self.outputs.append((None, []))
             else:
-                self.outputs.append((int(self.values[flag].ravel()[0]), [self.values[n] for n in leaves]))
+                there = self.word(int(self.values[flag].ravel()[0]))
+                self.outputs.append((there, [self.values[n] for n in leaves]))
 
     def _begin(self) -> None:
         """Words that are there before: registers, inputs, constants."""
@@ -102,15 +113,21 @@ class Tick(Whole):
     def _held(self, value: int, spec: Spec) -> np.ndarray:
         size, real = math.prod(spec.shape), spec.dtype == "real"
         width = self.bound.widths.get(value, self.width) if real else 0
-        low = [self.add(Held(value, k, False, width)) for k in range(size)]
+        halves = 2 if spec.dtype in ("int64", "uint64") else 1
+        long = spec.shape[-1] if spec.shape and self.shortest else 0
+        if halves == 1 and long and long >= self.shortest:
+            rows = [self.add(Held(value, k, False, width, long)) for k in range(0, size, long)]
+            low = np.array([self.elements(n, long) for n in rows]).ravel().tolist()
+        else:
+            rows = low = [self.add(Held(value, k, False, width)) for k in range(size)]
         if real:
             if value in self.formats.absent:
-                self.doubtful.update(low)
+                self.doubtful.update(rows)
             return np.array(low, dtype=np.int64).reshape(spec.shape)
-        halves = [low]
-        if spec.dtype in ("int64", "uint64"):
-            halves.append([self.add(Held(value, k, True)) for k in range(size)])
-        return np.array(halves, dtype=np.int64).T.reshape(*spec.shape, len(halves))
+        parts = [low]
+        if halves == 2:
+            parts.append([self.add(Held(value, k, True)) for k in range(size)])
+        return np.array(parts, dtype=np.int64).T.reshape(*spec.shape, halves)
 
     def _made(self, s: Site) -> np.ndarray:
         i = s.i
@@ -126,11 +143,15 @@ class Tick(Whole):
                 return self.from_real(s, args[0])
         if i.op in ("negative", "abs") and real:
             make = self.negated if i.op == "negative" else self.size
-            return self._each(i.spec.shape, make, args[0])
+            return self._each(i.spec.shape, make, (args[0],))
         if i.op in ("materialise", "positive", "astype") and kinds[0] == i.spec.dtype:
             return args[0]
         if i.op in shifts.MOVES and i.op not in ("negative", "abs"):
             return self._moved(s, args, real)
+        if i.op == "cumulative_sum":
+            return self._running(s, args[0], real)
+        if i.op == "searchsorted":
+            return self._search(s, args, kinds[0] == "real")
         if i.op in ("any", "all", "sum", "max", "min", "argmax", "argmin") and not (i.op == "sum" and real):
             return self._along(s, args[0], kinds[0] == "real")
         if i.op == "where" and real:
@@ -153,12 +174,12 @@ class Tick(Whole):
         def one(a: int) -> int:
             return self.sum([Term("ISNAN", a, self.one)], mode="NE" if nan else "EQ")
 
-        return self._each(s.i.spec.shape, one, x)[..., None]
+        return self._each(s.i.spec.shape, one, (x,))[..., None]
 
     def _moved(self, s: Site, args: list[np.ndarray], real: bool) -> np.ndarray:
         i = s.i
         if i.op == "take":
-            raise no_form(i)
+            return self._take(s, args, real)
         if i.op in ("tril", "triu"):
             kept = OPS[i.op].run(NUMPY, np.ones(i.spec.shape, bool), **i.attrs)
             return np.where(kept, args[0], self.zero)
@@ -172,8 +193,7 @@ class Tick(Whole):
         return np.stack(halves, axis=-1)
 
     def _longer(self, a: np.ndarray) -> np.ndarray:
-        rows = [self.long(tuple(x)) for x in a.reshape(-1, 1).tolist()]
-        return np.array(rows, dtype=np.int64).reshape(*a.shape[:-1], 2)
+        return self.each_line(a.shape[:-1], lambda x: self.long((x,)), [a[..., 0]])
 
     def _along(self, s: Site, x: np.ndarray, real: bool) -> np.ndarray:
         """Truth of some or all, sums of whole numbers, extremes and their places, along axes."""
@@ -184,23 +204,36 @@ class Tick(Whole):
         inner = [a for a in range(rank) if a not in axes]
         rows = np.transpose(words, [*inner, *axes, rank])
         count = math.prod(words.shape[a] for a in axes)
-        rows = rows.reshape(-1, count, words.shape[-1])
+        over = tuple(words.shape[a] for a in inner)
+        depth = words.shape[-1]
+        rows = rows.reshape(*over, count, depth)
+        moved: list[np.ndarray] = []
         if real:
             at = shifts.common_along(s.real(0), axes)
             by = np.transpose(shifts.between(s.real(0), np.broadcast_to(at, x.shape)), [*inner, *axes])
-            ends = (
-                np.transpose(at, [*inner, *axes]).ravel() - np.broadcast_to(s.out, i.spec.shape).ravel()
-            ).tolist()
-            made: list[tuple[int, ...]] = [
-                (self._extreme(i.op, row[:, 0].tolist(), b.tolist(), end),)
-                for row, b, end in zip(rows, by.reshape(-1, count), ends, strict=True)
-            ]
-        else:
-            made = [self._whole_along(s, [tuple(w) for w in row.tolist()]) for row in rows]
-        out = stacked(made, i.spec.shape, self)
-        return out[..., 0] if i.spec.dtype == "real" else out
+            ends = np.transpose(at, [*inner, *axes]).reshape(over) - np.broadcast_to(
+                s.out, i.spec.shape
+            ).reshape(over)
+            moved = [*np.moveaxis(by.reshape(*over, count), -1, 0), ends]
 
-    def _extreme(self, op: str, row: list[int], by: list[int], end: int) -> int:
+        def one(*x: int) -> tuple[int, ...]:
+            if real:
+                return (self._extreme(i.op, x[:count], x[count:-1], x[-1]),)
+            return self._whole_along(s, [x[k : k + depth] for k in range(0, count * depth, depth)])
+
+        args = [rows[..., k, w] for k in range(count) for w in range(depth)]
+        made = self.each_line(over, one, args, moved, elements=True)
+        made = made.reshape(*i.spec.shape, made.shape[-1])
+        return made[..., 0] if i.spec.dtype == "real" else made
+
+    def _extreme(self, op: str, numbers: Sequence[int], by: Sequence[int], end: int) -> int:
+        if op in ("max", "min"):
+            ones = [self.one] * len(numbers)
+            terms = self.along("MUL", zip(numbers, ones, by, strict=True), op == "min")
+            if any(t.times for t in terms):
+                peak = self.sum(terms, mode="RAW", gather="peak")
+                return self.sum([self.plain(peak, 0, op == "min")], end=end)
+        row = [self.word(n) for n in numbers]
         order = "greater" if op in ("max", "argmax") else "less"
         best, best_by, place = row[0], by[0], self.zero
         for k in range(1, len(row)):
@@ -215,10 +248,11 @@ class Tick(Whole):
     def _whole_along(self, s: Site, row: list[tuple[int, ...]]) -> tuple[int, ...]:
         op = s.i.op
         if op == "sum":
-            return self.wrapped([t for x in row for t in self.terms(x)], s.i.spec.dtype)
+            parts = [[(x[k], self.one, -32 * k) for x in row] for k in range(len(row[0]))]
+            return self.wrapped([t for part in parts for t in self.along("MUL", part)], s.i.spec.dtype)
         if op in ("any", "all") and all(len(x) == 1 for x in row):
             kind, mode = ("SEL", "NE") if op == "any" else ("SELN", "EQ")
-            return (self.sum([Term(kind, self.one, x[0]) for x in row], mode=mode),)
+            return (self.sum(self.along(kind, [(self.one, x[0], 0) for x in row]), mode=mode),)
         raise no_form(s.i)
 
     def _writes(self) -> dict[Held, int]:
@@ -233,16 +267,29 @@ class Tick(Whole):
                 by = np.broadcast_to(by, c.shape)
                 self.now = self.bound.widths[c.read]
                 new = self._each(
-                    c.shape, lambda x, b: self.sum([self.plain(x, b)]), np.broadcast_to(new, c.shape), by
+                    c.shape, lambda x, b: self.sum([self.plain(x, b)]), (np.broadcast_to(new, c.shape),), by
                 )
             elif new.shape[-1] < old.shape[-1]:
                 new = self._longer(new)
             new = np.broadcast_to(new, old.shape)
-            for to, source in zip(old.ravel().tolist(), new.ravel().tolist(), strict=True):
-                held = self.nodes[to]
-                assert isinstance(held, Held)
-                if to != source:
-                    found[held] = source
+            flat, wanted = old.ravel().tolist(), new.ravel().tolist()
+            k = 0
+            while k < len(flat):
+                size = max(self.row(root_of(flat[k])), 1)
+                source = self.row_of(wanted[k : k + size])
+                for to, n in (
+                    [(root_of(flat[k]), source)]
+                    if source is not None
+                    else [
+                        (self.word(to), self.word(n))
+                        for to, n in zip(flat[k : k + size], wanted[k : k + size], strict=True)
+                    ]
+                ):
+                    held = self.nodes[to]
+                    assert isinstance(held, Held)
+                    if to != n:
+                        found[held] = n
+                k += size
         return found
 
 
@@ -251,6 +298,22 @@ def held_values(pipeline: Pipeline) -> dict[int, Spec]:
     found = {c.read: Spec(c.shape, c.dtype) for r in pipeline.registers for c in r.cells}
     found |= {leaf.value: Spec(leaf.shape, leaf.dtype) for port in pipeline.inputs for leaf in port.leaves}
     return found | {pipeline.time: Spec((), "int64"), pipeline.seed: Spec((2,), "uint32")}
+
+
+def shortest_row(pipeline: Pipeline) -> int:
+    """From which length on an axis is made in loops: a quarter of the particles, or 0 without such.
+
+    Particles are an axis that has a name, the last of registers of several shapes. Their random words come
+    four at a time.
+    """
+    ends: dict[int, set[tuple[int, ...]]] = {}
+    for r in pipeline.registers:
+        for c in r.cells:
+            named = len(c.axes) == len(c.shape) > 0 and c.axes[-1]
+            if named and c.shape[-1] >= _PARTICLES and c.shape[-1] not in c.shape[:-1]:
+                ends.setdefault(c.shape[-1], set()).add(c.shape[:-1])
+    sizes = [n for n, shapes in ends.items() if len(shapes) > 1]
+    return max(-(-min(sizes) // 4), _SHORT) if sizes else 0
 
 
 __all__ = ["NOT_A_NUMBER", "Tick", "held_values"]

@@ -7,6 +7,8 @@ is a word, whatever its declared kind.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from flowgraph.engines.fixed import shifts
@@ -29,10 +31,12 @@ class Whole(Real):
         make = getattr(self, f"int_{i.op}", None)
         if make is None:
             raise no_form(i)
-        shape = i.spec.shape
-        rows = [np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]).tolist() for a in args]
-        made = [make(s, *map(tuple, row)) for row in zip(*rows, strict=True)]
-        return stacked(made, shape, self)
+        ends = np.cumsum([0, *(a.shape[-1] for a in args)]).tolist()
+
+        def one(*x: int) -> Pair:
+            return tuple(make(s, *(x[k:n] for k, n in pairwise(ends))))
+
+        return self.each_line(i.spec.shape, one, [a[..., k] for a in args for k in range(a.shape[-1])])
 
     def terms(self, x: Pair, minus: bool = False) -> list[Term]:
         """A number as terms of a sum."""
@@ -146,6 +150,47 @@ class Whole(Real):
         terms = [Term(t.kind, t.a, t.b, t.shift - by) for t in self.terms(a)]
         return self.wrapped(terms, s.i.spec.dtype)
 
+    def int_floor_divide(self, s: Site, a: Pair, b: Pair) -> Pair:
+        """Rounded down, by a number that is known: digit after digit, each by a product with 2^k / b."""
+        by = self.known(b[0]) if len(b) == 1 else None
+        if by is None or not 0 < by < 1 << 16 or s.i.spec.dtype == "uint64":
+            raise no_form(s.i)
+        digit = 31 - by.bit_length()
+        shift = 31 + by.bit_length()
+        factor = self.constant(-(-(1 << shift) // by))
+        top = -(-64 // digit) - 1
+        ahead = 1 << (63 - digit * top)  # the highest digit has the sign: it is made positive, by so often b
+        rest = [Term("MUL", self.constant(ahead), b[0])]
+        found = [Term("MUL", self.constant(ahead), self.one, -digit * top, True)]
+        for k in range(top, -1, -1):
+            part = self.sum(
+                self.terms(a), mode="RAW" if k == top else "U32", end=digit * k, limit=NO_LIMIT, floor=True
+            )
+            low = self.plain(part) if k == top else Term("AND", part, self.constant((1 << digit) - 1))
+            number = self.sum([*rest, low], mode="RAW", limit=NO_LIMIT)
+            divided = self.sum(
+                [Term("MUL", number, factor)], end=shift, mode="RAW", limit=NO_LIMIT, floor=True
+            )
+            rest = [self.plain(number, -digit), Term("MUL", divided, b[0], -digit, True)]
+            found.append(self.plain(divided, -digit * k))
+        return self.wrapped(found, s.i.spec.dtype)
+
+    def int_float32_bits(self, s: Site, a: Pair) -> Pair:
+        """The bits of the float32 nearest to a number of 32 bits, halves to even."""
+        length = self.sum([Term("BITS", a[0], self.one)], mode="RAW")
+        size = self.sum([Term("NORM", a[0], self.one, -31)], mode="RAW")
+        mantissa = self.whole_to_even(size, 7)
+        some, below = (self.sum([self.plain(a[0])], mode=m) for m in ("NE", "LT"))
+        made = self.sum(
+            [
+                Term("MUL", length, self.constant(1 << 23)),
+                self.plain(self.constant(125 << 23)),
+                self.plain(mantissa),
+            ],
+            mode="RAW",
+        )
+        return (self.sum([Term("SEL", made, some), Term("MUL", below, self.one, -31, True)], mode="S32"),)
+
     def int_sign(self, s: Site, a: Pair) -> Pair:
         above = self.sum(self.terms(a, True), mode="LT", limit=NO_LIMIT)
         below = self.sum(self.terms(a), mode="LT", limit=NO_LIMIT)
@@ -171,27 +216,30 @@ class Whole(Real):
     # -- between whole numbers and reals ---------------------------------------------------------------------
 
     def to_real(self, s: Site, a: np.ndarray) -> np.ndarray:
-        shape = s.i.spec.shape
-        out = np.broadcast_to(s.out, shape).ravel().tolist()
-        rows = a.reshape(-1, a.shape[-1]).tolist()
-        made = [
-            self.sum(self.terms(tuple(x)), end=-f, limit=NO_LIMIT) for x, f in zip(rows, out, strict=True)
-        ]
-        return np.array(made, dtype=np.int64).reshape(shape)
+        def one(*x: int) -> int:
+            return self.sum(self.terms(x[:-1]), end=-x[-1], limit=NO_LIMIT)
+
+        out = np.broadcast_to(s.out, s.i.spec.shape)
+        if self.uneven(out) and a.shape[-1] == 1:
+            return self._each(
+                s.i.spec.shape,
+                lambda x, down: self.sum([Term("DYN", x, down)]),
+                (a[..., 0], self.constants(-out)),
+            )
+        return self._each(s.i.spec.shape, one, [a[..., k] for k in range(a.shape[-1])], out)
 
     def from_real(self, s: Site, a: np.ndarray) -> np.ndarray:
         to = s.i.attrs["dtype"]
-        f = np.broadcast_to(shifts.bound_fraction(s.real(0)), a.shape).ravel().tolist()
-        made: list[Pair] = []
-        for x, fraction in zip(a.ravel().tolist(), f, strict=True):
+
+        def one(x: int, fraction: int) -> Pair:
             if to == "bool":
-                made.append((self.sum([self.plain(x)], mode="NE"),))
-                continue
+                return (self.sum([self.plain(x)], mode="NE"),)
             if fraction < 0 and to in _BIG:
-                raise no_form(s.i)
+                return self.halves([self.plain(x, fraction)], to)
             whole = self.whole_raw(x, fraction)
-            made.append((whole,) if to in _BIG else self.wrapped([self.plain(whole)], to))
-        return stacked(made, s.i.spec.shape, self)
+            return (whole,) if to in _BIG else self.wrapped([self.plain(whole)], to)
+
+        return self.each_line(s.i.spec.shape, one, [a], [shifts.bound_fraction(s.real(0))])
 
     def whole_raw(self, x: int, f: int) -> int:
         """The whole part of a word, towards zero, as a whole number."""

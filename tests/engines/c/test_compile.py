@@ -14,7 +14,7 @@ import pytest
 from flowgraph import MissingDependencyError, OutputError
 from flowgraph.data.files import lock
 from flowgraph.engines.c import compile as compiling
-from flowgraph.engines.c.compile import CompileError, build, cache_folder, load
+from flowgraph.engines.c.compile import FLAGS, CompileError, build, cache_folder, load
 
 TEXT = {"a.c": "int f(void) { return 3; }\n"}
 
@@ -65,6 +65,20 @@ def test_a_whole_file_that_is_no_library_is_made_again(cache):
     content = b"not a library"
     library.write_bytes(content + compiling._MARK + hashlib.sha256(content).hexdigest().encode())
     assert load(TEXT).f() == 3
+
+
+def test_another_compiler_than_gcc_gets_no_flags_of_gcc(cache, tmp_path, monkeypatch):
+    """What says nothing of the Free Software Foundation has its third level instead."""
+    seen = tmp_path / "seen"
+    says = 'test "$1" = --version && exec echo clang version 14\n'
+    monkeypatch.setenv("CC", program(tmp_path, f'{says}echo "$@" > {seen}; exec cc "$@"'))
+    build(TEXT)
+    words = seen.read_text().split()
+    assert "-O3" in words
+    assert not {"-O1", "-fstore-merging", "-ftree-vrp"} & set(words)
+    monkeypatch.delenv("CC")
+    assert "-O3" not in FLAGS
+    assert build(TEXT)
 
 
 def test_the_name_is_of_the_text_the_flags_and_the_compiler(cache, tmp_path, monkeypatch):

@@ -166,7 +166,7 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
     due: list[tuple[int, int]] = []
     for t, slot in enumerate(found.slots):
         for when, n in [d for d in due if d[0] <= t]:
-            lies[found.place.get(n, -1 - n)] = n
+            lies[found.place.get((n, 0), -1 - n)] = n
             due.remove((when, n))
         if slot is None:
             continue
@@ -174,7 +174,7 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
             node = nodes[r]
             if isinstance(node, Sum) and node.mode != "START":
                 assert t >= at[r] + LATENCY
-                assert lies[found.place.get(r, -1 - r)] == r
+                assert lies[found.place.get((r, 0), -1 - r)] == r
         if slot.term.kind == "TAKE":
             assert (
                 t
@@ -187,7 +187,7 @@ def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(mad
         if slot.writes is not None:
             due.append((t + LATENCY, slot.writes))
     assert len([s for s in found.slots if s]) == sum(len(plan.tick.made(n).terms) for n in plan.order)
-    assert found.words < len(plan.order)  # places are used again
+    assert found.size < len(plan.order)  # places are used again
 
 
 def test_what_is_known_costs_nothing():

@@ -2,7 +2,8 @@
 //
 // Each microword is a term of a sum: two words of the memory, what is made of them (`kind`), a shift, a sign.
 // The last term of a sum (`mode` is not 0) shifts the whole, cuts it to a word and writes it. One term a cycle;
-// a word can be read by the microword LATENCY after that which writes it. Quotients, roots, logarithms and
+// a word can be read by the microword LATENCY after that which writes it. With ROWS a loop of the program goes over
+// the elements of rows, a term is repeated for each of them, and a row is read at a place that was computed. Quotients, roots, logarithms and
 // angles are made beside, in units that are started by a sum and asked by a term.
 //
 // While `ready` is 1 the host writes words (`put`) and reads them (`word` is what lies at `at` three cycles
@@ -14,6 +15,9 @@ module fg_machine #(
     parameter STEP = 12,  // bits of an address of the program
     parameter WORDS = 4096,
     parameter STEPS = 4096,
+    parameter ROWS = 0,  // whether there are loops and computed places
+    parameter INDICES = 2,  // how many of these are kept
+    parameter LANE = 1,  // bits of the number of an element
     parameter DIVIDES = 1,  // which units there are
     parameter ROOTS = 1,
     parameter LOGARITHMS = 1,
@@ -33,15 +37,19 @@ module fg_machine #(
     output reg [31:0] cut  // words that did not fit, so far
 );
   // The microword, from its end: kind, shift, minus, first, limit, last shift, floor, mode, halt, places d b a.
-  localparam CODE = 4 + 8 + 1 + 1 + 4 + 8 + 1 + 4 + 1 + 3 * PLACE;
+  // With rows: whether a, b, d go along, repeat, running, back, round, peak, loop.
+  localparam CODE = 4 + 8 + 1 + 1 + 4 + 8 + 1 + 4 + 1 + 3 * PLACE + (ROWS != 0 ? 9 : 0);
   localparam KIND = 0, SHIFT = 4, MINUS = 12, FIRST = 13, LIMIT = 14, LAST = 18, FLOOR = 26, MODE = 27, HALT = 31;
-  localparam D = 32, B = 32 + PLACE, A = 32 + 2 * PLACE;
+  localparam D = 32, B = 32 + PLACE, A = 32 + 2 * PLACE, MARKS = 32 + 3 * PLACE;
+  localparam A_MOVES = MARKS, B_MOVES = MARKS + 1, D_MOVES = MARKS + 2, REPEAT = MARKS + 3, RUNNING = MARKS + 4, BACK = MARKS + 5,
+      ENDS = MARKS + 6, PEAK = MARKS + 7, LOOP = MARKS + 8;
   // Kinds of terms.
   localparam [3:0] MUL = 1, SEL = 2, SELN = 3, DYN = 4, AND = 5, OR = 6, XOR = 7, BITS = 8, NORM = 9, NORM_EVEN = 10,
-      TAKE = 11, ISNAN = 12;
+      TAKE = 11, ISNAN = 12, GET = 13;
   // What becomes of a sum.
-  localparam [3:0] FIT = 1, RAW = 2, U32 = 3, S32 = 4, LT = 5, LE = 6, EQ = 7, NE = 8, HOLD = 9, START = 10, FIT_WIDE = 11;
-  localparam DEPTH = 23;  // from the microword to the written word
+  localparam [3:0] FIT = 1, RAW = 2, U32 = 3, S32 = 4, LT = 5, LE = 6, EQ = 7, NE = 8, HOLD = 9, START = 10, FIT_WIDE = 11, INDEX = 12;
+  localparam AHEAD = ROWS != 0 ? 4 : 0;
+  localparam DEPTH = 23;  // from the microword to the written word, but for those
   localparam signed [65:0] MOST = (66'sd1 <<< (WIDTH - 1)) - 66'sd1;
   localparam signed [65:0] MOST_WIDE = (66'sd1 <<< (WIDE - 1)) - 66'sd1;
   localparam [35:0] NAN = 36'h8_0000_0000;
@@ -54,14 +62,18 @@ module fg_machine #(
   reg [CODE-1:0] fetched, next_code, code;
   reg running, live1, live2, live3;
   reg [5:0] draining;
+  wire hold, jump;
+  wire [STEP-1:0] back;
   assign ready = !running && draining == 6'd0;
   always @(posedge clk) begin
-    fetched <= program_[step];
-    next_code <= fetched;
-    code <= live2 ? next_code : {CODE{1'b0}};
-    live1 <= running;
-    live2 <= live1;
-    live3 <= live2;
+    if (!hold) begin
+      fetched <= program_[step];
+      next_code <= fetched;
+      code <= live2 ? next_code : {CODE{1'b0}};
+      live1 <= running;
+      live2 <= live1;
+      live3 <= live2;
+    end
     if (reset) begin
       running <= 1'b0;
       live1 <= 1'b0;
@@ -72,21 +84,87 @@ module fg_machine #(
     end else if (start && ready) begin
       running <= 1'b1;
       step <= from;
-      draining <= DEPTH + 6'd2;
+      draining <= DEPTH + AHEAD + 6'd2;
     end else if (running) begin
-      step <= step + 1'b1;
-      if (live3 && code[HALT]) begin
+      if (!hold) step <= jump ? back : step + 1'b1;
+      if (!hold && live3 && code[HALT]) begin
         running <= 1'b0;
         live1 <= 1'b0;
         live2 <= 1'b0;
       end
     end else if (draining != 6'd0) draining <= draining - 6'd1;
-    if (live3 && code[HALT]) code <= {CODE{1'b0}};
+    if (!hold && live3 && code[HALT]) code <= {CODE{1'b0}};
   end
+
+  // -- loops: `lane` is the first of the elements that a round makes, `placed` a microword with its places ------
+  wire [CODE-1:0] placed;
+  wire write_index;
+  reg [PLACE-1:0] to;
+  reg [35:0] written;
+  generate
+    if (ROWS != 0) begin : rows
+      reg [LANE-1:0] lane, last, by;
+      reg [STEP-1:0] begins;
+      wire at_last = lane == last;
+      assign hold = code[REPEAT] && !at_last;
+      assign jump = code[BACK] && !at_last;
+      assign back = begins;
+      always @(posedge clk) begin
+        if (code[LOOP]) begin
+          lane <= {LANE{1'b0}};
+          last <= code[A+:LANE];
+          by <= code[B+:LANE];
+          begins <= step - {{STEP-2{1'b0}}, 2'd2};
+        end else if (code[REPEAT] || code[ENDS]) lane <= at_last ? {LANE{1'b0}} : lane + by;
+      end
+
+      // Of a term that is repeated, the first begins the sum, and the last, or each, ends it.
+      reg [CODE-1:0] code1, code2, code3, code4;
+      reg [LANE-1:0] lane1, lane2, lane3;
+      (* ram_style = "block" *) reg [PLACE-1:0] index_[0:INDICES-1];
+      localparam INDEX_BITS = INDICES > 2 ? $clog2(INDICES) : 1;
+      reg [INDEX_BITS-1:0] index_place;
+      reg [PLACE-1:0] index_read, index3;
+      always @(posedge clk) begin
+        code1 <= code;
+        if (code[LOOP]) code1 <= {CODE{1'b0}};
+        if (code[REPEAT]) begin
+          code1[FIRST] <= code[FIRST] && lane == {LANE{1'b0}};
+          if (!at_last && !code[RUNNING]) code1[MODE+:4] <= 4'd0;
+        end
+        lane1 <= lane;
+        index_place <= code[B+:INDEX_BITS] + (code[B_MOVES] ? lane_of(lane) : {INDEX_BITS{1'b0}});
+        code2 <= code1;
+        lane2 <= lane1;
+        index_read <= index_[index_place];
+        code3 <= code2;
+        lane3 <= lane2;
+        index3 <= index_read;
+        code4 <= code3;
+        code4[A+:PLACE] <= code3[A+:PLACE] + (code3[KIND+:4] == GET ? index3 : code3[A_MOVES] ? {{PLACE-LANE{1'b0}}, lane3} : {PLACE{1'b0}});
+        if (code3[B_MOVES]) code4[B+:PLACE] <= code3[B+:PLACE] + {{PLACE-LANE{1'b0}}, lane3};
+        if (code3[D_MOVES]) code4[D+:PLACE] <= code3[D+:PLACE] + {{PLACE-LANE{1'b0}}, lane3};
+        if (write_index) index_[to[INDEX_BITS-1:0]] <= written[35] ? {PLACE{1'b0}} : written[PLACE-1:0];
+      end
+      function [INDEX_BITS-1:0] lane_of(input [LANE-1:0] x);
+        integer n;
+        for (n = 0; n < INDEX_BITS; n = n + 1) lane_of[n] = n < LANE ? x[n] : 1'b0;
+      endfunction
+      assign placed = code4;
+    end else begin : no_rows
+      assign hold = 1'b0;
+      assign jump = 1'b0;
+      assign back = {STEP{1'b0}};
+      assign placed = code;
+      // verilator lint_off UNUSEDSIGNAL
+      wire unused = write_index;
+      // verilator lint_on UNUSEDSIGNAL
+    end
+  endgenerate
 
   // Each microword goes along beside what it does: `w(n)` is n registers behind the decoder.
   reg [CODE*DEPTH-1:0] line;
-  always @(posedge clk) line <= {line[CODE*(DEPTH-1)-1:0], code};
+  always @(posedge clk) line <= {line[CODE*(DEPTH-1)-1:0], placed};
   `define AT(n, field) CODE * (n - 1) + field
 
   // -- the memory: two copies, so that two words are read a cycle -------------------------------------------
@@ -95,11 +173,11 @@ module fg_machine #(
   initial $readmemh(MEMORY, memory_a);
   initial $readmemh(MEMORY, memory_b);
   reg write;
-  reg [PLACE-1:0] to, a_place, b_place;
-  reg [35:0] written, a_read, b_read, a4, b4;
+  reg [PLACE-1:0] a_place, b_place;
+  reg [35:0] a_read, b_read, a4, b4;
   always @(posedge clk) begin
-    a_place <= ready ? at : code[A+:PLACE];
-    b_place <= code[B+:PLACE];
+    a_place <= ready ? at : placed[A+:PLACE];
+    b_place <= placed[B+:PLACE];
     a_read <= memory_a[a_place];
     b_read <= memory_b[b_place];
     a4 <= a_read;
@@ -252,9 +330,23 @@ module fg_machine #(
   // -- the sum ------------------------------------------------------------------------------------------------
   reg signed [65:0] sum;
   reg no17;
-  wire signed [65:0] base = line[`AT(16, FIRST)] ? 66'sd0 : sum;
+  wire signed [65:0] base;
+  wire peak16;
+  generate
+    if (ROWS != 0) begin : peaks
+      // The largest of the terms instead: a term is smaller where what is left of the sum without it is more than 0.
+      // verilator lint_off UNUSEDSIGNAL
+      wire signed [65:0] left = minus16 ? sum + term16 : sum - term16;
+      // verilator lint_on UNUSEDSIGNAL
+      assign peak16 = line[`AT(16, PEAK)] && !line[`AT(16, FIRST)] && !left[65];
+      assign base = line[`AT(16, FIRST)] || line[`AT(16, PEAK)] ? 66'sd0 : sum;
+    end else begin : no_peaks
+      assign peak16 = 1'b0;
+      assign base = line[`AT(16, FIRST)] ? 66'sd0 : sum;
+    end
+  endgenerate
   always @(posedge clk) begin
-    sum <= minus16 ? base - term16 : base + term16;
+    if (!peak16) sum <= minus16 ? base - term16 : base + term16;
     no17 <= no16 | (no17 & ~line[`AT(16, FIRST)]);
   end
 
@@ -279,11 +371,13 @@ module fg_machine #(
   wire over = whole21 > most, under = whole21 < -most;
   wire [35:0] least = 36'd0 - most[35:0];
   reg [35:0] result22;
-  reg write22;
+  reg write22, index22, index23;
+  assign write_index = index23;
   reg cut22;
   always @(posedge clk) begin
     cut22 <= 1'b0;
-    write22 <= mode21 != 4'd0 && mode21 != HOLD && mode21 != START;
+    write22 <= mode21 != 4'd0 && mode21 != HOLD && mode21 != START && mode21 != INDEX;
+    index22 <= mode21 == INDEX;
     case (mode21)
       FIT, FIT_WIDE: begin
         result22 <= no21 ? NAN : over ? most[35:0] : under ? least : whole21[35:0];
@@ -295,12 +389,13 @@ module fg_machine #(
       LE: result22 <= {35'd0, (whole21[65] || whole21 == 66'sd0) && !no21};
       EQ: result22 <= {35'd0, whole21 == 66'sd0 && !no21};
       NE: result22 <= {35'd0, whole21 != 66'sd0 || no21};
-      RAW: result22 <= no21 ? NAN : whole21[35:0];
+      RAW, INDEX: result22 <= no21 ? NAN : whole21[35:0];
       default: result22 <= 36'd0;
     endcase
     if (reset) cut <= 32'd0;
     else if (cut22) cut <= cut + 32'd1;
     write <= ready ? put : write22;
+    index23 <= index22;
     to <= ready ? at : line[`AT(22, D)+:PLACE];
     written <= ready ? put_word : result22;
   end
