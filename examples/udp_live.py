@@ -16,6 +16,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -62,9 +63,11 @@ def send(port: int, seconds: float) -> None:
             sock.sendto(packet, ("127.0.0.1", port))
     for _, packet in sorted(waiting):
         sock.sendto(packet, ("127.0.0.1", port))
-    for _ in range(5):  # the last word, which may get lost as well
-        sock.sendto(PACKET.pack(b"e", 0, 0, *numbers.values(), *[0.0] * 4), ("127.0.0.1", port))
-        time.sleep(0.02)
+    sock.connect(("127.0.0.1", port))
+    with suppress(ConnectionRefusedError):  # it has heard the last word, which may get lost as well
+        while True:
+            sock.send(PACKET.pack(b"e", 0, 0, *numbers.values(), *[0.0] * 4))
+            time.sleep(0.02)
 
 
 def receive(sock: socket.socket, live: Live, seconds: float) -> tuple[dict[str, int], dict[str, int]]:
@@ -130,8 +133,8 @@ def main() -> dict[str, Any]:
     try:
         came, sent = receive(sock, live, given.seconds)
     finally:
-        sender.wait(timeout=20.0)
         sock.close()
+        sender.wait(timeout=20.0)
     result, arrived = live.close(), live.arrived
     for name, n in sent.items():
         made_none = ("late", "twice", "dropped", "unclocked", "absent")

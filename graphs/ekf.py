@@ -102,5 +102,5 @@ def for_flight(on: OnFlight, *, filter: SmoothedPoseFilter) -> Case:
     """
     return on_capture(
         on, filter, start=start_pose, believed=in_tangent_space, steps=pose_steps,
-        at_start=("belief", pose_at_start),
+        begin=lambda first, at: {"belief": pose_at_start(first("vicon"), at=at)},
     )  # fmt: skip

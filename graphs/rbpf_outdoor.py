@@ -39,6 +39,7 @@ from flowgraph.blocks.outdoor.corrections import (
     correct_position,
 )
 from flowgraph.blocks.outdoor.flight import OutdoorSensors
+from flowgraph.blocks.outdoor.layout import particle_layout
 from flowgraph.blocks.particles.cloud import average_attitude, average_pose, effective_sample_size, weights
 from flowgraph.blocks.particles.lost import depletion
 from flowgraph.blocks.particles.resampling import draw_ancestors
@@ -131,7 +132,7 @@ def rbpf_outdoor(
     cloud.feed(merge(fresh, now, tie="left", name="next"))
     pose, belief, weight = average(now, plain)
     collect(belief, "belief")
-    if start.covariance.shape[0] > 12:
+    if particle_layout(start.covariance).biased:
         collect(cloud_biases(now, weight, name="biases"), "biases")
     collect(depletion(size, numbers=3), "depleted")
     return {"pose": pose, "effective_sample_size": size, "ancestors": ancestors}

@@ -20,8 +20,12 @@ from flowgraph import MissingDependencyError
 from tests import times
 from tests.support import Install
 
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("patient")  # a machine that is busy is no fault of a law
+_PATIENT: dict[str, Any] = {  # a machine that is busy is no fault of a law
+    "deadline": None, "suppress_health_check": [HealthCheck.too_slow],
+}  # fmt: skip
+settings.register_profile("same", derandomize=True, database=None, **_PATIENT)
+settings.register_profile("other", derandomize=False, **_PATIENT)
+settings.load_profile("same")  # each time the same examples; --hypothesis-profile=other looks for more
 
 COMPILER = shutil.which(os.environ.get("CC") or "cc")
 

@@ -101,4 +101,4 @@ def isolated(
         "sys.meta_path.insert(0, _Blocked())\n"
     )
     command = [sys.executable, "-c", guard + program, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)

@@ -63,7 +63,7 @@ def test_a_wrong_meaning_is_found(monkeypatch):
 def test_the_command_tells_how_many_and_which():
     ran = subprocess.run(
         [sys.executable, "-m", "tests.oracle", "--count", "2", "--seed", "3", "--json"],
-        capture_output=True, text=True, check=False, timeout=120,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     report = json.loads(ran.stdout)
     assert (ran.returncode, report["count"], report["failed"], report["seeds"]) == (0, 2, 0, [])

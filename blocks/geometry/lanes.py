@@ -25,10 +25,14 @@ __all__ = [
     "multiply",
     "normalize",
     "products",
+    "relative_to",
     "rotate",
     "rotation_matrices",
+    "rotation_vectors",
     "rotation_vectors_to",
+    "solve_and_log_determinant",
     "transpose",
+    "turned",
 ]
 
 
@@ -84,6 +88,22 @@ def exponential(v: Array, *, xp: Any) -> Array:
     return xp.concat([xp.cos(half), geometry.sinc(half, xp=xp) * u], axis=0)
 
 
+def turned(q: Array, v: Array, *, xp: Any) -> Array:
+    """q * Exp(v), of unit norm: attitudes (4, n), which are nearly so, turned by rotation vectors (3, n).
+
+    What is added to q is q (Exp(v) - 1), with cos(h) - 1 = -h^2 sinc(h/2)^2 / 2 for the half turn h, and then
+    what brings the norm back, q (1 - |q|^2) / 2. Both are small where the turn is, so that in words of few
+    bits only their sum is rounded to the last bit of q.
+    """
+    u = 0.5 * v
+    squared = xp.sum(u * u, axis=0, keepdims=True)
+    half = xp.sqrt(squared)
+    quarter = geometry.sinc(0.5 * half, xp=xp)
+    by = xp.concat([-0.5 * squared * (quarter * quarter), geometry.sinc(half, xp=xp) * u], axis=0)
+    q = q + multiply(q, by, xp=xp)
+    return q + q * (0.5 - 0.5 * xp.sum(q * q, axis=0))
+
+
 def rotation_matrices(q: Array, *, xp: Any) -> Array:
     """The rotation matrices (3, 3, n), body to world (Solà eq. 115)."""
     return xp.reshape(xp.asarray(_MATRIX, dtype=q.dtype) @ _squares(q, xp), (3, 3, q.shape[-1]))
@@ -99,17 +119,26 @@ def rotate(q: Array, v: Array, *, xp: Any) -> Array:
     return v[:, None] + q[:1, :] * t[:, 0, :] + cross(u, t, xp=xp)[:, 0, :]
 
 
-def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:
-    """Log(q^-1 * z): the rotation vectors (3, n) in rad, at most pi long, from attitudes (4, n) to z (4)."""
+def relative_to(q: Array, z: Array, *, xp: Any) -> Array:
+    """q^-1 * z: what turns attitudes (4, n) to z (4)."""
     to_z = geometry.right_product(z, xp=xp) * xp.asarray(_CONJUGATE, dtype=q.dtype)
-    relative = to_z @ q
-    w, v = relative[:1, :], relative[1:, :]
+    return to_z @ q
+
+
+def rotation_vectors(q: Array, *, xp: Any) -> Array:
+    """Log: the rotation vectors (3, n) in rad, at most pi long, of quaternions (4, n)."""
+    w, v = q[:1, :], q[1:, :]
     squared = xp.sum(v * v, axis=0, keepdims=True)
     small = squared < 1e-10
     sine = xp.sqrt(xp.where(small, 1.0, squared))
     # near zero: 2 asin(s)/s, with s^2 << 1; a series, so that the ratio is never 0/0
     scale = xp.where(small, 2.0 + squared / 3.0, 2.0 * xp.atan2(sine, xp.abs(w)) / sine)
     return xp.where(w < 0.0, -scale, scale) * v
+
+
+def rotation_vectors_to(q: Array, z: Array, *, xp: Any) -> Array:
+    """Log(q^-1 * z): the rotation vectors (3, n) in rad, at most pi long, from attitudes (4, n) to z (4)."""
+    return rotation_vectors(relative_to(q, z, xp=xp), xp=xp)
 
 
 def cross(a: Array, B: Array, *, xp: Any) -> Array:
@@ -148,3 +177,23 @@ def inverse_and_log_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
     y, x = 1.0 / second - c * zy, 1.0 / first + a * a / second + corner * zx
     inverse = xp.stack([xp.stack([x, yx, zx]), xp.stack([yx, y, zy]), xp.stack([zx, zy, z])])
     return inverse, xp.log(first) + xp.log(second) + xp.log(third)
+
+
+def solve_and_log_determinant(S: Array, B: Array, *, xp: Any) -> tuple[Array, Array]:
+    """S^-1 B (3, m, n) and log det S (n) of symmetric positive matrices S (3, 3, n), by L D L^T.
+
+    Forward through L, divided by D, back through L^T: each quotient is of the size of its own column, where
+    an inverse has one size for all, and loses in words of few bits what a column has beside a large pivot.
+    """
+    first = S[0, 0, :]
+    a, b = S[1, 0, :] / first, S[2, 0, :] / first
+    second = S[1, 1, :] - a * S[1, 0, :]
+    rest = S[2, 1, :] - b * S[1, 0, :]
+    c = rest / second
+    third = S[2, 2, :] - b * S[2, 0, :] - c * rest
+    x, y, z = B[0, :, :], B[1, :, :], B[2, :, :]
+    y = y - a * x
+    z = (z - b * x - c * y) / third
+    y = y / second - c * z
+    x = x / first - a * y - b * z
+    return xp.stack([x, y, z]), xp.log(first) + xp.log(second) + xp.log(third)

@@ -14,6 +14,7 @@ numbers below are his.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -178,9 +179,13 @@ def level(nearest: Array, specific_force: Array, *, xp: Any) -> Array:
     return normalize(multiply(between_vectors(upright, up, xp=xp), nearest, xp=xp), xp=xp)
 
 
-def parted(e: Array, *, xp: Any) -> tuple[Array, Array]:
-    """Tilt and heading (...) in rad of a rotation (..., 4); see `tilt_and_heading`."""
-    tilt = 2.0 * xp.atan2(xp.hypot(e[..., 1], e[..., 2]), xp.hypot(e[..., 0], e[..., 3]))
+def parted(e: Array, *, xp: Any, hypot: Callable[[Array, Array], Array] | None = None) -> tuple[Array, Array]:
+    """Tilt and heading (...) in rad of a rotation (..., 4); see `tilt_and_heading`.
+
+    hypot: in place of `xp.hypot`, where lengths are far from overflow.
+    """
+    hypot = hypot or xp.hypot
+    tilt = 2.0 * xp.atan2(hypot(e[..., 1], e[..., 2]), hypot(e[..., 0], e[..., 3]))
     sign = xp.where(e[..., 0] < 0.0, -1.0, 1.0)
     return tilt, 2.0 * xp.atan2(sign * e[..., 3], xp.abs(e[..., 0]))
 

@@ -141,13 +141,13 @@ def _back_in_turn(steps: LinearSteps, means: Array, covariances: Array, xp: Any)
 # -- all at once -------------------------------------------------------------------------------------
 
 
-def scanned(join: Callable[[Any, Any], Any], parts: Sequence[Array], xp: Any) -> list[Array]:
+def associative_scan(join: Callable[[Any, Any], Any], parts: Sequence[Array], xp: Any) -> list[Array]:
     """All prefixes of stacks of elements under a join that is associative: log2 of their number rounds."""
     count = parts[0].shape[0]
     if count < 2:
         return list(parts)
     even, odd = [p[: count - 1 : 2] for p in parts], [p[1::2] for p in parts]
-    joined = scanned(join, join(even, odd), xp)  # prefixes that end at odd places
+    joined = associative_scan(join, join(even, odd), xp)  # prefixes that end at odd places
     if count == 2:
         rest = [p[:1] for p in parts]
     else:
@@ -198,7 +198,7 @@ def _joined(steps: LinearSteps, mean: Array, covariance: Array, xp: Any) -> tupl
             _half(right @ L @ A, xp) + J,
         ]
 
-    found = scanned(join, parts, xp)
+    found = associative_scan(join, parts, xp)
     return found[1], found[2]
 
 
@@ -217,5 +217,5 @@ def _joined_back(steps: LinearSteps, means: Array, covariances: Array, xp: Any) 
         (B, c, D), (A, b, C) = j, i  # j comes later: the stacks are turned round
         return [A @ B, _by(A, c) + b, _half(A @ D @ _t(A, xp), xp) + C]
 
-    found = scanned(join, [xp.flip(p, axis=0) for p in parts], xp)
+    found = associative_scan(join, [xp.flip(p, axis=0) for p in parts], xp)
     return xp.flip(found[1], axis=0), xp.flip(found[2], axis=0)

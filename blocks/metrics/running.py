@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Scalar, Stream, block, latest
-from flowgraph.blocks.geometry.rotations import conjugate, multiply, to_matrix, to_rotation_vector
+from flowgraph.blocks.geometry.rotations import conjugate, multiply, parted, to_matrix, to_rotation_vector
 from flowgraph.blocks.metrics.chi_square import chi_square, chi_square_band
 from flowgraph.blocks.signals import (
     Bounds,
@@ -142,7 +142,8 @@ def pose_sums(
     back = conjugate(q, xp=xp)
     turn = to_rotation_vector(multiply(back, truth.attitude, xp=xp), xp=xp)
     off = multiply(q, conjugate(truth.attitude, xp=xp), xp=xp)
-    tilt, heading = (_DEGREES * angle for angle in _tilt_and_heading(off, xp))
+    root = lambda a, b: xp.sqrt(a * a + b * b)  # of a unit quaternion, which needs no more care
+    tilt, heading = (_DEGREES * angle for angle in parted(off, xp=xp, hypot=root))
     R = to_matrix(q, xp=xp)
     variances = xp.concat([_diagonal(P[:3, :3], xp), xp.sum((R @ P[6:9, 6:9]) * R, axis=-1)])
     offs = xp.concat([place, (R @ turn[:, None])[:, 0]])
@@ -177,14 +178,6 @@ def _no_sums() -> PoseSums:
 @pose_sums.init
 def _(estimate: Any = None, truth: Any = None, *, settle: int, band: Array) -> PoseSums:
     return _no_sums()
-
-
-def _tilt_and_heading(e: Array, xp: Any) -> tuple[Array, Array]:
-    """Those of `parted`, of a unit quaternion (4): its roots need no care for what is large or small."""
-    square = e * e
-    across, along = xp.sqrt(square[1] + square[2]), xp.sqrt(square[0] + square[3])
-    sign = xp.where(e[0] < 0.0, -1.0, 1.0)
-    return 2.0 * xp.atan2(across, along), 2.0 * xp.atan2(sign * e[3], xp.abs(e[0]))
 
 
 def _diagonal(P: Array, xp: Any) -> Array:

@@ -254,14 +254,18 @@ def quaternion_noise(q: Array, density: float, dt: Any, xp: Any) -> Array:
     return apart.mT @ apart / 6.0
 
 
+_UNSURE = (0.7, 0.7, 0.3)
+"""Deviations of velocity, position and attitude at a start of which nothing else is said: m/s, m, rad."""
+
+
 def start_pose(
     position: npt.ArrayLike,
     attitude: npt.ArrayLike,
     *,
     velocity: npt.ArrayLike = (0.0, 0.0, 0.0),
-    position_deviation: float = 0.7,
-    velocity_deviation: float = 0.7,
-    attitude_deviation: float = 0.3,
+    position_deviation: float = _UNSURE[1],
+    velocity_deviation: float = _UNSURE[0],
+    attitude_deviation: float = _UNSURE[2],
 ) -> QuaternionBelief:
     """A belief to start from, with standard deviations in m, m/s and rad (about each body axis)."""
     v, p, q = (np.asarray(x, dtype=float) for x in (velocity, position, attitude))
@@ -270,7 +274,7 @@ def start_pose(
 
 @block
 def pose_at_start(
-    pose: Pose, *, deviations: tuple[float, float, float] = (0.7, 0.7, 0.3), xp: Any
+    pose: Pose, *, deviations: tuple[float, float, float] = _UNSURE, xp: Any
 ) -> QuaternionBelief:
     """`start_pose` at a measured pose and at rest; deviations in m/s, m and rad."""
     return _started(0.0 * pose.position, pose.position, pose.attitude, deviations, xp)

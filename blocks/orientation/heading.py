@@ -132,6 +132,11 @@ def _fresh(*_: Any, **__: Any) -> Any:
     return np.float64(0.0)
 
 
+_LONG = 10**13
+"""ns; whoever waits longer than this has had no reading. Told in whole numbers: a word that holds the time
+since before all time has no bits for the time between two readings."""
+
+
 @block
 def update_heading(  # type: ignore[no-untyped-def]
     state,
@@ -165,8 +170,9 @@ def update_heading(  # type: ignore[no-untyped-def]
     if field is None:
         return state, prior
     kind = prior.angle.dtype
-    dt = xp.astype(t - state["time"], kind) * 1e-9
-    dt = xp.where(dt > 1e4, 0.0 * dt, dt)  # the first reading comes after no time
+    since = t - state["time"]
+    since = xp.where(since > _LONG, 0 * since, since)  # the first reading comes after no time
+    dt = xp.astype(since, kind) * 1e-9
     m = rotate(level.attitude, field.field, xp=xp)
     flat = xp.sqrt(m[..., 0] ** 2 + m[..., 1] ** 2)
     strength = xp.sqrt(xp.linalg.vecdot(m, m))

@@ -31,6 +31,7 @@ from flowgraph.blocks.geometry.rotations import (
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
 from flowgraph.blocks.outdoor.flight import OutdoorStart
+from flowgraph.blocks.outdoor.layout import BELIEF, belief_layout
 from flowgraph.blocks.signals import Belief, Gaussian, Imu, OpticalFlow, PoseBelief
 
 __all__ = [
@@ -64,26 +65,18 @@ BIASED = StateSpace(*OUTDOOR.parts, euclidean(3), euclidean(3))
 FLOW = StateSpace(euclidean(3), quaternion())
 """What optical flow measures: displacement (m) and turn."""
 
-_CLONES = np.eye(15, 6, -9)  # they stay
-_STAY = np.eye(12, 21, 9)  # clones and biases
-_POSE = [*range(9), *range(15, 21)]  # of the errors, those of now
-
-
-def _taken(size: int) -> np.ndarray:
-    """T (size, size) of a new picture: the errors of now become those of the clone."""
-    T = np.eye(size)
-    T[9:15] = 0.0
-    T[9:12, :3] = T[12:15, 6:9] = np.eye(3)
-    return T
+_COPIED = {"picture_position": "position", "picture_attitude": "attitude"}
+"""What a new picture makes of the clones."""
 
 
 def outdoor_space(mean: Array) -> StateSpace:
     """That of a state (17 or 23)."""
-    return OUTDOOR if mean.shape[-1] == 17 else BIASED
+    return BIASED if belief_layout(mean).biased else OUTDOOR
 
 
 def _parts(x: Array) -> tuple[Array, Array, Array, Array, Array]:
-    return x[..., 0:3], x[..., 3:6], x[..., 6:10], x[..., 10:13], x[..., 13:17]
+    p, v, q, p0, q0 = (x[..., at] for at in BELIEF.means.values())
+    return p, v, q, p0, q0
 
 
 def _times(M: Array, v: Array) -> Array:
@@ -114,23 +107,22 @@ def predict_clone(
         imu: rad/s and m/s^2, body.
         noise: densities; of the walks only where there are biases.
     """
-    x = belief.mean
-    p, v, q, p0, q0 = _parts(x)
+    x, layout = belief.mean, belief_layout(belief.mean)
+    p, v, q, _, _ = _parts(x)
     kind = q.dtype
     imu = _unbiased(x, imu)
     half, middle, R, back = _half_way(q, imu, dt, xp)
     step = (_times(R, imu.specific_force) + xp.asarray(gravity, dtype=kind)) * dt
     F = _clone_jacobian(x, R, back, imu, dt, xp)
-    power = np.repeat([0.0, noise.accelerometer**2, noise.gyro**2, 0.0, 0.0], 3)
-    stays = [p0, q0]
-    if x.shape[-1] > 17:
-        power = np.append(power, np.repeat([noise.gyro_bias**2, noise.accelerometer_bias**2], 3))
-        stays = [x[..., 10:]]
+    power = layout.diagonal(
+        velocity=noise.accelerometer**2, attitude=noise.gyro**2,
+        gyro_bias=noise.gyro_bias**2, accelerometer_bias=noise.accelerometer_bias**2,
+    )  # fmt: skip
     Q = xp.asarray(np.diag(power), dtype=kind) * (0.5 * dt)
     P = F @ (belief.covariance + Q) @ F.mT + Q
     turned = normalize(multiply(middle, half, xp=xp), xp=xp)
     return Gaussian(
-        mean=xp.concat([p + (v + 0.5 * step) * dt, v + step, turned, *stays], axis=-1),
+        mean=xp.concat([p + (v + 0.5 * step) * dt, v + step, turned, x[..., 10:]], axis=-1),
         covariance=0.5 * (P + P.mT),
     )
 
@@ -149,9 +141,11 @@ def clone_transition(x: Array, imu: Imu, dt: Any, xp: Any) -> Array:
 
 def _unbiased(x: Array, imu: Imu) -> Imu:
     """The reading less the biases of the state, where it has any."""
-    if x.shape[-1] == 17:
+    layout = belief_layout(x)
+    if not layout.biased:
         return imu
-    return Imu(gyro=imu.gyro - x[..., 17:20], specific_force=imu.specific_force - x[..., 20:23])
+    gyro, force = (x[..., layout.means[name]] for name in ("gyro_bias", "accelerometer_bias"))
+    return Imu(gyro=imu.gyro - gyro, specific_force=imu.specific_force - force)
 
 
 def _half_way(q: Array, imu: Imu, dt: Any, xp: Any) -> tuple[Array, Array, Array, Array]:
@@ -165,22 +159,19 @@ def _clone_jacobian(x: Array, R: Array, back: Array, imu: Imu, dt: Any, xp: Any)
     """F (15, 15) of `predict_clone`, or (21, 21), by a reading less its biases."""
     pull = R @ skew(imu.specific_force * -dt, xp=xp) @ back
     one, zero = 0.0 * R + xp.eye(3, dtype=R.dtype), 0.0 * R
-    wide = xp.concat([zero, zero], axis=-1)
-    if x.shape[-1] > 17:  # a turn loses half of a bias's by the middle of the step
-        pushed = xp.concat([wide, pull * (-0.5 * dt), R * -dt], axis=-1)
-        rows = [
-            xp.concat([one, one * dt, pull * (0.5 * dt), pushed * (0.5 * dt)], axis=-1),
-            xp.concat([zero, one, pull, pushed], axis=-1),
-            xp.concat([zero, zero, back @ back, wide, back * -dt, zero], axis=-1),
-        ]
-        stay = xp.asarray(_STAY, dtype=R.dtype)
-        return xp.concat([*rows, xp.broadcast_to(stay, (*R.shape[:-2], 12, 21))], axis=-2)
+    layout, clones = belief_layout(x), [zero, zero]
+    pushed: list[Array] = []
+    turned: list[Array] = []
+    if layout.biased:  # a turn loses half of a bias's by the middle of the step
+        pushed, turned = [pull * (-0.5 * dt), R * -dt], [back * -dt, zero]
+    stay = xp.asarray(np.eye(layout.directions)[9:], dtype=R.dtype)
     rows = [
-        xp.concat([one, one * dt, pull * (0.5 * dt), wide], axis=-1),
-        xp.concat([zero, one, pull, wide], axis=-1),
-        xp.concat([zero, zero, back @ back, wide], axis=-1),
+        xp.concat([one, one * dt, pull * (0.5 * dt), *clones, *(m * (0.5 * dt) for m in pushed)], axis=-1),
+        xp.concat([zero, one, pull, *clones, *pushed], axis=-1),
+        xp.concat([zero, zero, back @ back, *clones, *turned], axis=-1),
+        xp.broadcast_to(stay, (*R.shape[:-2], *stay.shape)),
     ]
-    return xp.concat([*rows, xp.asarray(_CLONES.T, dtype=R.dtype)], axis=-2)
+    return xp.concat(rows, axis=-2)
 
 
 class PositionObserver:
@@ -245,9 +236,10 @@ def new_picture(belief: Gaussian, flow: OpticalFlow | None, *, xp: Any) -> Gauss
 
 def picture_taken(x: Array, xp: Any) -> tuple[Array, Array]:
     """The state whose clone is its own pose, and T (15, 15), or (21, 21)."""
-    p, v, q, _, _ = _parts(x)
-    biases, size = ([], 15) if x.shape[-1] == 17 else ([x[..., 17:]], 21)
-    return xp.concat([p, v, q, p, q, *biases], axis=-1), xp.asarray(_taken(size), dtype=x.dtype)
+    layout, (p, v, q, _, _) = belief_layout(x), _parts(x)
+    biases = [x[..., 17:]] if layout.biased else []
+    mean = xp.concat([p, v, q, p, q, *biases], axis=-1)
+    return mean, xp.asarray(layout.copied(_COPIED), dtype=x.dtype)
 
 
 @block
@@ -272,13 +264,14 @@ def outdoor_navigation(belief: Gaussian, *, xp: Any) -> Belief:
     """What is believed of now and of the biases, without the clones."""
     x, P = belief.mean, belief.covariance
     p, v, q, _, _ = _parts(x)
-    pick = xp.asarray(np.eye(21)[_POSE], dtype=P.dtype)
+    at = belief_layout(x).means
+    pick = xp.asarray(np.eye(21)[[*range(9), *range(15, 21)]], dtype=P.dtype)  # of now, and the biases
     return Belief(
         position=p,
         velocity=v,
         attitude=q,
-        gyro_bias=x[..., 17:20],
-        accelerometer_bias=x[..., 20:23],
+        gyro_bias=x[..., at["gyro_bias"]],
+        accelerometer_bias=x[..., at["accelerometer_bias"]],
         covariance=pick @ P @ pick.mT,
     )
 
@@ -300,12 +293,14 @@ def start_outdoor(start: OutdoorStart, *, biases: bool = False) -> Gaussian:
 
     biases: whether there are any; they are zero, as far as the start's spread says.
     """
-    R, spread, size = np.asarray(to_matrix(start.attitude, xp=np)), start.spread, 21 if biases else 15
-    P = np.zeros((size, size))
-    P[:3, :3], P[3:6, 3:6] = np.eye(3) * spread.position**2, np.eye(3) * spread.velocity**2
+    R, spread = np.asarray(to_matrix(start.attitude, xp=np)), start.spread
+    mean = np.concatenate([start.position, np.zeros(3), start.attitude, start.position, start.attitude])
+    mean = np.append(mean, np.zeros(6)) if biases else mean
+    layout = belief_layout(mean)
+    P = np.diag(np.square(layout.diagonal(
+        position=spread.position, velocity=spread.velocity,
+        gyro_bias=spread.gyro_bias, accelerometer_bias=spread.accelerometer_bias,
+    )))  # fmt: skip
     P[6:9, 6:9] = R.T @ np.diag(np.square([spread.tilt, spread.tilt, spread.heading])) @ R
-    pose = [start.position, np.zeros(3), start.attitude, start.position, start.attitude]
-    if biases:
-        P[15:, 15:] = np.diag(np.repeat(np.square([spread.gyro_bias, spread.accelerometer_bias]), 3))
-        pose.append(np.zeros(6))
-    return Gaussian(mean=np.concatenate(pose), covariance=_taken(size) @ P @ _taken(size).T)
+    copied = layout.copied(_COPIED)
+    return Gaussian(mean=mean, covariance=copied @ P @ copied.T)

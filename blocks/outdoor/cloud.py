@@ -23,6 +23,8 @@ by local linearisation); for the sensors: R. Fiszel's thesis on reactive pose es
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from typing import Any
 
@@ -33,6 +35,7 @@ from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.outdoor.flight import OutdoorStart
+from flowgraph.blocks.outdoor.layout import PARTICLE, Layout, particle_layout
 from flowgraph.blocks.particles.cloud import cloud_belief, start_cloud
 from flowgraph.blocks.signals import (
     Ancestors,
@@ -63,30 +66,25 @@ __all__ = [
     "turned",
 ]
 
-VELOCITY, POSITION, MOVED, TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-GYRO_BIAS, ACCELEROMETER_BIAS = slice(12, 15), slice(15, 18)
+VELOCITY, POSITION, MOVED, TURN, GYRO_BIAS, ACCELEROMETER_BIAS = PARTICLE.with_biases().errors.values()
 """Where each stands in a covariance. The means have no turn, which is zero: biases come three before."""
 
-
-def _blocks(entries: dict[tuple[int, int], float]) -> np.ndarray:
-    """A (12, 12) matrix of multiples of I (3, 3), by block: velocity, position, displacement, turn."""
-    small = np.zeros((4, 4))
-    for at, value in entries.items():
-        small[at] = value
-    return np.kron(small, np.eye(3))
+_MOVING = ("position", "moved")
 
 
-_WHITE = (
-    _blocks({(0, 0): 1.0}),
-    _blocks({(0, 1): 0.5, (0, 2): 0.5, (1, 0): 0.5, (2, 0): 0.5}),
-    _blocks({(i, j): 1.0 / 3.0 for i in (1, 2) for j in (1, 2)}),
-)
-"""What white noise on the acceleration leaves: the coefficients of dt, dt^2 and dt^3."""
+@functools.cache
+def _white(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What white noise on the acceleration leaves: the coefficients of dt, dt^2 and dt^3."""
+    both = itertools.product(_MOVING, repeat=2)
+    mixed = {pair: 0.5 for m in _MOVING for pair in (("velocity", m), (m, "velocity"))}
+    return (
+        layout.blocks({("velocity", "velocity"): 1.0}),
+        layout.blocks(mixed),
+        layout.blocks(dict.fromkeys(both, 1.0 / 3.0)),
+    )
 
-_WHITE_TURN = _blocks({(3, 3): 1.0})
-"""What white noise on the rate leaves: the coefficient of dt."""
 
-_KEPT = np.repeat([1.0, 1.0, 0.0, 0.0, 1.0, 1.0], 3)
+_KEPT = {"velocity": 1.0, "position": 1.0, "gyro_bias": 1.0, "accelerometer_bias": 1.0}
 """What of the state outlives a picture."""
 
 _MOTION_OF_POSE = np.eye(9, 12, 0)[[3, 4, 5, 0, 1, 2, 6, 7, 8]] * (np.arange(9) < 6)[:, None]
@@ -129,51 +127,34 @@ def predict_outdoor(
         imu: the reading that held since then: rad/s and m/s^2, body.
         noise: densities; of the walks only where there are biases.
     """
-    kind = cloud.motion.dtype
-    if cloud.covariance.shape[0] > 12:
-        return _predict_biased(cloud, imu, noise, gravity, dt, xp)
-    half = lanes.exponential((0.5 * dt) * imu.gyro[:, None], xp=xp)
-    middle = lanes.multiply(cloud.attitude, half, xp=xp)
-    attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
-    force = lanes.rotate(middle, imu.specific_force, xp=xp)
-    step = (force + xp.asarray(gravity, dtype=kind)[:, None]) * dt
-    path = (cloud.motion[VELOCITY, :] + 0.5 * step) * dt
-    W, W2, W3 = (xp.asarray(table * noise.accelerometer**2, dtype=kind) for table in _WHITE)
-    Q = (W + (W2 + W3 * dt) * dt) * dt
-    N = xp.asarray(_WHITE_TURN * (0.5 * noise.gyro**2), dtype=kind) * dt
-    wide = cloud.covariance + N[:, :, None]
-    for _ in range(2):  # F (F P)^T, which is F P F^T
-        wide = lanes.transpose(_advanced(wide, force * dt, dt, xp), xp=xp)
-    return cloud.replace(
-        attitude=attitude,
-        motion=cloud.motion + xp.concat([step, path, path], axis=0),
-        covariance=wide + (N + Q)[:, :, None],
-    )
-
-
-def _predict_biased(
-    cloud: OutdoorCloud, imu: Imu, noise: ImuNoise, gravity: tuple[float, float, float], dt: Any, xp: Any
-) -> OutdoorCloud:
-    """`predict_outdoor` of particles with biases."""
-    kind = cloud.motion.dtype
-    rate = imu.gyro[:, None] - cloud.motion[9:12, :]
+    kind, layout = cloud.motion.dtype, particle_layout(cloud.covariance)
+    rate = imu.gyro[:, None]
+    if layout.biased:
+        rate = rate - cloud.motion[layout.means["gyro_bias"], :]
     half = lanes.exponential((0.5 * dt) * rate, xp=xp)
     middle = lanes.multiply(cloud.attitude, half, xp=xp)
-    R = lanes.rotation_matrices(middle, xp=xp)
-    force = xp.sum(R * (imu.specific_force[:, None] - cloud.motion[12:15, :])[None, :, :], axis=1)
+    attitude = lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp)
+    turn = None
+    if layout.biased:
+        R = lanes.rotation_matrices(middle, xp=xp)
+        own = imu.specific_force[:, None] - cloud.motion[layout.means["accelerometer_bias"], :]
+        force, turn = xp.sum(R * own[None, :, :], axis=1), R * dt
+    else:
+        force = lanes.rotate(middle, imu.specific_force, xp=xp)
     step = (force + xp.asarray(gravity, dtype=kind)[:, None]) * dt
     path = (cloud.motion[VELOCITY, :] + 0.5 * step) * dt
-    white = [np.pad(table, (0, 6)) * noise.accelerometer**2 for table in _WHITE]
-    walks = np.repeat([0.0, 0.0, 0.0, 0.0, noise.gyro_bias**2, noise.accelerometer_bias**2], 3)
+    white = [table * noise.accelerometer**2 for table in _white(layout)]
+    walks = layout.diagonal(gyro_bias=noise.gyro_bias**2, accelerometer_bias=noise.accelerometer_bias**2)
     W, W2, W3 = (xp.asarray(t, dtype=kind) for t in (white[0] + np.diag(walks), white[1], white[2]))
     Q = (W + (W2 + W3 * dt) * dt) * dt
-    N = xp.asarray(np.pad(_WHITE_TURN, (0, 6)) * (0.5 * noise.gyro**2), dtype=kind) * dt
+    N = xp.asarray(np.diag(layout.diagonal(turn=0.5 * noise.gyro**2)), dtype=kind) * dt
     wide = cloud.covariance + N[:, :, None]
-    for _ in range(2):
-        wide = lanes.transpose(_advanced(wide, force * dt, dt, xp, R * dt), xp=xp)
+    for _ in range(2):  # F (F P)^T, which is F P F^T
+        wide = lanes.transpose(_advanced(wide, force * dt, dt, xp, turn), xp=xp)
+    motion = cloud.motion[:9, :] + xp.concat([step, path, path], axis=0)
     return cloud.replace(
-        attitude=lanes.normalize(lanes.multiply(middle, half, xp=xp), xp=xp),
-        motion=xp.concat([cloud.motion[:9, :] + xp.concat([step, path, path], axis=0), cloud.motion[9:, :]]),
+        attitude=attitude,
+        motion=xp.concat([motion, cloud.motion[9:, :]], axis=0) if layout.biased else motion,
         covariance=wide + (N + Q)[:, :, None],
     )
 
@@ -218,24 +199,20 @@ def take_picture(cloud: OutdoorCloud, when: Any | None, *, draw: Any, xp: Any) -
         c = with_k / xp.sqrt(xp.maximum(with_k[9 + k, :], _LEAST_VARIANCE))
         state = state + c * deviations[k, :]
         P = P - c[:, None, :] * c[None, :, :]
-    kept = xp.asarray(_KEPT[: P.shape[0]], dtype=P.dtype)
+    layout = particle_layout(P)
+    kept = xp.asarray(layout.diagonal(**_KEPT), dtype=P.dtype)
     attitude = turned(cloud.attitude, state[TURN, :], xp)
     return cloud.replace(
         attitude=attitude,
         picture=attitude,
-        motion=shifted(cloud.motion, state, xp) * _moving(kept, xp)[:, None],
+        motion=shifted(cloud.motion, state, xp) * layout.but("turn", kept, xp)[:, None],
         covariance=P * (kept[:, None] * kept[None, :])[:, :, None],
     )
 
 
 def shifted(motion: Array, state: Array, xp: Any) -> Array:
     """The means (9 or 15, n) after a change of the state (12 or 18, n), but for its turn."""
-    return motion + _moving(state, xp)
-
-
-def _moving(state: Array, xp: Any) -> Array:
-    """Of the state (12 or 18, ...) all but the turn."""
-    return state[:9, ...] if state.shape[0] == 12 else xp.concat([state[:9, ...], state[12:, ...]], axis=0)
+    return motion + particle_layout(state).but("turn", state, xp)
 
 
 def turned(q: Array, e: Array, xp: Any) -> Array:
@@ -273,8 +250,7 @@ def outdoor_belief(
     """
     found = cloud_belief.step(plain, weights, pose, xp=xp)
     kind = pose.attitude.dtype
-    own = xp.sum(cloud.covariance * weights.weight, axis=-1)
-    own = own if own.shape[0] == 12 else own[:12, :12]
+    own = xp.sum(cloud.covariance * weights.weight, axis=-1)[:12, :12]
     R = to_matrix(pose.attitude, xp=xp)
     lift = xp.asarray(_TURN_OF_POSE, dtype=kind)
     turn = lift @ R.mT @ xp.asarray(np.eye(3, 12, 9), dtype=kind)  # (9, 12)
@@ -318,15 +294,16 @@ def start_outdoor_cloud(
     plain = start_cloud(
         particles, seed=seed, position=start.position, attitude=start.attitude, spread=start.spread
     )
-    variance = np.repeat([start.spread.velocity**2, start.spread.position**2, 0.0, 0.0], 3)
-    if biases:
-        known = np.square([start.spread.gyro_bias, start.spread.accelerometer_bias])
-        variance = np.append(variance, np.repeat(known, 3))
-    still = np.zeros((len(variance) - 9, particles))
+    layout, spread = PARTICLE.with_biases() if biases else PARTICLE, start.spread
+    deviations = layout.diagonal(
+        velocity=spread.velocity, position=spread.position,
+        gyro_bias=spread.gyro_bias, accelerometer_bias=spread.accelerometer_bias,
+    )  # fmt: skip
+    still = np.zeros((layout.size - 6, particles))
     return OutdoorCloud(
         log_weight=plain.log_weight,
         attitude=plain.attitude,
         picture=plain.attitude,
         motion=np.concatenate([plain.velocity, plain.position, still]),
-        covariance=np.repeat(np.diag(variance)[:, :, None], particles, axis=2),
+        covariance=np.repeat(np.diag(np.square(deviations))[:, :, None], particles, axis=2),
     )

@@ -21,6 +21,7 @@ from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.geometry.rotations import to_matrix
 from flowgraph.blocks.kalman.lost import PATIENCE, lost_variances
 from flowgraph.blocks.outdoor.cloud import MOVED, POSITION, TURN, as_cloud, shifted, turned
+from flowgraph.blocks.outdoor.layout import particle_layout
 from flowgraph.blocks.particles.cloud import average_attitude, log_sum_exp
 from flowgraph.blocks.particles.lost import judged, mixture, within_reach
 from flowgraph.blocks.signals import (
@@ -256,10 +257,10 @@ def _widened(cloud: OutdoorCloud, weight: Array, grow: Array, gated: _Gated, xp:
     kind = cloud.motion.dtype
     q = average_attitude.step(as_cloud.step(cloud), Weights(weight=weight), xp=xp).attitude
     turn = -lanes.rotation_vectors_to(cloud.attitude, q, xp=xp)  # in the body of the mean
-    n, turn = cloud.covariance.shape[0], to_matrix(q, xp=xp) @ turn
-    apart = xp.concat([cloud.motion, turn] if n == 12 else [cloud.motion[:9, :], turn, cloud.motion[9:, :]])
+    layout = particle_layout(cloud.covariance)
+    apart = layout.put("turn", cloud.motion, to_matrix(q, xp=xp) @ turn, xp)
     apart = apart - (apart @ weight)[:, None]
-    one = xp.asarray(np.eye(n), dtype=kind)
+    one = xp.asarray(np.eye(layout.directions), dtype=kind)
     own = xp.sum(cloud.covariance * one[:, :, None], axis=1)
     variance = (apart * apart + own) @ weight
     wide = lost_variances(

@@ -76,8 +76,7 @@ def propagate_attitude(cloud: Cloud, imu: Imu, *, gyro_noise: float, dt: float, 
     """
     errors = draw.normal("gyro", (3, cloud.log_weight.shape[-1]))
     turn = imu.gyro[:, None] * dt + xp.asarray(errors, dtype=imu.gyro.dtype) * (gyro_noise * xp.sqrt(dt))
-    turned = lanes.multiply(cloud.attitude, lanes.exponential(turn, xp=xp), xp=xp)
-    return cloud.replace(attitude=lanes.normalize(turned, xp=xp))
+    return cloud.replace(attitude=lanes.turned(cloud.attitude, turn, xp=xp))
 
 
 @block
@@ -92,16 +91,18 @@ def attitude_likelihood(cloud: Cloud, pose: Pose, *, noise: float, xp: Any) -> L
     Args:
         noise: standard deviation about each body axis, rad; small, so that the circle does not matter.
     """
-    error = lanes.rotation_vectors_to(cloud.attitude, pose.attitude, xp=xp)
-    error = xp.where(xp.isnan(error), 0.0, error)
     constant = 3.0 * math.log(noise) + 1.5 * math.log(2.0 * math.pi)
-    # who is too far to matter is put aside before the squares that tell: in words that hold the squares of
-    # half turns, the last bit is much beside those of a few degrees
-    squared = xp.sum(error * error, axis=0)
-    nearest = xp.min(squared)
-    near = squared <= nearest + _BEYOND * (2.0 * DEPTH * noise**2)
-    kept = xp.where(near[None, :], error, 0.0)
-    scaled = xp.sum(kept * kept, axis=0) * (-0.5 / noise**2)
+    missing = xp.any(xp.isnan(pose.attitude))
+    measured = xp.where(missing, cloud.attitude[:, 0], pose.attitude)
+    # who is too far to matter is put aside before the numbers that tell: in words that hold half turns and
+    # their squares, the last bit is much beside turns of a few degrees. |e|^2 grows by at least 4 s^2
+    sine = lanes.relative_to(cloud.attitude, measured, xp=xp)[1:, :]
+    squared = xp.sum(sine * sine, axis=0)
+    near = missing | (squared <= xp.min(squared) + _BEYOND * (0.5 * DEPTH * noise**2))
+    kept = xp.where(near[None, :], cloud.attitude, measured[:, None])
+    error = lanes.rotation_vectors(lanes.relative_to(kept, measured, xp=xp), xp=xp)
+    error = xp.where(missing, 0.0, error)
+    scaled = xp.sum(error * error, axis=0) * (-0.5 / noise**2)
     least = xp.min(xp.where(near, scaled, 0.0))
     value = xp.where(near, scaled, least - 2.0 * DEPTH)  # which `within_depth` brings up
     return LogLikelihood(value=within_depth(value - constant, xp=xp))

@@ -120,16 +120,16 @@ def correct_motion(
     residual = xp.where(missing[:, None], 0.0, residual)
     vague = 1e8 * (xp.max(xp.sum(P * one, axis=1), axis=-1) + noise**2)
     r = xp.where(missing, vague, noise**2)[:, None, None]
-    inverse, log_determinant = lanes.inverse_and_log_determinant(P + one * r, xp=xp)
-    u = xp.sum(inverse * residual[None, :, :], axis=1)
-    inverse_C = lanes.matrix_product(inverse, C)
+    known = xp.concat([P, C, residual[:, None, :]], axis=1)
+    solved, log_determinant = lanes.solve_and_log_determinant(P + one * r, known, xp=xp)
+    own, across, u = solved[:, :3, :], solved[:, 3:6, :], solved[:, 6, :]
     distance = xp.sum(residual * u, axis=0)
     corrected = cloud.replace(
         velocity=cloud.velocity + xp.sum(C * u[:, None, :], axis=0),
         position=cloud.position + xp.sum(P * u[None, :, :], axis=1),
-        velocity_covariance=_symmetric(V - lanes.matrix_product(lanes.transpose(C, xp=xp), inverse_C), xp),
-        cross_covariance=r * inverse_C,
-        position_covariance=_symmetric(r * lanes.matrix_product(inverse, P), xp),
+        velocity_covariance=_symmetric(V - lanes.matrix_product(lanes.transpose(C, xp=xp), across), xp),
+        cross_covariance=r * across,
+        position_covariance=_symmetric(r * own, xp),
     )
     log_likelihood = -0.5 * (distance + log_determinant + 3.0 * math.log(2.0 * math.pi))
     return corrected, LogLikelihood(value=within_depth(log_likelihood, xp=xp))

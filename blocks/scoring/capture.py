@@ -28,7 +28,7 @@ def on_capture(
     start: Callable[..., Any],
     believed: Callable[[Any], Gaussian],
     steps: Callable[[Result], Smoothing] | None = None,
-    at_start: tuple[str, Callable[..., Stream[Any]]] | None = None,
+    begin: Callable[..., dict[str, Stream[Any]]] | None = None,
     **settings: Any,
 ) -> Case:
     """A filter without biases on `imu` and `vicon`, at the capture's first pose and at rest.
@@ -39,7 +39,7 @@ def on_capture(
         start: `(position, attitude)`, makes what the graph starts from.
         believed: of that, the belief over position, velocity and attitude.
         steps: what a smoother needs of a result.
-        at_start: a register, and the block that makes of the capture's first pose what it starts from.
+        begin: that of `Case`, where nothing else is told of the start.
         settings: of the graph itself.
     """
     vicon, info = on.inputs["vicon"], on.flight.info
@@ -54,15 +54,11 @@ def on_capture(
         "held": filter.held(on, pose.inputs["imu"]),
     }
 
-    def begin(first: Callable[[str], Any], at: Stream[Any]) -> dict[str, Stream[Any]]:
-        assert at_start is not None
-        return {at_start[0]: at_start[1](first("vicon"), at=at)}
-
     recording = pose_recording(pose.inputs, start=believed(begun), **known)
     return on.case(
         filter.score(on, pose_errors, steps=steps, recording=recording),
         inputs=pose.inputs,
-        begin=None if at_start is None or pose.told else begin,
+        begin=None if pose.told else begin,
         start=begun,
         **known,
         **filter.gating(),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from flowgraph.data.arrival import with_stamps
 from flowgraph.data.flight import Flight
 from flowgraph.data.series import Series, unmasked
+from flowgraph.data.stamps import extreme_steps
 from flowgraph.data.tape import check_stamp, need_near
 from flowgraph.errors import ClockError, DataError, DeclarationError, TypeMismatchError, UnknownNameError
 from flowgraph.language.clock import Timing, aperiodic, nanoseconds, periodic
@@ -25,7 +26,6 @@ from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import StructType, Type, as_value, check_fits, flatten
 
 Inputs = Flight | Mapping[str, Any]
-
 
 NOT_FINITE = ("raise", "absent", "keep")
 """What a value with a NaN or an infinity may be: an error, no event, or data."""
@@ -224,7 +224,7 @@ def _check_after(name: str, time: int, resumed: int) -> None:
 
 def _checked(name: str, series: Series, timing: Timing, before: int = NEVER) -> Series:
     check_finite(name, series)
-    check_times(name, series.time, timing, before)
+    check_times(name, series.time, timing, before, series.steps)
     return series
 
 
@@ -248,16 +248,30 @@ def _not_finite(name: str, time: int, where: str, *, live: bool = False) -> None
     )
 
 
-def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER) -> None:
-    """Check stamps (int64 ns) of one source against its declared clock; `before` is the stamp that came last.
+def check_times(
+    name: str,
+    time: np.ndarray,
+    timing: Timing,
+    before: int = NEVER,
+    extremes: tuple[int, int] | None = None,
+) -> None:
+    """Check stamps (int64 ns) of one source against its declared clock.
+
+    Args:
+        name, time, timing: of the source.
+        before: the stamp that came last.
+        extremes: the shortest and the longest step of these, where they are known.
 
     Raises:
         DataError: out of order, or two at one time. ClockError: not as declared.
     """
-    stamps = time if before == NEVER else np.r_[before, time]
-    steps = np.diff(stamps)
-    least, most = int(steps.min(initial=2**63 - 1)), int(steps.max(initial=0))
+    least, most = extremes or extreme_steps(time)
+    stamps = time
+    if before != NEVER:
+        first, last = extreme_steps(np.array([before, *time[:1]], np.int64))
+        least, most, stamps = min(least, first), max(most, last), np.r_[before, time]
     if least <= 0:
+        steps = np.diff(stamps)
         row = int(np.flatnonzero(steps <= 0)[0])
         need_near(int(stamps[row]), int(stamps[row + 1]))  # a step beyond int64 comes out negative
         twice = steps[row] == 0
@@ -272,6 +286,7 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
         )
     if timing.period is not None:
         if max(timing.period - least, most - timing.period) > timing.jitter:
+            steps = np.diff(stamps)
             row = int(np.flatnonzero(np.abs(steps - timing.period) > timing.jitter)[0])
             raise ClockError(
                 "the data do not keep the declared period",
@@ -293,6 +308,7 @@ def check_times(name: str, time: np.ndarray, timing: Timing, before: int = NEVER
                 fix="leave the phase out, or shift the stamps",
             )
     if timing.max_rate is not None and least < int(1e9 / timing.max_rate):
+        steps = np.diff(stamps)
         row = int(np.flatnonzero(steps < int(1e9 / timing.max_rate))[0])
         raise ClockError(
             "events come closer than the declared highest rate",

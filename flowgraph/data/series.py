@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph.data.frames import frame_of, signal_of, stamps_of
+from flowgraph.data.stamps import extreme_steps, from_dates, settled
 from flowgraph.errors import DataError, UnknownNameError
 from flowgraph.types import (
     DTYPES,
@@ -62,7 +63,7 @@ class Series:
             raise _only_real(f"{name}: time")
         stamps = _array(time, name)
         if stamps.dtype.kind in "mM":
-            stamps = _from_dates(stamps, name)
+            stamps = from_dates(stamps, name)
         if stamps.size and stamps.dtype.kind not in "iu":
             raise DataError(
                 "times must be integer nanoseconds",
@@ -87,7 +88,8 @@ class Series:
                 got=str(stamps.max()),
                 fix="check the unit of the stamps: they are nanoseconds",
             )
-        self.time = stamps.astype(np.int64)
+        self.time = settled(stamps)
+        self._steps: tuple[int, int] | None = None
         self._stamp = None if stamp is None else _true_at(stamp, self.time, name)
         self.name, self.gaps = name, gaps
         self.type = type if type is not None else _one_of(values, name)
@@ -169,6 +171,13 @@ class Series:
     def stamp(self) -> np.ndarray:
         """(n,) int64 ns, when each value was true; `time` where nothing else was said."""
         return self.time if self._stamp is None else self._stamp
+
+    @property
+    def steps(self) -> tuple[int, int]:
+        """The shortest and the longest time from one value to the next, in ns; looked for once."""
+        if self._steps is None or self.time.flags.writeable:
+            self._steps = extreme_steps(self.time)
+        return self._steps
 
     @property
     def is_late(self) -> bool:
@@ -334,21 +343,6 @@ def _only_real(name: str) -> DataError:
         got="a mask of times, whole numbers or booleans",
         fix="leave such rows out, or convert them: values.astype(float)",
     )
-
-
-def _from_dates(stamps: np.ndarray, name: str) -> np.ndarray:
-    """datetime64 or timedelta64 of any unit, as int64 ns; finer ones are cut off."""
-    exact = stamps.astype(f"{stamps.dtype.kind}8[ns]")
-    finer = np.datetime_data(stamps.dtype)[0] in ("ps", "fs", "as")
-    if np.isnat(stamps).any() or (not finer and (exact.astype(stamps.dtype) != stamps).any()):
-        raise DataError(
-            "a time is missing, or beyond what int64 nanoseconds hold",
-            path=name,
-            expected="times from 1677 to 2262, and no NaT",
-            got=f"dtype {stamps.dtype}",
-            fix="drop such rows at the source",
-        )
-    return exact.astype(np.int64)
 
 
 def _one_of(values: Any, name: str) -> Type:

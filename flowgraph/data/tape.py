@@ -10,7 +10,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,32 +21,40 @@ from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
 
 _WIDE = 64
+_FIRST, _MANY = 1024, 32
+Rows = slice | np.ndarray
 
 
 @dataclass(frozen=True)
 class Tape:
-    """Ticks of recorded sources: `time[i]` in ns, and `key[i]` with bit k set where source k is present."""
+    """Ticks of recorded sources: `time[i]` in ns, and `key[i]` with bit k set where source k is present.
+
+    The keys are of the smallest kind of integer that has so many bits.
+    """
 
     time: np.ndarray
     key: np.ndarray
     series: tuple[Series, ...]
+    found: tuple[Rows, ...] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def of(cls, series: tuple[Series, ...]) -> Tape:
         """The ticks of series that are each in order: their times merged, equal ones made one."""
-        time = max((s.time for s in series), key=len, default=np.zeros(0, np.int64))
-        rows = [None if len(s) == len(time) else _rows(time, s.time) for s in series]
-        if not all(np.array_equal(_taken(time, r), s.time) for r, s in zip(rows, series, strict=True)):
+        longest = max(series, key=len, default=None)
+        time = np.zeros(0, np.int64) if longest is None else longest.time
+        rows: list[Any] = [_rows(longest, s) for s in series] if longest is not None else []
+        if any(r is None for r in rows):
             time = np.concatenate([s.time for s in series])
             time.sort(kind="stable")  # merges runs that are sorted already
             time = time[np.concatenate([[True], time[1:] != time[:-1]])]
-            rows = [np.searchsorted(time, s.time) for s in series]
+            time.flags.writeable = False  # outputs share it
+            rows = [_looked_up(time, s.time) for s in series]
         if len(time):
             need_near(int(time[0]), int(time[-1]))
-        key = np.zeros(len(time), np.int64)
+        key = np.zeros(len(time), bits(len(series)))
         for k, r in enumerate(rows):
-            key[... if r is None else r] |= 1 << k
-        return cls(time, key, series)
+            key[r] |= 1 << k
+        return cls(time, key, series, tuple(rows))
 
     def first(self, ticks: int) -> Tape:
         """The tape of the first ticks alone."""
@@ -60,13 +68,35 @@ class Tape:
         return Tape(self.time[first:last], key, series)
 
     @property
+    def rows(self) -> tuple[Rows, ...]:
+        """For each source at which ticks it is present: a slice where that is each n-th, or their places."""
+        if self.found is not None:
+            return self.found
+        return tuple(np.flatnonzero(self.key >> k & 1) for k in range(len(self.series)))
+
+    @property
     def patterns(self) -> tuple[int, ...]:
         """The keys that occur, in order."""
-        if len(self.series) > 16:
-            return tuple(np.unique(self.key).tolist())
-        seen = np.zeros(1 << len(self.series), bool)
-        seen[self.key] = True
-        return tuple(np.flatnonzero(seen).tolist())
+        return patterns_of(self.key)
+
+
+def bits(sources: int) -> Any:
+    """The smallest kind of integer with a bit for each of so many sources."""
+    return next((k for k in (np.uint8, np.uint16, np.uint32) if np.iinfo(k).bits >= sources), np.int64)
+
+
+def patterns_of(key: np.ndarray) -> tuple[int, ...]:
+    """The keys that occur, in order: those at the start, and what else is found behind."""
+    found: set[int] = set()
+    while len(key):
+        found.update(key[:_FIRST].tolist())
+        if len(found) > _MANY:
+            return tuple(sorted(found.union(np.unique(key).tolist())))
+        others = np.ones(len(key), dtype=bool)
+        for known in found:
+            others &= key != known
+        key = key[others]
+    return tuple(sorted(found))
 
 
 def check_stamp(name: str, time: Any) -> int:
@@ -110,8 +140,39 @@ def need_near(first: int, time: int) -> None:
         )
 
 
-def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Where `some` times lie among all; counted where these are equally far apart, and else looked for."""
+def _rows(every: Series, some: Series) -> Rows | None:
+    """Where the times of some values lie among those of a longer series; None if one is not there."""
+    time, wanted = every.time, some.time
+    if wanted is time or (len(wanted) == len(time) and np.array_equal(wanted, time)):
+        return slice(None)
+    if _is_even(every) and _is_even(some):
+        return _each_nth(int(wanted[0]) - int(time[0]), some.steps[0], len(wanted), every)
+    if len(wanted) > 1:
+        first, second = np.searchsorted(time, wanted[:2]).tolist()
+        ticks = slice(first, first + (second - first) * len(wanted), max(second - first, 1))
+        if np.array_equal(time[ticks], wanted):
+            return ticks
+    rows = _looked_up(time, wanted)
+    return rows if np.array_equal(time.take(rows, mode="clip"), wanted) else None
+
+
+def _is_even(series: Series) -> bool:
+    """Whether its times are equally far apart."""
+    least, most = series.steps
+    return least == most > 0
+
+
+def _each_nth(after: int, period: int, count: int, every: Series) -> slice | None:
+    """The ticks of `count` values, the first `after` that of an even series; None where one has none."""
+    first, past = divmod(after, every.steps[0])
+    step, rest = divmod(period, every.steps[0])
+    if past or rest or first < 0 or first + step * (count - 1) >= len(every):
+        return None
+    return slice(first, first + step * count, step)
+
+
+def _looked_up(time: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Rows of `some` times among all; counted where these are equally far apart, and else looked for."""
     if len(time) > 1 and len(some) and time[0] <= some[0] and some[-1] <= time[-1]:
         step = (int(time[-1]) - int(time[0])) // (len(time) - 1)
         if step > 0 and int(time[-1]) - int(time[0]) < 2**63:
@@ -119,11 +180,6 @@ def _rows(time: np.ndarray, some: np.ndarray) -> np.ndarray:
             if rows[-1] < len(time) and np.array_equal(time.take(rows, mode="clip"), some):
                 return np.asarray(rows)
     return np.searchsorted(time, some)
-
-
-def _taken(time: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
-    """`time[rows]`; all of it without rows, and the last where a row is past the end."""
-    return time if rows is None else time.take(rows, mode="clip")
 
 
 def tape(
@@ -141,7 +197,7 @@ def tape(
         s.time is other.time or np.array_equal(s.time, other.time)
         for s, other in zip(series, like.series, strict=True)
     ):
-        return Tape(like.time, like.key, series)
+        return Tape(like.time, like.key, series, like.found)
     return Tape.of(series)
 
 

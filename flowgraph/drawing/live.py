@@ -102,6 +102,12 @@ class LiveServer:
             self._changed.notify_all()
         return viewer
 
+    def answer(self, viewer: queue.Queue[bytes | None], message: bytes) -> None:
+        """To one viewer, where its queue has room; as all that fills a queue, while nothing else does."""
+        with self._changed:
+            if not viewer.full():
+                viewer.put_nowait(message)
+
     def left(self, viewer: queue.Queue[bytes | None]) -> None:
         with self._changed:
             if viewer in self._viewers:
@@ -202,8 +208,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return
             mask = self.rfile.read(4)
             sent = bytes(b ^ mask[k % 4] for k, b in enumerate(self.rfile.read(size)))
-            if kind == _PING and not viewer.full():
-                viewer.put_nowait(frame(sent, _PONG))
+            if kind == _PING:
+                self.server.live.answer(viewer, frame(sent, _PONG))
 
 
 def _put_newest(viewer: queue.Queue[bytes | None], message: bytes | None) -> None:

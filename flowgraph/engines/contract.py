@@ -244,12 +244,3 @@ class PipelineEngine(Engine):
 def real_leaves(series: Series, real: Any) -> list[np.ndarray]:
     """The leaves of a series, with its real numbers in the dtype of a run."""
     return [a.astype(real, copy=False) if a.dtype.kind == "f" else a for a in series.leaves.values()]
-
-
-def dense(leaf: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """One row a tick: `leaf` where `at` is true, zero elsewhere."""
-    if len(leaf) == len(at):
-        return leaf
-    full = np.zeros((len(at), *leaf.shape[1:]), leaf.dtype)
-    full[at] = leaf
-    return full

@@ -161,9 +161,9 @@ class Live:
         arrived = perf_counter_ns()
         checked = self._entrance.events(time, values)
         places = [self._names.index(name) for name, _, _ in checked]
-        if not self._queued.locked() and self._boxes.have_room(places):
-            return self._put(checked, arrived, None)
-        async with self._queued:
+        async with self._queued:  # at once where nobody waits for it: its waiters come first
+            if self._boxes.have_room(places):
+                return self._put(checked, arrived, None)
             return await asyncio.to_thread(self._put, checked, arrived, None)
 
     def play(self, inputs: Inputs, *, speed: float = 1.0) -> int:

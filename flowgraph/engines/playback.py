@@ -71,7 +71,7 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     run = Playback(
         pipeline,
         start.cells,
-        gaps_of(events, [p.name for p in pipeline.inputs]),
+        lambda: gaps_of(events, [p.name for p in pipeline.inputs]),
         lambda: events,
         lambda ticks: played(events.first(ticks)),
     )

@@ -42,14 +42,14 @@ class Playback:
     Args:
         pipeline: what was played; None for a graph that cannot be lowered.
         cells: its register cells at the start.
-        gaps: the inputs, by name, whose leaf (by place) may hold a NaN.
+        gaps: gives the inputs, by name, whose leaf (by place) may hold a NaN.
         tape: gives the ticks.
         again: plays the first n ticks without looking; None where that would do things a second time.
     """
 
     pipeline: Pipeline | None
     cells: Sequence[Any]
-    gaps: Mapping[str, Sequence[bool]]
+    gaps: Callable[[], Mapping[str, Sequence[bool]]]
     tape: Callable[[], Tape]
     again: Callable[[int], Result] | None
 
@@ -148,7 +148,7 @@ def _made(outputs: list[Astray], registers: list[Astray], run: Playback) -> list
     """Those that an operation of the pipeline made."""
     if run.pipeline is None or not (outputs or registers):
         return [*outputs, *registers]
-    ours, moved = moved_leaves(run.pipeline, run.cells, run.gaps)
+    ours, moved = moved_leaves(run.pipeline, run.cells, run.gaps())
     return [f for f in outputs if ours.get(f.place)] + [f for f in registers if moved.get(f.place)]
 
 

@@ -170,24 +170,14 @@ def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
         if flag is not None and env.get(flag, True):
             taken.update(dict.fromkeys(leaves, True))
     for i in others:
-        mask = taken.get(i.out)
-        if mask is None:
+        mask = taken.get(i.out, False)
+        if mask is not True and not np.any(mask):
             continue
-        if i.op == "where":
-            chosen = np.asarray(env[i.args[0]], bool)
-            masks = [mask, chosen & mask, ~chosen & mask]
-        else:
-            masks = [mask if i.op in ELEMENTWISE else True] * len(i.args)
-        for a, m in zip(i.args, masks, strict=True):
-            before = taken.get(a)
-            if before is True:
-                continue
-            if m is not True:
-                m = _reduced(np.broadcast_to(m, i.spec.shape), np.shape(env[a]))
-                if not m.any():
-                    continue
-            taken[a] = m if before is None else True if m is True else before | m
-    return taken
+        for place, a in enumerate(i.args):
+            before = taken.get(a, False)
+            if before is not True:
+                taken[a] = _either(before, _through(i, place, mask, env))
+    return {n: mask for n, mask in taken.items() if mask is True or np.any(mask)}
 
 
 def needed_of(program: Program, env: Mapping[int, Any], values: Iterable[int]) -> dict[int, Any]:
@@ -206,17 +196,8 @@ def needed_of(program: Program, env: Mapping[int, Any], values: Iterable[int]) -
             if whole is False:
                 continue
             for place, a in enumerate(i.args):
-                if a != n:
-                    continue
-                m = whole
-                if i.op == "where" and place:
-                    chosen = np.asarray(env[i.args[0]], bool)
-                    m = (chosen if place == 1 else ~chosen) & whole
-                elif i.op != "where" and i.op not in ELEMENTWISE:
-                    m = True
-                if m is not True:
-                    m = _reduced(np.broadcast_to(m, i.spec.shape), np.shape(env[n]))
-                mask = True if m is True or mask is True else mask | m
+                if a == n:
+                    mask = _either(mask, _through(i, place, whole, env))
             if mask is True:
                 break
         known[n] = mask = mask if mask is True or np.any(mask) else False
@@ -228,6 +209,23 @@ def needed_of(program: Program, env: Mapping[int, Any], values: Iterable[int]) -
     except RecursionError:  # a chain of a thousand that nothing surely takes
         found = needed(program, env)
         return {n: found[n] for n in asked if n in found}
+
+
+def _through(i: Instruction, place: int, mask: Any, env: Mapping[int, Any]) -> Any:
+    """What an instruction of whose result a mask is needed needs of the argument at a place."""
+    if i.op == "where" and place:
+        chosen = np.asarray(env[i.args[0]], bool)
+        mask = (chosen if place == 1 else ~chosen) & mask
+    elif i.op != "where" and i.op not in ELEMENTWISE:
+        return True
+    if mask is True:
+        return True
+    return _reduced(np.broadcast_to(mask, i.spec.shape), np.shape(env[i.args[place]]))
+
+
+def _either(a: Any, b: Any) -> Any:
+    """What one mask or the other asks for: True for all."""
+    return True if a is True or b is True else a | b
 
 
 def _reduced(mask: Any, shape: tuple[int, ...]) -> Any:

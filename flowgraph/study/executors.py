@@ -27,6 +27,9 @@ from typing import Any, NoReturn, Protocol
 
 from flowgraph.errors import DeclarationError, MissingDependencyError
 
+_Work = tuple[str, Callable[..., Any], tuple[Any, ...]]
+"""A task: its name, and what to call."""
+
 DEATHS = 3
 """So many workers may one task take with it before it is given up."""
 
@@ -94,7 +97,7 @@ class InProcess(_Closing):
     workers = 1
 
     def __init__(self) -> None:
-        self._waiting: deque[tuple[str, Callable[..., Any], tuple[Any, ...]]] = deque()
+        self._waiting: deque[_Work] = deque()
 
     def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
         self._waiting.append((task, function, arguments))
@@ -279,6 +282,10 @@ def _serve(descriptor: int) -> None:
 class OnDask(_Closing):
     """A Dask cluster: one that is there, or a local one of processes.
 
+    Dask gives several tasks to a worker at once, and holds its death against all of them. So a task that is
+    said to have killed its workers is run again by itself when there is nothing else to do, and lost only
+    then.
+
     Args:
         scheduler: its address, such as "tcp://host:8786"; None starts a local cluster.
         workers: of the local cluster.
@@ -323,7 +330,8 @@ class OnDask(_Closing):
                 _ask(distributed, scheduler, patience)
             self._client = distributed.Client(self._cluster or scheduler, set_as_default=False)
         self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
-        self._futures: dict[Any, str] = {}
+        self._futures: dict[Any, tuple[_Work, bool]] = {}
+        self._suspects: deque[_Work] = deque()
         self._done = distributed.as_completed(loop=self._client.loop)
 
     def pids(self) -> list[int]:
@@ -331,15 +339,21 @@ class OnDask(_Closing):
         return list(self._client.run(os.getpid).values())
 
     def submit(self, task: str, function: Callable[..., Any], *arguments: Any) -> None:
+        self._send((task, function, arguments), alone=False)
+
+    def _send(self, work: _Work, *, alone: bool) -> None:
+        _, function, arguments = work
         future = self._client.submit(function, *arguments, pure=False)
-        self._futures[future.key] = task
+        self._futures[future.key] = work, alone
         self._done.add(future)
 
     def as_completed(self) -> Iterator[Finished]:
         for future in self._done:
-            task = self._futures.pop(future.key)
-            error = future.exception()
-            if isinstance(error, self._distributed.KilledWorker):
+            work, alone = self._futures.pop(future.key)
+            task, error = work[0], future.exception()
+            if isinstance(error, self._distributed.KilledWorker) and not alone:
+                self._suspects.append(work)
+            elif isinstance(error, self._distributed.KilledWorker):
                 yield Finished(task, lost=str(error).partition("\n")[0])
             elif future.status == "cancelled":
                 yield Finished(task, lost="the cluster has gone away")
@@ -348,11 +362,15 @@ class OnDask(_Closing):
             else:
                 yield Finished(task, future.result())
             future.release()
+            if self._suspects and not self._futures:
+                self._send(self._suspects.popleft(), alone=True)
 
     def close(self) -> None:
-        self._client.close(timeout=5)
+        with suppress(TimeoutError):  # what has been done is there, however long they take to go
+            self._client.close(timeout=5)
         if self._cluster is not None:
-            self._cluster.close(timeout=10)
+            with suppress(TimeoutError):
+                self._cluster.close(timeout=10)
 
 
 def _ask(distributed: Any, address: str, patience: float) -> None:

@@ -170,6 +170,7 @@ class _Search:
         self.notes: list[str] = []
         self._more: dict[int, int] = {}
         self._worst = Counts()
+        self._joined = False
         first = structure_of(self.pipeline)
         for one in (*self._flights, *self._held):
             if structure_of(one.pipeline) != first:
@@ -187,27 +188,50 @@ class _Search:
 
     def at(self, bits: int) -> tuple[Formats, dict[str, Any]]:
         """Formats of so many bits, and their figures on the flights that were held out."""
+        formats, player = self._settled(bits)
+        figures = self._judge(formats, player)
+        if figures["saturations"] and not self._joined:
+            self._join(bits)
+            formats, player = self._settled(bits)
+            figures = self._judge(formats, player)
+        for _ in range(_ROUNDS):
+            if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
+                break
+            formats = self.sizes.formats(bits, self._margin, self._held_width)
+            figures = self._judge(formats, self._player(formats))
+        return formats, figures
+
+    def _settled(self, bits: int) -> tuple[Formats, _Fleet]:
+        """Formats in which nothing saturates on the flights of the sizes."""
         for _ in range(_ROUNDS):
             formats = self.sizes.formats(bits, self._margin, self._held_width)
             player = self._player(formats)
             if not self._widened(player, self._flights, "the flights of the sizes", bits):
                 break
-        for _ in range(_ROUNDS):
-            formats = self.sizes.formats(bits, self._margin, self._held_width)
-            player = self._player(formats)
-            figures = self._judge(formats, player)
-            if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
-                break
-        return formats, figures
+        return formats, player
 
-    def _player(self, formats: Formats) -> CompiledIntegers:
+    def _join(self, bits: int) -> None:
+        """Take the sizes of the flights held out as well, in floating point: after a first word that is cut a
+        filter may go anywhere, and what its integers would have needed there tells nothing."""
+        self._joined = True
+        names = names_of(self.pipeline)
+        some = ", ".join(names[v] for v in list(self._worst.cut)[:3])
+        self.notes.append(
+            f"the flights held out are larger than those of the sizes, which were too few, and their sizes"
+            f" were joined: {len(self._worst.cut)} values were cut at {bits} bits, as {some}"
+        )
+        self._say(self.notes[-1])
+        for one in self._held:
+            self.sizes.play(one.pipeline, one.tape, one.start.cells, one.seed)
+
+    def _player(self, formats: Formats) -> _Fleet:
         patterns = sorted({key for one in (*self._flights, *self._held) for key in one.tape.patterns})
-        return CompiledIntegers(replace(self.pipeline, formats=formats), patterns, tabled=True)
+        return _Fleet(formats, patterns)
 
-    def _widened(self, player: CompiledIntegers, flights: Sequence[_Ready], where: str, bits: int) -> bool:
+    def _widened(self, player: _Fleet, flights: Sequence[_Ready], where: str, bits: int) -> bool:
         counts = Counts()
         for one in flights:
-            counts.join(one.play(player))
+            counts.join(one.play(player.of(one)))
         return self._widen(counts, where, bits)
 
     def _widen(self, counts: Counts, where: str, bits: int) -> bool:
@@ -222,14 +246,14 @@ class _Search:
             self._say(self.notes[-1])
         return bool(counts.cut)
 
-    def _judge(self, formats: Formats, player: CompiledIntegers) -> dict[str, Any]:
+    def _judge(self, formats: Formats, player: _Fleet) -> dict[str, Any]:
         self._worst = Counts()
         found: dict[str, Any] = {"bits": formats.width, "held_bits": formats.held_width or formats.width}
         found |= dict.fromkeys(KINDS, 0)
         for one in self._held:
-            counts = one.play(player)
+            counts = one.play(player.of(one))
             self._worst.join(counts)
-            for name, figure in differences(one.reference, one.result(player), one.flown.estimate).items():
+            for name, figure in differences(one.reference, one.result(), one.flown.estimate).items():
                 found[name] = max(found.get(name, 0), figure)
         found |= {kind: self._worst.total(kind) for kind in KINDS}
         return found
@@ -259,6 +283,23 @@ class _Search:
                 if size is not None and (size > 0.0).any():
                     spread[c.read] = float(size.max() / size[size > 0.0].min())
         return names[max(spread, key=lambda n: spread[n])] if spread else self.pipeline.name
+
+
+class _Fleet:
+    """The filter in its formats for any flight. Constants are those of the flight, as where it starts level;
+    the compiled text is the same for all."""
+
+    def __init__(self, formats: Formats, patterns: Sequence[int]) -> None:
+        self._formats, self._patterns = formats, patterns
+        self._made: dict[bytes, CompiledIntegers] = {}
+
+    def of(self, one: _Ready) -> CompiledIntegers:
+        """The player for a flight."""
+        numbers = b"".join(a.tobytes() for _, a in sorted(one.pipeline.constants.items()))
+        if numbers not in self._made:
+            pipeline = replace(one.pipeline, formats=self._formats)
+            self._made[numbers] = CompiledIntegers(pipeline, self._patterns, tabled=True)
+        return self._made[numbers]
 
 
 class _Ready:
@@ -297,7 +338,7 @@ class _Ready:
         self._outcome = player.play(self.tape, self.start.cells, self.seed, None)
         return player.counts
 
-    def result(self, player: CompiledIntegers) -> dict[str, Series]:
+    def result(self) -> dict[str, Series]:
         """The outputs of the last flight."""
         assert self._outcome is not None
         return {

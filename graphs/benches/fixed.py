@@ -20,6 +20,8 @@ from flowgraph.engines.fixed.engine import ENGINE
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.language.checks import need_count
+from flowgraph.pipeline.formats import Formats
+from flowgraph.pipeline.plain import plain
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import MARGIN, RELATIVE, Flown, quantise
 
@@ -90,7 +92,7 @@ def fixed(
                 some[:-1], some[-1:], width=width, least=least, bounds={RELATIVE: bound}, margin=margin
             )
             row |= {k: v for k, v in found.figures.items() if k in row}
-            same = _compared(replace(found.pipeline, formats=found.formats), some[-1], compared)
+            same = _compared(found.formats, some[-1], compared)
             row["values_compared"], row["values_differing"] = same
         except FlowgraphError as error:
             row["reason"] = f"{error.path}: {error.message}; {error.got}"[:300]
@@ -122,9 +124,10 @@ def flown(name: str, seed: int, duration: float, particles: int = 0) -> Flown:
     return Flown(case.graph, case.inputs, case.estimate, seed)
 
 
-def _compared(pipeline: Any, flown: Flown, seconds: float) -> tuple[int, int]:
+def _compared(formats: Formats, flown: Flown, seconds: float) -> tuple[int, int]:
     """How many values the interpreter and C give in the first seconds of a flight, and how many differ."""
-    subject = LoweredGraph(flown.graph)
+    subject = LoweredGraph(flown.graph, dtype="fixed")
+    pipeline = replace(plain(subject.pipeline), formats=formats)
     start = subject.start(RunOptions(seed=flown.seed))
     events = subject.tape(flown.inputs, start.last)
     patterns = sorted(events.patterns)

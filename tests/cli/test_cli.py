@@ -126,7 +126,7 @@ def test_a_full_standard_output_is_a_message(arguments):
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=120,
+            timeout=600,
             check=False,
         )
     assert done.returncode == 1, done.stderr
@@ -256,7 +256,7 @@ def test_json_is_all_there_is_on_standard_output(tmp_path):
         [sys.executable, "-c", program, *RUN, "--json", "--out", str(tmp_path / "new")],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=True,
         env={**os.environ, "MPLBACKEND": "Agg"},
     )

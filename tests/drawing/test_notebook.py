@@ -213,20 +213,21 @@ def test_a_browser_unpacks_the_diagram_in_its_frame(run: tuple[Graph, Result], t
     cell = tmp_path / "cell.html"
     cell.write_text(run[0]._repr_mimebundle_()["text/html"].replace("<details>", "<details open>"))
     options = webdriver.ChromeOptions()
-    for word in ("--headless", "--no-sandbox", "--disable-gpu"):
+    options.binary_location = shutil.which("chromium")
+    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
         options.add_argument(word)
-    browser = webdriver.Chrome(options=options)
+    driver = webdriver.chrome.service.Service(shutil.which("chromedriver"))
+    browser = webdriver.Chrome(options=options, service=driver)
     try:
         browser.get(cell.as_uri())
         browser.switch_to.frame(browser.find_element("tag name", "iframe"))
-        for _ in range(100):
-            words = browser.execute_script("return document.body ? document.body.innerText : ''")
-            if "Twice x." in words and browser.execute_script(
-                "return document.querySelectorAll('svg').length"
-            ):
+        seen = "return [document.body?.innerText ?? '', document.querySelectorAll('svg').length]"
+        end = time.monotonic() + 120
+        while True:
+            words, pictures = browser.execute_script(seen)
+            if "Twice x." in words and pictures:
                 break
+            assert time.monotonic() < end, f"the diagram did not come: {words!r}"
             time.sleep(0.1)
-        else:
-            pytest.fail(f"the diagram did not come: {words!r}")
     finally:
         browser.quit()

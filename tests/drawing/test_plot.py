@@ -205,7 +205,9 @@ def test_no_text_lies_on_another():
     """Titles, legends, numbers and labels of a figure with long names and many components."""
     long = "a_stream_whose_name_is_as_long_as_such_names_become_in_a_graph_of_several_levels_of_nesting"
     many = {f"{long}_{k}": track() for k in range(5)}
-    figure = plot_result(result_of(**many, wide=Series(np.arange(50), np.random.rand(50, 6))))
+    figure = plot_result(
+        result_of(**many, wide=Series(np.arange(50), np.sin(np.arange(300.0)).reshape(50, 6)))
+    )
     figure.draw_without_rendering()
     for axis in panels(figure):
         words = [axis._left_title, axis.yaxis.label]

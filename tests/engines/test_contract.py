@@ -135,7 +135,7 @@ def toy(tmp_path: Path) -> dict[str, str]:
 
 
 def ran(toy: dict[str, str], *command: str) -> Any:
-    return subprocess.run(command, env=toy, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, env=toy, capture_output=True, text=True, timeout=600)
 
 
 FLOWGRAPH = str(Path(sys.executable).with_name("flowgraph"))

@@ -39,7 +39,7 @@ def child(*words, method="fork"):
     mine, yours = context.Pipe()
     process = context.Process(target=answer, args=(yours, *words))
     process.start()
-    found = mine.recv() if mine.poll(60) else "hangs"
+    found = mine.recv() if mine.poll(120) else "hangs"
     process.kill()
     process.join()
     return found
@@ -52,7 +52,7 @@ def forked_twice():
     mine, yours = context.Pipe()
     process = context.Process(target=grandchild, args=(yours,))
     process.start()
-    found = mine.recv() if mine.poll(60) else "hangs"
+    found = mine.recv() if mine.poll(120) else "hangs"
     process.kill()
     process.join()
     return found
@@ -65,7 +65,7 @@ if __name__ == "__main__":
 def said(body: str, tmp_path) -> list:
     file = tmp_path / "program.py"
     file.write_text(PROGRAM.replace("BODY", body))
-    done = subprocess.run([sys.executable, file], capture_output=True, text=True, timeout=180, check=False)
+    done = subprocess.run([sys.executable, file], capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)
 

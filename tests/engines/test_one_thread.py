@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from typing import Any
 
@@ -27,7 +28,7 @@ class Gate:
 
     def __call__(self, x: Any) -> None:
         self.inside.set()
-        assert self.go.wait(30)
+        assert self.go.wait(120)
 
 
 def waiting(inputs: Any = None) -> tuple[Run, Gate]:
@@ -57,7 +58,7 @@ def test_a_second_thread_is_refused_by_name(enter, second):
     first = threading.Thread(target=calls[enter])
     first.start()
     try:
-        assert gate.inside.wait(30)
+        assert gate.inside.wait(120)
         with pytest.raises(DataError, match=f"Run.{second.split()[-1]} while this run is in a tick") as error:
             calls[second]()
         assert error.value.got == "another thread is in it"
@@ -65,7 +66,7 @@ def test_a_second_thread_is_refused_by_name(enter, second):
         assert "one thread" in str(error.value.expected)
     finally:
         gate.go.set()
-        first.join(30)
+        first.join(120)
     assert len(run.result()["a"]) >= 1, "the first is not disturbed"
     if enter == "push":
         run.push(6, a=2.0)
@@ -104,7 +105,7 @@ def test_a_block_may_look_at_its_own_run():
 def test_threads_that_push_lose_nothing_in_silence():
     """Each push has happened, or was refused; and all are there where those that were refused come again."""
     run = Run(total.build())
-    stamps, lock = iter(range(10**6)), threading.Lock()
+    stamps, lock = itertools.count(), threading.Lock()  # a refused push takes one, too
     pushed, refused = [0] * 3, [0] * 3
 
     def work(k: int) -> None:

@@ -43,7 +43,8 @@ def test_a_notebook_runs_and_shows_what_it_says(file: Path, tmp_path: Path) -> N
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient")
     pytest.importorskip("ipykernel", reason="needs ipykernel")
     notebook = read(file)
-    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    patience = {"timeout": 300, "startup_timeout": 300}
+    nbclient.NotebookClient(notebook, **patience, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = nbformat.writes(notebook)
     for words in SHOWS[file.stem]:
         assert words in shown.split('"source"', 1)[-1], words

@@ -162,7 +162,7 @@ def test_mypy_finds_what_is_planted(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mypy", "--no-color-output", "right.py", *(f"{n}.py" for n in PLANTED)]
     environment = {**os.environ, "MYPYPATH": str(ROOT)}
     done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=400, check=False, env=environment
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False, env=environment
     )
     check(done.stdout, lines)
 
@@ -173,7 +173,7 @@ def test_pyright_finds_what_is_planted(tmp_path: Path) -> None:
     pytest.importorskip("pyright", reason="needs pyright")
     lines = planted(tmp_path)
     command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "."]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False)
     if not re.search(r"\d+ errors?, \d+ warnings?", done.stdout):
         pytest.skip(f"pyright does not run here: {done.stderr[-200:]}")
     check(done.stdout, lines)

@@ -50,11 +50,12 @@ def test_tasks_may_be_submitted_while_others_end(executor):
     assert sorted(seen) == ["0", "1", "2", "3"]
 
 
-@pytest.mark.parametrize("kind", [ProcessPool, OnDask])
-def test_a_task_that_kills_its_workers_is_given_up_and_the_rest_end(kind):
+@pytest.mark.parametrize(("kind", "workers"), [(ProcessPool, 2), (OnDask, 2), (OnDask, 1)])
+def test_a_task_that_kills_its_workers_is_given_up_and_the_rest_end(kind, workers):
+    """Also where those that wait behind it are on the same worker, each time that it dies."""
     if kind is OnDask:
         pytest.importorskip("distributed")
-    with kind(workers=2, deaths=2) as pool:
+    with kind(workers=workers, deaths=2) as pool:
         pool.submit("poison", deeds.die, 0)
         for x in range(6):
             pool.submit(f"{x}", deeds.slow, x)

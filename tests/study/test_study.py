@@ -262,6 +262,16 @@ def test_a_worker_killed_in_the_middle_changes_nothing(kind, undisturbed, tmp_pa
     assert told(read_table(tmp_path)) == rows
 
 
+def address_in(file, seconds=90.0):
+    """Of a scheduler, once it has written all of it down."""
+    deadline = time.monotonic() + seconds
+    while True:
+        with contextlib.suppress(OSError, json.JSONDecodeError):
+            return json.loads(file.read_text())["address"]
+        assert time.monotonic() < deadline, "no scheduler came"
+        time.sleep(0.05)
+
+
 @pytest.fixture
 def cluster(tmp_path):
     """The address of a Dask scheduler with two workers, each a process of its own without a nurse."""
@@ -278,10 +288,7 @@ def cluster(tmp_path):
             )  # fmt: skip
             all_of.callback(process.wait)
             all_of.callback(process.kill)
-        deadline = time.monotonic() + 90
-        while not file.exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        yield json.loads(file.read_text())["address"]
+        yield address_in(file)
 
 
 @pytest.mark.slow
@@ -320,26 +327,30 @@ def written(out: Path) -> int:
 
 
 def test_a_study_killed_and_run_again_changes_nothing(undisturbed, tmp_path):
+    """Killed by itself, between two runs: who watches it from outside may come when it has ended."""
     study, rows = undisturbed
-    file = tmp_path / "study.json"
+    file, out = tmp_path / "study.json", tmp_path / "out"
     file.write_text(json.dumps(study.resolved()))
-    out = tmp_path / "out"
-    command = [sys.executable, "-c", "from flowgraph.cli import main; main()", "batch", str(file)]
-    command += ["--out", str(out), "--workers", "2", "--quiet"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 90
-    while written(out) < 3 and time.monotonic() < deadline:
-        assert process.poll() is None, "it ended before it could be killed"
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    there = written(out)
-    assert 3 <= there < 20
+    process = subprocess.run([sys.executable, "-c", SUICIDE, str(file), str(out)], check=False)
+    assert process.returncode == -signal.SIGKILL
+    assert written(out) == 3
     assert not (out / "results.parquet").exists()
     done = run_study(study, out)
-    assert done.kept >= 3
-    assert done.kept + done.done == 20
+    assert (done.kept, done.done) == (3, 17)
     assert told(read_table(out)) == rows
+
+
+SUICIDE = """
+import os, signal, sys
+from flowgraph.study import Study, Watcher, run_study
+class Kills(Watcher):
+    left = 3
+    def row(self, row):
+        self.left -= 1
+        if not self.left:
+            os.kill(os.getpid(), signal.SIGKILL)
+run_study(Study.load(sys.argv[1]), sys.argv[2], workers=2, watcher=Kills())
+"""
 
 
 def test_ctrl_c_stops_with_what_there_is(undisturbed, tmp_path):

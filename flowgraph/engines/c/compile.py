@@ -23,7 +23,7 @@ import subprocess
 import tempfile
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +32,6 @@ from flowgraph.errors import FlowgraphError, MissingDependencyError, OutputError
 
 _COMMON = (
     "-std=c99",
-    "-O3",
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -42,14 +41,41 @@ _COMMON = (
 )
 _NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AMD64") else ()
 
-FLAGS = (*_COMMON, *_NARROW)
+_FULL = "-O3"
+_FIRST = (
+    "-O1",
+    "-fcaller-saves",
+    "-fexpensive-optimizations",
+    "-finline-functions",
+    "-finline-small-functions",
+    "-fpartial-inlining",
+    "-fpeel-loops",
+    "-fpredictive-commoning",
+    "-fschedule-insns2",
+    "-fsplit-loops",
+    "-fstore-merging",
+    "-fstrict-aliasing",
+    "-ftree-loop-distribution",
+    "-ftree-vectorize",
+    "-ftree-vrp",
+    "-funswitch-loops",
+    "-fvect-cost-model=dynamic",
+    "--param=sccvn-max-alias-queries-per-access=50",
+)
+"""gcc's first level, and of the others what straight code gains by: six tenths of the time to compile."""
+
+FLAGS = (*_FIRST, *_COMMON, *_NARROW)
 """What `engine="c"` compiles with; none of them changes what NaN or infinity mean.
 
 Straight code is packed into vectors, of half the length where a processor has AVX-512: with whole ones
 gcc 12.2 puts elements of one row into the next.
 """
 
+LANES = (_FULL, *_COMMON, *_NARROW)
+"""The flags for runs that go as lanes: the vectors are in the text, and loops go around them."""
+
 LOOPS = (
+    _FULL,
     *_COMMON,
     "-fno-tree-slp-vectorize",  # so loops may have whole vectors, see above
     "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile
@@ -157,44 +183,53 @@ def _version(command: tuple[str, ...]) -> str:
         ["-march=native", "-Q", "--help=target"],
         ["-march=native", "-dM", "-E", "-xc", "-"],
     )
-    return "\n".join(_run([*command, *ask], None)[1] for ask in asked)
+    return "\n".join(said for _, said, _ in _run([[*command, *ask] for ask in asked], None))
 
 
-def _run(command: list[str], folder: Path | None) -> tuple[int, str, str]:
-    """Exit status, and what a program wrote to its two ends; it and what it started end with us.
+def _run(commands: list[list[str]], folder: Path | None) -> list[tuple[int, str, str]]:
+    """Exit status, and what each program wrote to its two ends; all go on at once, and end with us.
 
     Raises:
-        CompileError: where it cannot be started.
+        CompileError: where one cannot be started.
     """
     environment = os.environ if folder is None else {**os.environ, "TMPDIR": str(folder)}
-    try:
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            process_group=0,
-        )
-    except OSError as error:
-        raise CompileError(
-            "the C compiler cannot be started",
-            path=command[0],
-            expected="a program, cc or what $CC names",
-            got=f"{type(error).__name__}: {error.strerror or error}",
-            fix='install gcc or clang, or use engine="xla" or "python"',
-        ) from error
-    with process:
+    with ExitStack() as stack:
+        running = []
         try:
-            said, complained = process.communicate()
-        except BaseException:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)  # with the compiler proper, which it has started
-            raise
-    return process.returncode, said, complained
+            for command in commands:
+                running.append(
+                    stack.enter_context(
+                        subprocess.Popen(
+                            command,
+                            cwd=folder,
+                            env=environment,
+                            stdin=subprocess.DEVNULL,
+                            stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE,
+                            text=True,
+                            errors="replace",
+                            process_group=0,
+                        )
+                    )
+                )
+            said = [process.communicate() for process in running]
+        except BaseException as error:
+            for process in running:
+                if process.returncode is None:
+                    with suppress(ProcessLookupError):
+                        os.killpg(
+                            process.pid, signal.SIGKILL
+                        )  # with the compiler proper, which it has started
+            if not isinstance(error, OSError):
+                raise
+            raise CompileError(
+                "the C compiler cannot be started",
+                path=commands[0][0],
+                expected="a program, cc or what $CC names",
+                got=f"{type(error).__name__}: {error.strerror or error}",
+                fix='install gcc or clang, or use engine="xla" or "python"',
+            ) from error
+    return [(process.returncode, *texts) for process, texts in zip(running, said, strict=True)]
 
 
 def _first_error(said: str) -> str:
@@ -240,6 +275,7 @@ def load(files: dict[str, str], flags: tuple[str, ...] = FLAGS) -> ctypes.CDLL:
 def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
     """The library, and whether it was compiled now."""
     command = _command()
+    flags = _understood(flags, _version(tuple(command)))
     said = "\0".join(
         [*command, _version(tuple(command)), *flags, *(f"{n}\0{t}" for n, t in sorted(files.items()))]
     )
@@ -258,6 +294,14 @@ def _built(files: dict[str, str], flags: tuple[str, ...]) -> tuple[Path, bool]:
             return target, True
     assert refused is not None  # there is one place at least
     raise refused
+
+
+def _understood(flags: tuple[str, ...], version: str) -> tuple[str, ...]:
+    """These flags; for another compiler than gcc its whole third level in place of parts of gcc's."""
+    if "Free Software Foundation" in version:
+        return flags
+    others = tuple(f for f in flags if f not in _FIRST)
+    return flags if len(others) == len(flags) else (_FULL, *others)
 
 
 def _is_whole(library: Path) -> bool:
@@ -284,8 +328,12 @@ def _compile(
             for name, text in files.items():
                 (work / name).write_text(text, encoding="utf-8")
         sources = sorted(n for n in files if n.endswith(".c"))
-        line = [*command, *flags, "-fPIC", "-shared", "-o", "made.so", *sources, "-lm"]
-        status, said, complained = _run(line, work)
+        calls = [[*command, *flags, "-fPIC", "-c", "-o", f"{n}.o", n] for n in sources]
+        done = _run(calls, work)
+        if not any(status for status, _, _ in done):
+            objects = [f"{n}.o" for n in sources]
+            done = _run([[*command, *flags, "-shared", "-o", "made.so", *objects, "-lm"]], work)
+        status, said, complained = next((d for d in done if d[0]), done[0])
         made = work / "made.so"
         if status and "No space left on device" in complained:
             raise OutputError(

@@ -29,7 +29,7 @@ from flowgraph.engines.contract import (
 )
 from flowgraph.engines.fixed.engine import need_formats
 from flowgraph.engines.options import KINDS, Meter, RunOptions
-from flowgraph.engines.stretches import joined
+from flowgraph.engines.stretches import gathered
 from flowgraph.pipeline.optimise import COMPILED
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.random import seed_words
@@ -42,19 +42,19 @@ class _Loaded(Player):
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         library = self._library
         rows = library.rows([real_leaves(s, library.real) for s in tape.series])
-        parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in library.pipeline.outputs]
         done = 0
         start = perf_counter()
+        outputs = gathered(library.pipeline, tape)
         for part, after in library.play(cells, seed, tape.time, tape.key, rows):
             cells = after
             times = tape.time[done : done + part.ticks]
-            for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
-                kept.append((times[mask], leaves))
+            for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
+                output.add(part.ticks, times if mask.all() else times[mask], leaves)
             done += part.ticks
             if progress is not None:
                 progress.update(done, int(times[-1]))
-        wall = perf_counter() - start
-        return Outcome(cells, joined(library.pipeline, parts, tape), wall)
+        collected = [output.rows() for output in outputs]
+        return Outcome(cells, collected, perf_counter() - start)
 
 
 class CEngine(PipelineEngine):

@@ -105,8 +105,8 @@ class File:
             own_text(self.expressions.called, self.expressions.helpers, self.real),
             *(self._constant(name, b) for name, b in self.constants.values()),
             *(text for _, text in self.expressions.functions.values()),
-            reset,
             *reactions,
+            reset,
             entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
         ]
         text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"

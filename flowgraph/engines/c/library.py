@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.tape import patterns_of
 from flowgraph.engines.c.compile import FLAGS, LOOPS, load
 from flowgraph.engines.c.loop import loop_text
 from flowgraph.engines.c.names import names_of
 from flowgraph.engines.c.source import every_pattern, generate
 from flowgraph.engines.c.texts import kept_text, presence_of_rows, presence_rows
+from flowgraph.engines.c.units import units
 from flowgraph.pipeline.optimise import optimise
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline
 
@@ -104,7 +106,7 @@ class Outputs:
 
     def most(self, key: np.ndarray) -> list[tuple[int, bool]]:
         """For each output in how many ticks of these patterns it can be present, and whether it then is."""
-        counts = {int(k): int(n) for k, n in zip(*np.unique(key, return_counts=True), strict=True)}
+        counts = {k: int(np.count_nonzero(key == k)) for k in patterns_of(key)}
         found = []
         for port in range(len(self.pipeline.outputs)):
             bits = [(n, *(p >> port & 1 for p in self.presence_of(k))) for k, n in counts.items()]
@@ -113,7 +115,7 @@ class Outputs:
 
     def present(self, key: np.ndarray, port: int) -> np.ndarray:
         """(T,) bool: where an output is whose presence follows from the patterns alone."""
-        there = {int(k): bool(self.presence_of(int(k))[0] >> port & 1) for k in np.unique(key)}
+        there = {k: bool(self.presence_of(k)[0] >> port & 1) for k in patterns_of(key)}
         if len(set(there.values())) == 1:
             return np.full(len(key), next(iter(there.values())))
         return np.isin(key, [k for k, holds in there.items() if holds])
@@ -163,7 +165,7 @@ class Compiled(Outputs):
             )
             m = source.names.module
             loop = loop_text(pipeline, source)
-            files = {f"{m}.h": source.header, f"{m}.c": source.source, "fg_loop.c": loop}
+            files = {f"{m}.h": source.header, **units(source), "fg_loop.c": loop}
             presence = presence_rows(source.presence)
             return {"files": files, "longest": source.longest, "presence": presence}
 
@@ -228,7 +230,7 @@ class Compiled(Outputs):
         Returns:
             How many rows each output has now, and (T,) uint64 with bit k set where output k was present.
         """
-        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
+        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key, np.int64)
         made, counts = np.empty(len(time), np.uint64), np.zeros(max(len(rooms), 1), np.int64)
         scratch = self.scratch()
         leaves = [None if leaf is None else leaf.ctypes.data for room in rooms for leaf in room]
@@ -258,7 +260,8 @@ class Compiled(Outputs):
         Args:
             cells: register cells before the first tick.
             seed: (2,) uint32.
-            time, key: (T,) int64.
+            time: (T,) int64 ns.
+            key: (T,), bit k set where input k is present.
             rows: events of each port, from `rows`.
         """
         state = State(self, cells, seed)

@@ -31,6 +31,8 @@ _HELD = 16.0
 _MOST = 256.0
 """Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
 
+_ALIKE = frozenset(["particles", "members"])
+"""Axes along which elements are alike and share a format; those of a state differ by powers of ten."""
 
 _CORRELATION = 2.0**-7
 """The smallest that an element of a matrix is taken for, beside its diagonal."""
@@ -58,7 +60,10 @@ class Sizes:
         self._cells = [c for r in pipeline.registers for c in r.cells]
         self._real = {n for n, s in pipeline.specs.items() if s.dtype == "real"} - set(pipeline.constants)
         self._shared = {
-            n for part in _parts(pipeline) for n, axis in zip(part.shape, part.axes, strict=False) if axis
+            n
+            for part in _parts(pipeline)
+            for n, axis in zip(part.shape, part.axes, strict=False)
+            if axis in _ALIKE
         }
         self._waiting: dict[int, list[Any]] = {}
         self._idle: dict[int, list[Any]] = {}

@@ -14,7 +14,7 @@ from flowgraph.engines.numpy.guards import present_in
 from flowgraph.engines.numpy.plan import Plan, planned
 from flowgraph.engines.numpy.steps import Stretch
 from flowgraph.engines.options import Meter
-from flowgraph.engines.stretches import joined
+from flowgraph.engines.stretches import gathered
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import DTYPES
 
@@ -32,7 +32,7 @@ class _Prepared(Player):
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         program = self.plan.program
         held = {n: self._number(c) for n, c in zip(program.reads, cells, strict=True)}
-        parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in program.outputs]
+        outputs = gathered(self.pipeline, tape)
         start = perf_counter()
         with np.errstate(all="ignore"):
             fixed = self._fixed(held, seed)
@@ -47,8 +47,8 @@ class _Prepared(Player):
                     step.play(ticks)
                     for n in done:
                         ticks.values.pop(n, None)
-                for kept, found in zip(parts, self._outputs(ticks), strict=True):
-                    kept.append(found)
+                for output, found in zip(outputs, self._outputs(ticks), strict=True):
+                    output.add(len(ticks.times), *found)
                 every = self.plan.every
                 held = {
                     r: np.array(ticks.at(w, every)[..., -1])
@@ -56,8 +56,8 @@ class _Prepared(Player):
                 }
                 if progress is not None:
                     progress.update(first + len(ticks.times), int(ticks.times[-1]))
-        wall = perf_counter() - start
-        return Outcome([held[n] for n in program.reads], joined(self.pipeline, parts, tape), wall)
+        collected = [output.rows() for output in outputs]
+        return Outcome([held[n] for n in program.reads], collected, perf_counter() - start)
 
     def _number(self, value: Any) -> Any:
         found = np.asarray(value)

@@ -152,10 +152,10 @@ def _playback(graph: Graph, kept: Callable[[], Inputs], options: RunOptions) -> 
     try:
         pipeline = lower(graph)
     except LoweringError:
-        return Playback(None, (), {}, events, None if hosted else again)
+        return Playback(None, (), dict, events, None if hosted else again)
     if hosted:  # its blocks must not do what they do a second time
-        return Playback(pipeline, [c.reset for r in pipeline.registers for c in r.cells], {}, events, None)
-    gaps = gaps_of(events(), list(graph.sources))
+        return Playback(pipeline, [c.reset for r in pipeline.registers for c in r.cells], dict, events, None)
+    gaps = lambda: gaps_of(events(), list(graph.sources))
     return Playback(pipeline, LoweredGraph(graph).start(options).cells, gaps, events, again)
 
 

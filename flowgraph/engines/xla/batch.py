@@ -1,7 +1,6 @@
 """Many runs in XLA: chunks of one size, each through one compiled scan under `vmap`.
 
-The runs of a batch share their ticks. Their inputs go in as dense arrays, and of the outputs only what is
-kept is computed.
+The runs of a batch share their ticks, and of the outputs only what is kept is computed.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from flowgraph.data.batch import Runs
 from flowgraph.data.tape import Tape
-from flowgraph.engines.contract import ManyOutcome, ManyRuns, dense, real_leaves
+from flowgraph.engines.contract import ManyOutcome, ManyRuns, real_leaves
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick, chosen_device
 from flowgraph.errors import DataError
@@ -39,17 +38,17 @@ def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> 
     if which not in compiled:
         compiled[which] = Scan(pipeline, keys, real, ticks, runs=size, shared=runs.shared, passes=passes)
     scan = compiled[which]
-    dense_first = _columns([first], True, real)
+    columns_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []
     wall = 0.0
     for n, members in enumerate(_chunks(len(seeds), size)):
-        columns = dense_first if runs.shared else _columns(_tapes(runs, members), False, real)
+        columns = columns_first if runs.shared else _columns(_tapes(runs, members), False, real)
         last = cells = _cells_of(runs, members)
         words = np.stack([seed_words(seeds[k]) for k in members])
         scan.compile(cells, words, columns)
         start = perf_counter()
         parts = []
-        for part, after in scan(cells, words, first.time, first.key, columns):
+        for part, after in scan(cells, words, first.time, first.key, columns, first.rows):
             parts.append(_without_absent(part))
             last = after
         wall += perf_counter() - start
@@ -111,14 +110,8 @@ def _cells_of(runs: ManyRuns, members: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray]]:
-    """Dense leaves of each input; with a leading axis of runs where inputs differ."""
-    made = [
-        [
-            [dense(leaf, (t.key >> k & 1).astype(bool)) for leaf in real_leaves(s, real)]
-            for k, s in enumerate(t.series)
-        ]
-        for t in tapes
-    ]
+    """The leaves of each input; with a leading axis of runs where inputs differ."""
+    made = [[real_leaves(s, real) for s in t.series] for t in tapes]
     if shared:
         return made[0]
     return [[np.stack(leaves) for leaves in zip(*ports, strict=True)] for ports in zip(*made, strict=True)]

@@ -15,12 +15,10 @@ from flowgraph.engines.contract import (
     Outcome,
     PipelineEngine,
     Player,
-    dense,
-    real_leaves,
 )
 from flowgraph.engines.forks import refuse_lost_threads
 from flowgraph.engines.options import Meter, RunOptions
-from flowgraph.engines.stretches import joined
+from flowgraph.engines.stretches import gathered
 from flowgraph.engines.xla.batch import vectorised
 from flowgraph.engines.xla.scan import Scan, chosen_device, chunk_size, import_jax
 from flowgraph.pipeline.optimise import ARRAYS
@@ -32,25 +30,22 @@ class _Compiled(Player):
         self._scan = scan
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
-        columns = []
-        for k, series in enumerate(tape.series):
-            leaves = real_leaves(series, self._scan.dtype)
-            everywhere = len(series) == len(tape.time)
-            columns.append(leaves if everywhere else [dense(x, tape.key & (1 << k) != 0) for x in leaves])
+        columns = [list(series.leaves.values()) for series in tape.series]
         self._scan.compile(cells, seed, columns)
-        parts: list[list[tuple[np.ndarray, list[np.ndarray]]]] = [[] for _ in self._scan.pipeline.outputs]
         done = 0
         start = perf_counter()
-        for part, after in self._scan(cells, seed, tape.time, tape.key, columns):
+        outputs = gathered(self._scan.pipeline, tape)
+        for part, after in self._scan(cells, seed, tape.time, tape.key, columns, tape.rows):
             cells = after
             times = tape.time[done : done + part.ticks]
-            for kept, (mask, leaves) in zip(parts, part.outputs, strict=True):
-                kept.append((times, leaves) if mask.all() else (times[mask], [leaf[mask] for leaf in leaves]))
+            for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
+                there = (times, leaves) if mask.all() else (times[mask], [leaf[mask] for leaf in leaves])
+                output.add(part.ticks, *there)
             done += part.ticks
             if progress is not None:
                 progress.update(done, int(times[-1]))
-        wall = perf_counter() - start
-        return Outcome(cells, joined(self._scan.pipeline, parts, tape), wall)
+        rows = [output.rows() for output in outputs]
+        return Outcome(cells, rows, perf_counter() - start)
 
 
 class XlaEngine(PipelineEngine):

@@ -9,13 +9,15 @@ the last chunk is filled up with ticks in which nothing is present.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from flowgraph.data.tape import Rows, bits
+from flowgraph.engines.xla.buffers import Buffers
 from flowgraph.engines.xla.namespace import JaxNamespace
 from flowgraph.errors import MissingDependencyError
 from flowgraph.pipeline.optimise import ARRAYS, optimise
@@ -25,6 +27,8 @@ from flowgraph.recorder.ops import OPS, bound_attrs
 
 _MOST_PATTERNS = 8
 _SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
+_UNROLLED = 4
+_SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
 
@@ -90,6 +94,9 @@ class Scan:
         self.branches = None if len(keys) > _MOST_PATTERNS or saved < _SMALL_WORK else programs
         self.shared = shared_program
         self.follows = [_known_presence(programs, k) for k in range(len(pipeline.outputs))]
+        played = [shared_program] if self.branches is None else self.branches
+        self._timed = any(_reads(program, pipeline.time) for program in played)
+        self._unroll = _UNROLLED if self.branches is None and _moved(pipeline) <= _SMALL_TICK else 1
         self._input_axis = 0 if shared or runs is None else 1
         self._output_axis = 0 if runs is None else 1
         play = self._chunk
@@ -107,32 +114,25 @@ class Scan:
             # A GPU would multiply float32 matrices with ten bits unless told otherwise.
             with self.jax.enable_x64(True), self.jax.default_matmul_precision("highest"):
                 now = tuple(_as(c, self.dtype) for c in cells)
-                xs = self._slice(np.zeros(1, np.int64), np.zeros(1, np.int64), inputs, 0)
-                self._compiled = self._play_chunk.lower(now, seed, xs).compile()
+                self._compiled = self._play_chunk.lower(now, seed, self._buffers(inputs).arrays).compile()
 
-    def _slice(self, choice: np.ndarray, time: np.ndarray, inputs: list[list[np.ndarray]], start: int) -> Any:
-        """The ticks of one chunk, filled up with ticks in which nothing is present."""
-        here = slice(start, min(start + self.chunk, len(time)))
-        axis = self._input_axis
-        part = (slice(None),) * axis + (here,)
-        leaves = tuple(tuple(_padded(x[part], self.chunk, 0, axis) for x in port) for port in inputs)
-        kind, idle = (np.int64, 0) if self.branches is None else (np.int32, len(self.keys))
-        return (
-            _padded(choice[here], self.chunk, idle).astype(kind, copy=False),
-            _padded(time[here], self.chunk, int(time[here.stop - 1])),
-            leaves,
-        )
+    def _buffers(self, inputs: list[list[np.ndarray]]) -> Buffers:
+        ports = len(self.pipeline.inputs)
+        kind, idle = (np.int32, len(self.keys)) if self.branches is not None else (bits(ports), 0)
+        return Buffers(self.chunk, kind, self._timed, inputs, self._input_axis, self.dtype, idle)
 
     def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
         step = self._switched if self.branches is not None else self._flagged
-        return self.jax.lax.scan(partial(step, seed), cells, xs)
+        return self.jax.lax.scan(partial(step, seed), cells, xs, unroll=self._unroll)
 
     def _start(
         self, program: Program, cells: tuple[Any, ...], seed: Any, time: Any, inputs: Any
     ) -> dict[int, Any]:
         jnp = self.jax.numpy
         env: dict[int, Any] = {n: jnp.asarray(_as(a, self.dtype)) for n, a in program.constants.items()}
-        env[self.pipeline.time], env[self.pipeline.seed] = time, seed
+        env[self.pipeline.seed] = seed
+        if self._timed:
+            env[self.pipeline.time] = time
         env.update(zip((c.read for r in self.pipeline.registers for c in r.cells), cells, strict=True))
         for port, leaves in zip(self.pipeline.inputs, inputs, strict=True):
             env.update(zip((leaf.value for leaf in port.leaves), leaves, strict=True))
@@ -181,37 +181,60 @@ class Scan:
         time: np.ndarray,
         key: np.ndarray,
         inputs: list[list[np.ndarray]],
+        rows: Sequence[Rows],
     ) -> Iterator[tuple[Chunk, list[Any]]]:
         """Play all ticks; yields each chunk of outputs with the register cells after it.
 
         Args:
             cells: register cells before the first tick.
             seed: (2,) uint32.
-            time, key: (T,) int64.
-            inputs: for each input port its leaves, dense: (T, ...), zero where absent.
+            time: (T,) int64 ns.
+            key: (T,), bit k set where input k is present.
+            inputs: for each input port its leaves, (n, ...).
+            rows: for each input port at which ticks it has its rows.
 
-        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs.
+        With `runs`, cells, seed, outputs, and inputs that are not shared have a leading axis of runs. Outputs
+        may be views of what XLA has made.
         """
         varies = any(known is not None and not known.all() for known in self.follows)
         pattern = _places(self.keys, key) if varies or self.branches is not None else key
         choice = key if self.branches is None else pattern
         self.compile(cells, seed, inputs)
         now: Any = tuple(_as(c, self.dtype) for c in cells)
+        buffers = self._buffers(inputs)
         for start in range(0, len(time), self.chunk):
             count = min(self.chunk, len(time) - start)
             kept = (slice(None),) * self._output_axis + (slice(count),)
             part = pattern[start : start + count]
-            xs = self._slice(choice, time, inputs, start)
+            buffers.fill(choice, time, rows, inputs, slice(start, start + count))
             with self.jax.enable_x64(True):
-                now, ys = self._compiled(now, seed, xs)
+                now, ys = self._compiled(now, seed, buffers.arrays)
                 outputs = [
                     (
                         np.asarray(mask)[kept] if known is None else _picked(known, part),
-                        [np.asarray(leaf)[kept] for leaf in leaves],
+                        [_held(np.asarray(leaf), buffers)[kept] for leaf in leaves],
                     )
                     for (mask, leaves), known in zip(ys, self.follows, strict=True)
                 ]
+                now = self.jax.block_until_ready(now)  # the buffers are read until then
             yield Chunk(count, outputs), [np.asarray(c) for c in now]
+
+
+def _held(array: np.ndarray, buffers: Buffers) -> np.ndarray:
+    """An output, copied where XLA has handed an input through."""
+    return array.copy() if buffers.holds(array) else array
+
+
+def _reads(program: Program, number: int) -> bool:
+    """Whether a program needs a value."""
+    ends = (*program.writes, *(n for flag, leaves in program.outputs for n in (flag, *leaves)))
+    return number in ends or any(number in i.args for i in program.instructions)
+
+
+def _moved(pipeline: Pipeline) -> int:
+    """What a tick reads and writes, in bytes: inputs, outputs, and registers both ways."""
+    cells = (c for r in pipeline.registers for c in r.cells)
+    return bytes_per_tick(pipeline) + 2 * 8 * sum(math.prod(c.shape) for c in cells)
 
 
 def _places(keys: tuple[int, ...], key: np.ndarray) -> np.ndarray:
@@ -248,14 +271,6 @@ def chunk_size(pipeline: Pipeline, ticks: int) -> int:
     """A power of two that holds all ticks, or as many as keep the outputs of a chunk in bounds."""
     most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(bytes_per_tick(pipeline), 1)))
     return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
-
-
-def _padded(array: np.ndarray, size: int, fill: int, axis: int = 0) -> np.ndarray:
-    short = size - array.shape[axis]
-    if not short:
-        return array
-    shape = (*array.shape[:axis], short, *array.shape[axis + 1 :])
-    return np.concatenate([array, np.full(shape, fill, array.dtype)], axis=axis)
 
 
 def _dtype(kind: str, real: Any) -> Any:

@@ -44,10 +44,10 @@ def test_a_sensor_description_that_is_none_is_named_at_once(tmp_path, text):
     (tmp_path / "imu0").mkdir()
     (tmp_path / "imu0" / "data.csv").write_text(test_euroc.IMU)
     (tmp_path / "imu0" / "sensor.yaml").write_text(text)
-    start = time.monotonic()
+    start = time.process_time()
     with pytest.raises(DataError) as caught:
         euroc.load(str(tmp_path))
-    assert time.monotonic() - start < 10.0
+    assert time.process_time() - start < 10.0
     assert "sensor.yaml" in str(caught.value)
     assert len(str(caught.value)) < 2000
 
@@ -145,13 +145,13 @@ def test_an_array_without_the_parts_of_its_class_is_refused_before_it_is_read(tm
 def test_thousands_of_digits_take_no_time(tmp_path):
     file = tmp_path / "parameters.txt"
     text = "1" * 20_000 + " side 0.2 m\n" + "[" * 20_000
-    start = time.monotonic()
+    start = time.process_time()
     file.write_text(text)
     parse_parameters(file)
     file.write_text("yaw = " + "9" * 20_000 + "\n" + text)
     with pytest.raises(DataError, match="the mount is malformed"):
         parse_parameters(file)
-    assert time.monotonic() - start < 10.0
+    assert time.process_time() - start < 10.0
 
 
 @pytest.mark.parametrize(

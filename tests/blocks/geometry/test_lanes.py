@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from flowgraph.blocks.geometry import lanes
 from flowgraph.blocks.geometry import rotations as g
@@ -42,6 +43,15 @@ def test_rotation_vectors_to_one_attitude():
     np.testing.assert_allclose(found[:, 2], [-1e-7, 0.0, 0.0], atol=1e-15)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.01, 1.0, 3.0])
+def test_a_turned_attitude_is_the_product_with_the_exponential(size):
+    q, v = quaternions(0), size * np.random.default_rng(2).normal(size=(3, N))
+    expected = lanes.multiply(q, lanes.exponential(v, xp=np), xp=np)
+    np.testing.assert_allclose(lanes.turned(q, v, xp=np), expected, atol=2e-15)
+    long = (1.0 + 1e-5) * q  # what is added brings the norm back
+    np.testing.assert_allclose(lanes.turned(long, v, xp=np), expected, atol=2e-10)
+
+
 def test_the_exponential_of_nothing_is_the_identity():
     np.testing.assert_array_equal(
         lanes.exponential(np.zeros((3, 2)), xp=np), [[1, 1], [0, 0], [0, 0], [0, 0]]
@@ -58,6 +68,23 @@ def test_matrices_agree_with_linear_algebra():
     inverse, log_determinant = lanes.inverse_and_log_determinant(last(S), xp=np)
     np.testing.assert_allclose(inverse, last(np.linalg.inv(S)), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(log_determinant, np.linalg.slogdet(S)[1], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("pivot", [1.0, 1e-6, 1e4])
+def test_a_solution_by_triangles_agrees_with_linear_algebra(pivot):
+    rng = np.random.default_rng(4)
+    A, B = rng.normal(size=(N, 3, 3)), rng.normal(size=(N, 3, 5))
+    S = A @ A.mT + 0.1 * np.eye(3)
+    S[:, 0, :] *= pivot
+    S[:, :, 0] *= pivot
+    last = lambda M: np.moveaxis(M, 0, -1)
+    solved, log_determinant = lanes.solve_and_log_determinant(last(S), last(B), xp=np)
+    expected = np.linalg.solve(S, B)
+    for k in range(3):  # the rows differ by the pivot in size
+        np.testing.assert_allclose(
+            solved[k], last(expected)[k], rtol=1e-9, atol=1e-9 * abs(expected[:, k]).max()
+        )
+    np.testing.assert_allclose(log_determinant, np.linalg.slogdet(S)[1], rtol=1e-9)
 
 
 def test_cross_products_of_one_vector_with_many():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph import DeclarationError, UnknownNameError
-from flowgraph.blocks.kalman.parallel import LinearSteps, linear_pass, scanned
+from flowgraph.blocks.kalman.parallel import LinearSteps, associative_scan, linear_pass
 
 
 def problem(count: int, seed: int, *, n: int = 4, m: int = 2) -> tuple[LinearSteps, np.ndarray, np.ndarray]:
@@ -83,7 +83,7 @@ def test_the_same_compiled():
 def test_prefixes_keep_their_order(count):
     rng = np.random.default_rng(count)
     parts = rng.normal(size=(count, 2, 2))
-    (found,) = scanned(lambda i, j: [i[0] @ j[0]], [parts], np)
+    (found,) = associative_scan(lambda i, j: [i[0] @ j[0]], [parts], np)
     product = np.eye(2)
     for k in range(count):
         product = product @ parts[k]

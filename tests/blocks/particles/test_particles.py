@@ -119,12 +119,33 @@ def test_the_likelihood_of_an_attitude_is_normal_in_the_rotation_vector():
         assert found[i] == pytest.approx(multivariate_normal(np.zeros(3), 0.16 * np.eye(3)).logpdf(error))
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.05, 0.15, 1.0])
+def test_attitudes_that_are_far_from_the_best_are_64_behind_it(noise):
+    cloud = start_cloud(400, attitude=MEASURED.attitude, spread=StartSpread(tilt=0.05, heading=1.5))
+    signs = np.where(np.arange(400) % 2 == 1, -1.0, 1.0)  # q and -q are one attitude
+    cloud = cloud.replace(attitude=cloud.attitude * signs)
+    found = attitude_likelihood.step(cloud, MEASURED, noise=noise, xp=np).value
+    back = g.conjugate(cloud.attitude.T, xp=np)
+    error = g.to_rotation_vector(g.multiply(back, MEASURED.attitude, xp=np), xp=np)
+    expected = multivariate_normal(np.zeros(3), noise**2 * np.eye(3)).logpdf(error)
+    far = expected < expected.max() - 64.0
+    assert (far.sum() > 20) == (noise < 0.3)
+    np.testing.assert_allclose(found, np.maximum(expected, expected.max() - 64.0), rtol=1e-9, atol=1e-9)
+
+
+def test_an_attitude_that_was_not_measured_tells_no_particle_from_another():
+    half = MEASURED.replace(attitude=np.array([0.8, np.nan, 0.6, 0.0]))
+    found = attitude_likelihood.step(a_cloud(n=50), half, noise=0.01, xp=np).value
+    np.testing.assert_array_equal(found, found[0])
+    assert np.isfinite(found[0])
+
+
 def test_weights_stay_normalised_however_unlikely_all_particles_are():
     cloud = a_cloud()
     hopeless = LogLikelihood(value=np.array([-1e4, -1e4 - 1.0, -2e4, -3e4, -1e6]))
     nothing = LogLikelihood(value=np.zeros(N))
     weight = np.exp(reweight.step(cloud, hopeless, nothing, xp=np).log_weight)
-    assert weight.sum() == pytest.approx(1.0, abs=1e-12)
+    assert weight.sum() == pytest.approx(1.0, abs=1e-11)  # a logarithm of 1e4 is rounded by 1e-12
     before = np.exp(cloud.log_weight)
     assert weight[1] / weight[0] == pytest.approx(before[1] / before[0] * np.exp(-1.0), rel=1e-9)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.compile import FLAGS, CompileError, load
+from flowgraph.engines.c.compile import LANES, CompileError, load
 from flowgraph.engines.c.lanes.expressions import NoLanesError
 from flowgraph.engines.c.lanes.source import WIDTH, generate_lanes
 from flowgraph.engines.c.library import Outputs, Room, Structs, pointers
@@ -45,7 +45,7 @@ class Lanes(Outputs):
         patterns = None if every_pattern(pipeline) is not None else sorted(keys)
         text = kept_text(pipeline, names.module, ("lanes", patterns, passes), write)
         super().__init__(pipeline, np.float64, presence_of_rows(text["presence"]))
-        self._library = load(text["files"], FLAGS)
+        self._library = load(text["files"], LANES)
         self._library.fg_play.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 6]
         self._library.fg_play.restype = None
         self._library.fg_size.restype = ctypes.c_size_t
@@ -130,7 +130,7 @@ class Lanes(Outputs):
             For each run how many rows each output has now, and (T,) uint64 with bit k set where output k was
             present.
         """
-        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key)
+        time, key = np.ascontiguousarray(time), np.ascontiguousarray(key, np.int64)
         outputs = len(self.pipeline.outputs)
         made = np.empty((WIDTH, len(time)), np.uint64)
         counts = np.zeros((WIDTH, max(outputs, 1)), np.int64)

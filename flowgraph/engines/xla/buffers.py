@@ -1,0 +1,115 @@
+"""What goes into one call of a compiled scan: arrays of the ticks of a chunk, filled again for each chunk.
+
+They lie where XLA takes an array as it is, at a multiple of 64 bytes; one at another address would be copied.
+An input that is not there at every tick is spread over the ticks here, a chunk at a time, so that no array
+of all ticks is made of it and what is written is still in the cache when it is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flowgraph.data.tape import Rows
+
+_ALIGNMENT = 64
+
+
+class Buffers:
+    """The choice of a program, the time and the inputs at the ticks of one chunk.
+
+    Args:
+        ticks: of a chunk.
+        choice: the dtype of what chooses a program.
+        timed: whether the time is read.
+        inputs: for each input port its leaves, (..., T or fewer, ...).
+        axis: of the ticks in these.
+        real: the dtype of real numbers.
+        idle: the choice at ticks in which nothing is present.
+    """
+
+    def __init__(
+        self,
+        ticks: int,
+        choice: Any,
+        timed: bool,
+        inputs: Sequence[Sequence[np.ndarray]],
+        axis: int,
+        real: Any,
+        idle: int,
+    ) -> None:
+        self._ticks, self._axis, self._idle = ticks, axis, idle
+        self._choice = aligned((ticks,), choice)
+        self._time = aligned((ticks,), np.int64) if timed else None
+        self._leaves = tuple(
+            tuple(
+                aligned(
+                    (*x.shape[:axis], ticks, *x.shape[axis + 1 :]), real if x.dtype.kind == "f" else x.dtype
+                )
+                for x in port
+            )
+            for port in inputs
+        )
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What the scan goes through: choice, time (None where it is not read) and the leaves."""
+        return self._choice, self._time, self._leaves
+
+    def fill(
+        self,
+        choice: np.ndarray,
+        time: np.ndarray,
+        rows: Sequence[Rows],
+        inputs: Sequence[Sequence[np.ndarray]],
+        here: slice,
+    ) -> None:
+        """Take the ticks `here` of a recording; those that are short of a chunk are idle.
+
+        Args:
+            choice, time: of all ticks, (T,).
+            rows: for each input port at which ticks it has its rows.
+            inputs: for each input port its leaves, as they were given to the constructor.
+            here: from one tick to before another.
+        """
+        count = here.stop - here.start
+        self._choice[:count] = choice[here]
+        self._choice[count:] = self._idle
+        if self._time is not None:
+            self._time[:count] = time[here]
+            self._time[count:] = time[here.stop - 1]
+        before = (slice(None),) * self._axis
+        for at, port, leaves in zip(rows, inputs, self._leaves, strict=True):
+            places, part = _within(at, here)
+            for array, kept in zip(port, leaves, strict=True):
+                if isinstance(at, slice) and at.step is None:  # at all ticks
+                    kept[(*before, slice(count, None))] = 0
+                else:
+                    kept[...] = 0
+                kept[(*before, places)] = array[(*before, part)]
+
+    def holds(self, array: np.ndarray) -> bool:
+        """Whether an array lies in one of these, and so will not stay as it is."""
+        return any(np.may_share_memory(array, kept) for port in self._leaves for kept in port)
+
+
+def _within(rows: Rows, here: slice) -> tuple[Rows, slice]:
+    """Of some ticks those `here`, counted from its start, and which of them these are."""
+    if isinstance(rows, np.ndarray):
+        first, last = np.searchsorted(rows, (here.start, here.stop)).tolist()
+        return rows[first:last] - here.start, slice(first, last)
+    start, step = rows.start or 0, rows.step or 1
+    last = here.stop if rows.stop is None else min(here.stop, rows.stop)
+    before, within = (max(0, -(-(tick - start) // step)) for tick in (here.start, last))
+    return slice(start + before * step - here.start, max(last - here.start, 0), step), slice(before, within)
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array of zeros at an address that XLA takes as it is."""
+    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    room = np.zeros(size + _ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % _ALIGNMENT
+    made: np.ndarray = room[start : start + size].view(dtype).reshape(shape)
+    return made
