@@ -24,7 +24,6 @@ by local linearisation); for the sensors: R. Fiszel's thesis on reactive pose es
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from typing import Any
 
@@ -75,12 +74,10 @@ _MOVING = ("position", "moved")
 @functools.cache
 def _white(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What white noise on the acceleration leaves: the coefficients of dt, dt^2 and dt^3."""
-    both = itertools.product(_MOVING, repeat=2)
-    mixed = {pair: 0.5 for m in _MOVING for pair in (("velocity", m), (m, "velocity"))}
     return (
         layout.blocks({("velocity", "velocity"): 1.0}),
-        layout.blocks(mixed),
-        layout.blocks(dict.fromkeys(both, 1.0 / 3.0)),
+        layout.blocks({pair: 0.5 for m in _MOVING for pair in (("velocity", m), (m, "velocity"))}),
+        layout.blocks({(a, b): 1.0 / 3.0 for a in _MOVING for b in _MOVING}),
     )
 
 

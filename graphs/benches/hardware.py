@@ -16,6 +16,7 @@ import numpy as np
 
 from flowgraph import FlowgraphError, Report
 from flowgraph.data.files import put
+from flowgraph.data.registry import graph_names
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.engines.verilog.image import Image
@@ -47,7 +48,7 @@ def hardware(
     """The filters as hardware: cycles a tick, words compared with the interpreter, and a routed FPGA.
 
     Args:
-        graphs: names, between commas.
+        graphs: names, between commas; "all" for every one that needs no host.
         width: bits of a word.
         bound: of the difference of the estimate to float64, relative to its size.
         flights: simulated ones, that the formats are found on; one more judges.
@@ -67,7 +68,8 @@ def hardware(
         there is no machine.
     """
     rows = []
-    for name in (n.strip() for n in graphs.split(",") if n.strip()):
+    names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
+    for name in names:
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
             "graph": name, "particles": particles or None, "width": width, "lanes": 1, "multipliers": 1,
         }  # fmt: skip

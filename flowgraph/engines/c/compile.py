@@ -62,7 +62,7 @@ _FIRST = (
     "-fvect-cost-model=dynamic",
     "--param=sccvn-max-alias-queries-per-access=50",
 )
-"""gcc's first level, and of the others what straight code gains by: six tenths of the time to compile."""
+"""gcc's first level, and of the others what generated code gains by: six tenths of the time to compile."""
 
 FLAGS = (*_FIRST, *_COMMON, *_NARROW)
 """What `engine="c"` compiles with; none of them changes what NaN or infinity mean.
@@ -75,7 +75,7 @@ LANES = (_FULL, *_COMMON, *_NARROW)
 """The flags for runs that go as lanes: the vectors are in the text, and loops go around them."""
 
 LOOPS = (
-    _FULL,
+    *_FIRST,
     *_COMMON,
     "-fno-tree-slp-vectorize",  # so loops may have whole vectors, see above
     "--param=max-completely-peeled-insns=64",  # larger loops stay loops: half the time to compile

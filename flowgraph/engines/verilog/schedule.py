@@ -19,7 +19,7 @@ LATENCY = 23
 """Cycles from the microword that writes a word to the first that can read it."""
 
 AHEAD = 4
-"""Cycles more where the machine has rows: the places of words are worked out before they are read."""
+"""Cycles more until an index can be read: the places of words are worked out before they are read."""
 
 UNIT_LATENCY = {"divide": 45, "root": 45, "logarithm": 193, "angle": 93}
 """Cycles from the microword that starts a unit to the first that can take what it made."""
@@ -107,15 +107,14 @@ class Schedule:
 def schedule(plan: Plan, rows: bool = False) -> Schedule:
     """The order of a tick's sums, for a machine with rows or without."""
     made = Schedule(repeats=rows)
-    latency = LATENCY + AHEAD * rows
     ready: dict[int, int] = {}  # cycles from which a word, or all of a row, can be read
     spans: list[tuple[int, int]] = []
     for stage in plan.stages:
         start = len(made.words)
         if stage.row:
-            _loop(plan, stage, made, ready, latency)
+            _loop(plan, stage, made, ready)
         else:
-            _words(plan, stage, made, ready, latency)
+            _words(plan, stage, made, ready)
         spans.append((start, len(made.words) - 1))
     if made.words and made.words[-1].ends:  # the program halts behind its last loop
         made.words.append(Word())
@@ -124,9 +123,9 @@ def schedule(plan: Plan, rows: bool = False) -> Schedule:
     return made
 
 
-def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], latency: int) -> None:
+def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int]) -> None:
     """Words one by one, with terms that are many between them."""
-    order = _Order(plan, [(n, 0) for n in stage.order], latency, ready, made.cycles)
+    order = _Order(plan, [(n, 0) for n in stage.order], ready, made.cycles)
     last: int | None = None
     idle = 0
     for slot in order.slots:
@@ -144,7 +143,7 @@ def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], late
         made.words.append(Word(slot))
         made.cycles += slot.term.times or 1
         if slot.writes is not None:
-            ready[slot.writes] = made.cycles - 1 + latency
+            ready[slot.writes] = made.cycles - 1 + _latency(slot.node)
 
 
 def _wait(made: Schedule, cycles: int) -> bool:
@@ -157,14 +156,14 @@ def _wait(made: Schedule, cycles: int) -> bool:
     return False
 
 
-def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], latency: int) -> None:
+def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int]) -> None:
     """All rows of one length: a round as often as it takes."""
     best: tuple[float, int, _Order] | None = None
     least = 0
     for step in range(1, min(_ABREAST, stage.row) + 1):
         if stage.row % step:
             continue
-        order = _Order(plan, [(n, k) for n in stage.order for k in range(step)], latency, {}, 0)
+        order = _Order(plan, [(n, k) for n in stage.order for k in range(step)], {}, 0)
         pace = max(len(order.slots), _LEAST) / step
         longest = max(_LONGEST, 1.3 * least) if least else len(order.slots)
         least = least or len(order.slots)
@@ -199,15 +198,15 @@ def _loop(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], laten
     made.cycles = begin + rounds * len(body)
     for t, slot in enumerate(slots):
         if slot is not None and slot.writes is not None:
-            at = begin + (rounds - 1) * len(body) + t + latency
+            at = begin + (rounds - 1) * len(body) + t + _latency(slot.node)
             ready[slot.writes] = max(ready.get(slot.writes, 0), at)
 
 
 class _Order:
     """The order of sums that are made together: `slots`, a microword a cycle, None where nothing begins."""
 
-    def __init__(self, plan: Plan, items: list[Item], latency: int, ready: dict[int, int], now: int) -> None:
-        self.plan, self.latency = plan, latency
+    def __init__(self, plan: Plan, items: list[Item], ready: dict[int, int], now: int) -> None:
+        self.plan = plan
         self.nodes, self.made = plan.tick.nodes, plan.tick.made
         self.slots: list[Slot | None] = []
         self.now = 0  # in cycles
@@ -229,7 +228,7 @@ class _Order:
         return max(self.ready.get(self._item(r, nth), 0) for r in self.plan.sources(n))
 
     def _make(self, items: list[Item]) -> None:
-        made, latency = self.made, self.latency
+        made = self.made
         needs = {
             (n, k): sorted({x for r, _ in self.plan.reads(made(n)) if (x := self._item(r, k)) in self.within})
             for n, k in items
@@ -249,7 +248,7 @@ class _Order:
         for x in sorted(items, reverse=True):
             node = made(x[0])
             behind = max((urgent[u] for u in users[x]), default=0)
-            urgent[x] = behind + _latency(node, latency) + sum(t.times or 1 for t in node.terms)
+            urgent[x] = behind + _latency(node) + sum(t.times or 1 for t in node.terms)
         takes = {x: len(users[x]) for x in items if made(x[0]).mode == "START"}
         waiting: list[tuple[int, Item]] = []
         free: list[tuple[int, Item]] = []
@@ -281,7 +280,7 @@ class _Order:
                 busy[node.unit] = takes[x]
             self._put(x, node)
             left -= 1
-            self.ready[x] = self.now - 1 + _latency(node, latency)
+            self.ready[x] = self.now - 1 + _latency(node)
             if node.terms[0].kind == "TAKE":
                 busy[node.unit] -= 1
                 if not busy[node.unit]:
@@ -320,8 +319,11 @@ class _Order:
         return max(when[k] - n for n, k in enumerate(order)), list(order)
 
 
-def _latency(node: Sum, latency: int) -> int:
-    return UNIT_LATENCY[UNITS[node.unit]] if node.mode == "START" else latency
+def _latency(node: Sum) -> int:
+    """Cycles from the last microword of a sum to the first that can read it."""
+    if node.mode == "START":
+        return UNIT_LATENCY[UNITS[node.unit]]
+    return LATENCY + AHEAD * (node.mode == "INDEX")
 
 
 def _places(plan: Plan, made: Schedule, spans: list[tuple[int, int]]) -> None:

@@ -303,7 +303,7 @@ def test_single_precision_keeps_the_times_whole(engine):
     mixed = {**moved, "z": delayed(moved["z"], ("0ms", "300ms"))}
     found = simulate(rewound.build(), mixed, engine=engine, dtype="float32")
     assert sorted(found["stamp"].value.tolist()) == moved["z"].time.tolist()
-    rounded = len(U) * np.finfo(np.float32).eps  # at most, of numbers near one
+    rounded = len(U) * float(np.finfo(np.float32).eps)  # at most, of numbers near one
     np.testing.assert_allclose(found["x_now"].value[-1], SORTED["x"].value[-1], rtol=0.0, atol=rounded)
 
 

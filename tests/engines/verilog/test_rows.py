@@ -13,7 +13,7 @@ from flowgraph.engines.verilog import simulate as simulation
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.nodes import Sum
 from flowgraph.engines.verilog.plan import Plan
-from flowgraph.engines.verilog.schedule import LATENCY, Loop, schedule
+from flowgraph.engines.verilog.schedule import AHEAD, LATENCY, Loop, schedule
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.tick import Tick
 from flowgraph.pipeline.format_files import with_formats
@@ -176,7 +176,7 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
                     look(n, 0 if every else slot.nth, lane, every)
         if slot.writes is not None and slot.writes not in plan.fixed:
             place, word = place_of(slot.writes, slot.nth, lane)
-            due.append((now + LATENCY + 4, place, word))
+            due.append((now + LATENCY + AHEAD * (slot.mode == "INDEX"), place, word))
 
     k = 0
     head = Loop(0)
