@@ -3,7 +3,7 @@
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
 on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
-sensor does to it. `errors` judges navigation by the path of an antenna, and by directions.
+sensor does to it. `layout` says where the parts of their states stand. `errors` judges navigation by the path of an antenna, and by directions.
 """
 
 from __future__ import annotations
@@ -62,10 +62,14 @@ from flowgraph.blocks.outdoor.flight import (
     outdoor_flight,
     without_gaps,
 )
+from flowgraph.blocks.outdoor.layout import Layout, belief_layout, particle_layout
 from flowgraph.blocks.outdoor.recording import outdoor_recording
 from flowgraph.blocks.outdoor.tracks import as_geojson, as_gpx, as_kml, as_table, track_files
 
 __all__ = [
+    "Layout",
+    "belief_layout",
+    "particle_layout",
     "ACCELEROMETER_BIAS",
     "BIASED",
     "GYRO_BIAS",

@@ -15,7 +15,7 @@ import numpy as np
 
 from flowgraph import Array
 
-__all__ = ["BELIEF", "PARTICLE", "Layout", "belief_layout", "particle_layout"]
+__all__ = ["Layout", "belief_layout", "particle_layout"]
 
 
 class Layout:
