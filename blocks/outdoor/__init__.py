@@ -3,7 +3,8 @@
 `flight` says which sensors there are and how good, and where a filter starts. `belief` is an error-state
 Kalman filter that remembers where the last picture was taken; `cloud` is a Rao-Blackwellized particle filter
 on the same sensors, with the same knowledge, so that the two can be compared, and `corrections` what each
-sensor does to it. `layout` says where the parts of their states stand. `errors` judges navigation by the path of an antenna, and by directions.
+sensor does to it. `layout` says where the parts of their states stand. `errors` judges navigation by the
+path of an antenna, and by directions.
 """
 
 from __future__ import annotations
