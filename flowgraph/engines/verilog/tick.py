@@ -12,7 +12,7 @@ from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.verilog.lookup import Lookup
 from flowgraph.engines.verilog.nodes import Held, Term
-from flowgraph.engines.verilog.real import COMPARE, no_form
+from flowgraph.engines.verilog.real import COMPARE, WORD, no_form
 from flowgraph.engines.verilog.rows import root_of
 from flowgraph.engines.verilog.whole import stacked
 from flowgraph.errors import LoweringError
@@ -227,23 +227,34 @@ class Tick(Lookup):
         return made[..., 0] if i.spec.dtype == "real" else made
 
     def _extreme(self, op: str, numbers: Sequence[int], by: Sequence[int], end: int) -> int:
-        if op in ("max", "min"):
+        """The largest or smallest of words at one fraction, to which `by` shifts each, or its place.
+
+        What is best so far is kept as it lies, a word for each shift, of which all but one are zero: at the
+        finest fraction of all it might fit no word.
+        """
+        if op in ("max", "min") and -min(by) <= WORD - self.now:
             ones = [self.one] * len(numbers)
             terms = self.along("MUL", zip(numbers, ones, by, strict=True), op == "min")
             if any(t.times for t in terms):
                 peak = self.sum(terms, mode="RAW", gather="peak")
                 return self.sum([self.plain(peak, 0, op == "min")], end=end)
         row = [self.word(n) for n in numbers]
-        order = "greater" if op in ("max", "argmax") else "less"
-        best, best_by, place = row[0], by[0], self.zero
+        mode, turned = COMPARE["greater" if op in ("max", "argmax") else "less"]
+        best, place = {by[0]: row[0]}, self.zero
         for k in range(1, len(row)):
-            other = self.compared(order, row[k], best, by[k], best_by)
+            held = [self.plain(word, shift, not turned) for shift, word in best.items()]
+            other = self.sum([self.plain(row[k], by[k], turned), *held], mode=mode)
             if op.startswith("arg"):
                 place = self.chosen(other, self.constant(k), place, mode="RAW")
-            best, best_by = self.chosen(other, row[k], best, by[k], best_by, mode="RAW"), 0
+            best = {
+                shift: self.chosen(
+                    other, row[k] if shift == by[k] else self.zero, best.get(shift, self.zero), mode="RAW"
+                )
+                for shift in dict.fromkeys([*best, by[k]])
+            }
         if op.startswith("arg"):
             return place
-        return self.sum([self.plain(best, best_by)], end=end)
+        return self.sum([self.plain(word, shift) for shift, word in best.items()], end=end)
 
     def _whole_along(self, s: Site, row: list[tuple[int, ...]]) -> tuple[int, ...]:
         op = s.i.op

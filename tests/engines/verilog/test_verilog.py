@@ -128,6 +128,31 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     assert _bench(player, file) == (1, compared, 1)
 
 
+@block
+def apart(x: Three, *, xp) -> Three:
+    """Extremes of numbers of very different sizes: at the fraction of the finest, the largest fits no word."""
+    sizes = xp.stack([1e-6 * x[0], x[1], 1e3 * x[2], 1e-6 * x[1]])
+    place = xp.argmax(xp.abs(sizes))
+    return xp.stack([xp.max(sizes), xp.min(sizes), xp.asarray(place, dtype=x.dtype)])
+
+
+@graph
+def extremes(x: Stream[Three], y: Stream[Scalar]):
+    return {"z": apart(x), "y": y}
+
+
+def test_extremes_of_numbers_of_very_different_sizes():
+    need_verilator()
+    built = extremes.build()
+    subject = LoweredGraph(built)
+    pipeline = with_formats(subject.pipeline, sizes_of(built, flight()).formats(28, 2.0))
+    tape = subject.tape(flight())
+    player = Simulated(pipeline, tape.patterns, check=True)
+    player.play(tape, subject.start(RunOptions()).cells, seed_words(0), None)
+    assert player.compared > 200
+    assert player.differing == 0
+
+
 def _bench(player, file):
     run = [str(player.built.program), str(file)]
     done = subprocess.run(
