@@ -49,7 +49,7 @@ def registers(
     """
     rows: list[dict[str, Any]] = []
     for n in _numbers(particles, "particles"):
-        flight = load_flight("sim", seed=seed, settings={"duration": duration})
+        flight = load_flight("sim", seed=seed, settings={"duration": str(duration)})
         case = find_graph("rbpf_indoor").case(flight, particles=n, seed=seed)
         subject = LoweredGraph(case.graph)
         start = subject.start(RunOptions(seed=seed))

@@ -76,6 +76,9 @@ def call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object)
 _ACCUMULATORS = 12
 """Vectors of sums that are under way together: what is one after the other waits for each sum."""
 
+_PACKED = 16_384
+"""Elements of a matrix that are laid out for vectors at a time: they lie on the stack."""
+
 
 def _matmul(w: Lines, m: Macro) -> None:
     type_ = ctype(m.output.buffer.dtype, w.write.real)
@@ -93,18 +96,30 @@ def _matmul(w: Lines, m: Macro) -> None:
         packed = type_ == w.write.real and rows >= 4 and columns > 1
         w.write.packs |= packed
         kept, wide = ("fg_pack", f"FG_PACKS({columns})") if packed else (type_, columns)
+        deep = min(inner, max(_PACKED // columns, 1))
+        parted = packed and deep < inner
+        begin, end = ("first", "last") if parted else (0, inner)
+        nth = "(k - first)" if parted else "k"
+
+        def so_far(r: int) -> list[str]:
+            """What the parts before have summed up."""
+            return [
+                f"        for (int32_t j = 0; first && j < {columns}; j++) (({type_} *)made)[j] = out[{to(r)}];",
+                f"        for (int32_t j = 0; first && j < {wide}; j++) row{r}[j] = made[j];",
+            ]
 
         def block(first: int, last: int, step: int) -> list[str]:
             """Rows from `first` on up to `last`, so many at a time."""
             each = range(step)
-            factor = f"right[{wide} * k + j]" if packed else f"b[{right}]"
+            factor = f"right[{wide} * {nth} + j]" if packed else f"b[{right}]"
             lines = [
                 f"    for (int32_t i = {first}; i < {last}; i += {step}) {{",
                 *(f"        {kept} row{r}[{wide}];" for r in each),
                 f"        for (int32_t j = 0; j < {wide}; j++) {{",
                 *(f"            row{r}[j] = {'none' if packed else '0'};" for r in each),
                 "        }",
-                f"        for (int32_t k = 0; k < {inner}; k++) {{",
+                *([line for r in each for line in so_far(r)] if parted else []),
+                f"        for (int32_t k = {begin}; k < {end}; k++) {{",
                 *(f"            const {type_} left{r} = a[{at(r)}];" for r in each),
                 f"            for (int32_t j = 0; j < {wide}; j++) {{",
                 *(f"                row{r}[j] += left{r} * {factor};" for r in each),
@@ -121,10 +136,18 @@ def _matmul(w: Lines, m: Macro) -> None:
         together = max(1, min(_ACCUMULATORS // -(-columns // 4), 4)) if packed else 1
         full = rows - rows % together
         copy = [
-            f"    fg_pack right[{inner} * {wide}], made[{wide}];",
+            f"    fg_pack right[{deep} * {wide}], made[{wide}];",
             "    const fg_pack none = FG_ZERO;",
-            f"    for (int32_t k = 0; k < {inner}; k++) {{",
-            f"        {type_} *const row = ({type_} *)(right + {wide} * k);",
+            *(
+                [
+                    f"    for (int32_t first = 0; first < {inner}; first += {deep}) {{",
+                    f"    const int32_t last = first < {inner - deep} ? first + {deep} : {inner};",
+                ]
+                if parted
+                else []
+            ),
+            f"    for (int32_t k = {begin}; k < {end}; k++) {{",
+            f"        {type_} *const row = ({type_} *)(right + {wide} * {nth});",
             f"        for (int32_t j = 0; j < {columns}; j++) row[j] = b[{right}];",
             f"        for (int32_t j = {columns}; j < FG_PACK * {wide}; j++) row[j] = 0;",
             "    }",
@@ -138,6 +161,7 @@ def _matmul(w: Lines, m: Macro) -> None:
                 *(copy if packed else []),
                 *block(0, full, together),
                 *(block(full, rows, rows - full) if full < rows else []),
+                *(["    }"] if parted else []),
                 "}",
                 "",
             ]

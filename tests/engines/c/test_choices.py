@@ -184,9 +184,13 @@ def test_only_a_symmetric_positive_matrix_is_solved_without_exchange_of_rows():
             np.testing.assert_allclose(batch["x"].value[k, t], expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(("rows", "inner", "columns"), [(15, 30, 15), (30, 6, 15), (5, 40, 3), (17, 13, 25)])
+@pytest.mark.parametrize(
+    ("rows", "inner", "columns"), [(15, 30, 15), (30, 6, 15), (5, 40, 3), (17, 13, 25), (9, 12_345, 4)]
+)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_products_by_blocks_of_rows(rows, inner, columns, dtype):
+    """The last also by parts of the sum, since what is laid out for vectors lies on the stack."""
+
     class Factors(Signal):
         a: Array = real(rows, inner)
         b: Array = real(inner, columns)
@@ -206,4 +210,5 @@ def test_products_by_blocks_of_rows(rows, inner, columns, dtype):
     a, b = draw.normal(size=(2, rows, inner)), draw.normal(size=(2, inner, columns))
     given = Series(np.arange(2) * 1_000_000, Factors(a=a, b=b))
     found = simulate(g.build(), {"given": given}, engine="c", dtype=dtype)["product"].value
-    np.testing.assert_allclose(found, a @ b, atol=1e-12 if dtype == "float64" else 1e-4)
+    bound = (1e-12 if dtype == "float64" else 1e-4) * max(1.0, inner / 100)
+    np.testing.assert_allclose(found, a @ b, atol=bound)
