@@ -217,9 +217,7 @@ class GraphFunction:
             )
         known = inspect.signature(self.prepare).parameters
         if not any(p.kind is p.VAR_KEYWORD for p in known.values()):
-            for key in (
-                settings.keys() - getattr(self.prepare, "refused", {}).keys()
-            ):  # see there
+            for key in settings.keys() - getattr(self.prepare, "refused", {}).keys():  # see there
                 if key not in known:
                     raise UnknownNameError("setting", key, list(known)[1:], path=self.name)
         return self.prepare(flight, **settings)

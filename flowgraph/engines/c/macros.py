@@ -103,8 +103,9 @@ def _matmul(w: Lines, m: Macro) -> None:
 
         def so_far(r: int) -> list[str]:
             """What the parts before have summed up."""
+            sums = f"(({type_} *)made)[j]"
             return [
-                f"        for (int32_t j = 0; first && j < {columns}; j++) (({type_} *)made)[j] = out[{to(r)}];",
+                f"        for (int32_t j = 0; first && j < {columns}; j++) {sums} = out[{to(r)}];",
                 f"        for (int32_t j = 0; first && j < {wide}; j++) row{r}[j] = made[j];",
             ]
 

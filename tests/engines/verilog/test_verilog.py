@@ -130,7 +130,7 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
 
 @block
 def apart(x: Three, *, xp) -> Three:
-    """Extremes of numbers of very different sizes: at the fraction of the finest, the largest fits no word."""
+    """Extremes of numbers so different that at the fraction of the finest the largest fits no word."""
     sizes = xp.stack([1e-6 * x[0], x[1], 1e3 * x[2], 1e-6 * x[1]])
     place = xp.argmax(xp.abs(sizes))
     return xp.stack([xp.max(sizes), xp.min(sizes), xp.asarray(place, dtype=x.dtype)])
