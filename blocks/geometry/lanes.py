@@ -157,6 +157,17 @@ def matrix_product(a: Array, b: Array) -> Array:
     return a[:, 0:1, :] * b[0:1, :, :] + a[:, 1:2, :] * b[1:2, :, :] + a[:, 2:3, :] * b[2:3, :, :]
 
 
+def _triangle(S: Array) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """The pivots D of S = L D L^T, and of the unit lower triangle L the entries 10, 20 and 21, (n) each."""
+    first = S[0, 0, :]
+    a, b = S[1, 0, :] / first, S[2, 0, :] / first
+    second = S[1, 1, :] - a * S[1, 0, :]
+    rest = S[2, 1, :] - b * S[1, 0, :]
+    c = rest / second
+    third = S[2, 2, :] - b * S[2, 0, :] - c * rest
+    return (first, second, third), (a, b, c)
+
+
 def inverse_and_log_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
     """The inverses (3, 3, n) and log det (n) of symmetric positive matrices (3, 3, n), by L D L^T.
 
@@ -164,12 +175,7 @@ def inverse_and_log_determinant(S: Array, *, xp: Any) -> tuple[Array, Array]:
     of variances, where a determinant is of the size of their cube, which words of few bits do not hold (Golub
     and Van Loan, Matrix Computations, section 4.1).
     """
-    first = S[0, 0, :]
-    a, b = S[1, 0, :] / first, S[2, 0, :] / first
-    second = S[1, 1, :] - a * S[1, 0, :]
-    rest = S[2, 1, :] - b * S[1, 0, :]
-    c = rest / second
-    third = S[2, 2, :] - b * S[2, 0, :] - c * rest
+    (first, second, third), (a, b, c) = _triangle(S)
     corner = a * c - b  # M = [[1, 0, 0], [-a, 1, 0], [corner, -c, 1]]
     z = 1.0 / third
     zx, zy = corner * z, -c * z
@@ -185,12 +191,7 @@ def solve_and_log_determinant(S: Array, B: Array, *, xp: Any) -> tuple[Array, Ar
     Forward through L, divided by D, back through L^T: each quotient is of the size of its own column, where
     an inverse has one size for all, and loses in words of few bits what a column has beside a large pivot.
     """
-    first = S[0, 0, :]
-    a, b = S[1, 0, :] / first, S[2, 0, :] / first
-    second = S[1, 1, :] - a * S[1, 0, :]
-    rest = S[2, 1, :] - b * S[1, 0, :]
-    c = rest / second
-    third = S[2, 2, :] - b * S[2, 0, :] - c * rest
+    (first, second, third), (a, b, c) = _triangle(S)
     x, y, z = B[0, :, :], B[1, :, :], B[2, :, :]
     y = y - a * x
     z = (z - b * x - c * y) / third

@@ -109,8 +109,8 @@ class Step(abc.ABC):
 
 
 @dataclass(eq=False)
-class Evaluate(Step):
-    """An instruction at all ticks that need it, at once."""
+class Instructed(Step):
+    """What makes the value of one instruction, at the ticks that need it."""
 
     instruction: Instruction
     where: Patterns
@@ -123,6 +123,11 @@ class Evaluate(Step):
     @property
     def takes(self) -> tuple[int, ...]:
         return self.instruction.args
+
+
+@dataclass(eq=False)
+class Evaluate(Instructed):
+    """An instruction at all ticks that need it, at once."""
 
     def __post_init__(self) -> None:
         self.run = bound(self.instruction, self.real)
