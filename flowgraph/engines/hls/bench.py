@@ -171,7 +171,7 @@ _MAKEFILE = """\
 PYTHON ?= python3
 FOUND = import importlib.util as u; print(u.find_spec("hls4ml").submodule_search_locations[0])
 AP_TYPES ?= $(shell $(PYTHON) -c '$(FOUND)')/templates/vivado/ap_types
-CXXFLAGS ?= -std=c++14 -O1 -Wall -Wno-unknown-pragmas
+CXXFLAGS ?= -std=c++14 -O1 -Wall -Wno-unknown-pragmas -Wno-uninitialized -Wno-maybe-uninitialized
 
 replay: NAME_hls.cpp NAME_hls.h bench.cpp
 \t$(CXX) $(CXXFLAGS) -isystem $(AP_TYPES) -o $@ NAME_hls.cpp bench.cpp
