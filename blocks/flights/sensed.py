@@ -1,4 +1,4 @@
-"""A world and sensors of choice in one graph: of it, a flight of `sim:thesis`, `roundtrip` or `hover` is a run.
+"""A world and sensors of choice in one graph, of which flights of `sim:thesis` and its kin are runs.
 
 Each sensor has a clock of its own, a source without data, and is there where its clock is. One that is late
 fires when its reading arrives, and reads the motion of then. How late a reading is that trembles is drawn
@@ -57,8 +57,9 @@ def sensed(
     """A body in a world, and the sensors that have clocks.
 
     `start` ticks once, at 0, and is there where something is drawn once (`begins`): the constant biases, and
-    what the world leaves open if no `plan` tells it, which then comes at 0. There is a truth at each `truth`. `sensors` has the settings of each,
-    and of the parts of the IMU, as `worlds.SENSORS` lists them.
+    what the world leaves open if no `plan` tells it, which then comes at 0. There
+    is a truth at each `truth`. `sensors` has the settings of each, and of the parts of the IMU, as
+    `worlds.SENSORS` lists them.
     """
     given = {
         "imu": imu, "gyro": gyro, "accelerometer": accelerometer,
@@ -77,7 +78,8 @@ def sensed(
     now = [name for name in clocks if not (late(sensors[name]) or _of_a_time(sensors[name]))]
     here: dict[str, Any] = {}
     everyone = ["truth", *now]
-    for some in (everyone[k : k + _TOGETHER] for k in range(0, len(everyone), _TOGETHER)):
+    for k in range(0, len(everyone), _TOGETHER):
+        some = everyone[k : k + _TOGETHER]
         at = _any([clocks.get(name, truth) for name in some])
         here.update(dict.fromkeys(some, world_motion(shape, at=at, world=world)))
 

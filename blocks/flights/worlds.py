@@ -196,8 +196,10 @@ def _made_by(kind: str, chosen: tuple[str, ...], numbers: tuple[tuple[str, float
         name: ticks(step, start=first, until=max(end + 1 - first, 0), name=name)
         for name, (first, step) in clocks.items()
     }
-    given = partial(_planned, numbers=n) if kind == "thesis" else lambda seed: {}
-    return Experiment(sensed, made, {"world": world, "sensors": sensors}, given)
+    told = {"world": world, "sensors": sensors}
+    if kind == "thesis":
+        return Experiment(sensed, made, told, partial(_planned, numbers=n))
+    return Experiment(sensed, made, told)
 
 
 @lru_cache(maxsize=8)

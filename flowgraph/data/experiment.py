@@ -20,7 +20,7 @@ class Experiment:
         world: its sources keep time, and what is `given`; it gives the flight's streams, and "truth".
         ticks: for each of its sources the `Series` of when it ticks, all by one clock for all seeds.
         settings: of the world.
-        given: what its other sources are given for a seed, such as a way that no reaction of fixed size finds.
+        given: what its other sources get for a seed, such as a way that no reaction of fixed size finds.
     """
 
     world: GraphFunction

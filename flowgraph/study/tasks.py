@@ -205,8 +205,9 @@ def _whole(run: RunSpec) -> Case | None:
     kept = _wholes[which]
     if kept is None:
         return None
-    own = kept[1].given(run.seed)
-    return replace(kept[0], inputs={**kept[0].inputs, **own}) if own else kept[0]
+    case, own = kept[0], kept[1].given(run.seed)
+    assert not isinstance(case.inputs, Flight)
+    return replace(case, inputs={**case.inputs, **own}) if own else case
 
 
 _programs: OrderedDict[str, list[tuple[Any, Graph]]] = OrderedDict()

@@ -1,4 +1,4 @@
-"""Sensors of the simulated worlds: what they read, how wrong, when it arrives, and that none disturbs another."""
+"""Sensors of the simulated worlds: what they read, how wrong, when it arrives; none disturbs another."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ def fly(sensors: str, *, world: str = "thesis", seed: int = 5, noisy: bool = Fal
         name: SENSORS[name]
         for name in (*sensors.split(","), *(("gyro", "accelerometer") if "imu" in sensors else ()))
     }
-    quiet = {f"{name}.{part}": 0.0 for name, own in parts.items() for part in own if part.endswith("noise")}
+    quiet: dict[str, Any] = {
+        f"{name}.{part}": 0.0 for name, own in parts.items() for part in own if part.endswith("noise")
+    }
     instant = {
         f"{n}.{part}": v for n in parts for part, v in (("turn", 0), ("oversample", 1)) if part in SENSORS[n]
     }
     biased = {"gyro.bias": 0.0} if world == "roundtrip" and "gyro" in parts else {}
-    told = {name.replace("__", "."): value for name, value in given.items()}
+    told: dict[str, Any] = {name.replace("__", "."): value for name, value in given.items()}
     start = {} if noisy else quiet
     return load_world(world, seed=seed, settings={"sensors": sensors, **start, **instant, **biased, **told})
 
@@ -77,7 +79,9 @@ def test_without_noise_each_reads_the_truth() -> None:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_seed_repeats_and_the_name_chooses_the_draws(name: str) -> None:
-    wrong = {f"{name}__{part}": 0.1 for part in SENSORS[name] if part.endswith(("noise", "bias", "walk"))}
+    wrong: dict[str, Any] = {
+        f"{name}__{part}": 0.1 for part in SENSORS[name] if part.endswith(("noise", "bias", "walk"))
+    }
     wrong = wrong or {
         f"{part}__{what}": 0.1 for part in ("gyro", "accelerometer") for what in ("noise", "bias", "walk")
     }
@@ -87,20 +91,21 @@ def test_a_seed_repeats_and_the_name_chooses_the_draws(name: str) -> None:
     assert same(first, fly(name, seed=3, **common).streams[name])
     assert not same(first, fly(name, seed=4, **common).streams[name])
     # one that trembles draws its latency apart
-    late = fly(name, seed=3, **common, **{f"{name}__latency": 0.02, f"{name}__jitter": 0.001})
+    trembling: dict[str, Any] = {f"{name}__latency": 0.02, f"{name}__jitter": 0.001}
+    late = fly(name, seed=3, **common, **trembling)
     rows = np.searchsorted(first.time, late.info["stamps"][name])
     assert same(late.streams[name], first[rows])
     pairs = {"gps": "gps2", "attitude": "magnetic_attitude"}
     if name in pairs:
         twin = pairs[name]
-        more = {f"{twin}__rate": SENSORS[name]["rate"], f"{twin}__noise": 0.1}
+        more: dict[str, Any] = {f"{twin}__rate": SENSORS[name]["rate"], f"{twin}__noise": 0.1}
         both = fly(f"{name},{twin}", seed=3, **common, **more)
         assert same(first, both.streams[name])
         assert not same(first, both.streams[twin])
 
 
 def test_a_short_recording_is_the_beginning_of_a_long_one() -> None:
-    wrong = {"gyro__noise": 0.01, "gyro__bias": 0.1, "gyro__walk": 0.01}
+    wrong: dict[str, Any] = {"gyro__noise": 0.01, "gyro__bias": 0.1, "gyro__walk": 0.01}
     long, short = (fly("gyro", duration=until, **wrong).streams["gyro"] for until in (20, 5))
     assert len(short) == 1001
     assert same(short, long[:1001])
@@ -133,7 +138,7 @@ def test_attitude_noise_turns_the_body() -> None:
 
 
 def test_an_inertial_unit_tells_its_densities() -> None:
-    given = {
+    given: dict[str, Any] = {
         "gyro__noise": 0.02,
         "gyro__walk": 1e-3,
         "accelerometer__noise": 0.03,
@@ -145,7 +150,11 @@ def test_an_inertial_unit_tells_its_densities() -> None:
 @pytest.mark.parametrize("turn", [False, True])
 def test_readings_over_a_time_are_means_of_looks_and_turns(turn: bool) -> None:
     """Against the motion at the looks; before it begins the world stands still."""
-    over = {"gyro__turn": float(turn), "gyro__oversample": 4, "coordinate_acceleration__oversample": 4}
+    over: dict[str, Any] = {
+        "gyro__turn": float(turn),
+        "gyro__oversample": 4,
+        "coordinate_acceleration__oversample": 4,
+    }
     sensors = "gyro,coordinate_acceleration,accelerometer"
     flight = fly(sensors, accelerometer__oversample=4, **over)
     time = flight.streams["gyro"].time
@@ -165,7 +174,7 @@ def test_readings_over_a_time_are_means_of_looks_and_turns(turn: bool) -> None:
 
 def test_antenna_is_where_the_lever_puts_it() -> None:
     lever = (0.1, -0.2, 0.3)
-    arm = {f"gps__lever_{axis}": value for axis, value in zip("xyz", lever, strict=True)}
+    arm: dict[str, Any] = {f"gps__lever_{axis}": value for axis, value in zip("xyz", lever, strict=True)}
     read, motion = one("gps", gps__rate=10, **arm)
     apart = read["position"] - motion.position
     np.testing.assert_allclose(
@@ -212,7 +221,12 @@ def test_geodetic_known_places():
 
 def test_gps_as_a_receiver_gives_it() -> None:
     read, origin = one("gps", gps__noise=1.0)[0], (0.8, 0.1, 400.0)
-    earth = {"gps__latitude": 0.8, "gps__longitude": 0.1, "gps__height": 400.0, "gps__geodetic": 1}
+    earth: dict[str, Any] = {
+        "gps__latitude": 0.8,
+        "gps__longitude": 0.1,
+        "gps__height": 400.0,
+        "gps__geodetic": 1,
+    }
     geodetic = one("gps", gps__noise=1.0, **earth)[0]
     assert np.abs(geodetic["height"] - 400.0).max() < 10.0
     np.testing.assert_allclose(s.as_position(geodetic, origin)["position"], read["position"], atol=1e-6)
@@ -221,7 +235,11 @@ def test_gps_as_a_receiver_gives_it() -> None:
 
 
 def test_magnetometer_reads_the_field_in_the_body() -> None:
-    given = {"magnetometer__declination": 0.3, "magnetometer__dip": 1.0, "magnetometer__strength": 50e-6}
+    given: dict[str, Any] = {
+        "magnetometer__declination": 0.3,
+        "magnetometer__dip": 1.0,
+        "magnetometer__strength": 50e-6,
+    }
     read, motion = one("magnetometer", **given)
     field = s.earth_field(0.3, 1.0, 50e-6)
     world = g.rotate(motion.attitude, read["field"], xp=np)
@@ -286,7 +304,7 @@ def test_a_late_inertial_unit_reads_what_was() -> None:
 
 
 def test_gaussian_latency_arrives_in_order_of_arrival() -> None:
-    trembles = {"position__latency": 0.05, "position__jitter": 0.02, "position__rate": 100}
+    trembles: dict[str, Any] = {"position__latency": 0.05, "position__jitter": 0.02, "position__rate": 100}
     flight = fly("position", world="hover", duration=500, **trembles)
     late, stamp = flight.streams["position"], flight.info["stamps"]["position"]
     assert (np.diff(late.time) > 0).all()
@@ -299,7 +317,7 @@ def test_gaussian_latency_arrives_in_order_of_arrival() -> None:
 
 
 def test_arrivals_at_one_time_are_set_apart() -> None:
-    trembles = {"position__latency": 1e-9, "position__jitter": 5e-9, "position__rate": 1e9}
+    trembles: dict[str, Any] = {"position__latency": 1e-9, "position__jitter": 5e-9, "position__rate": 1e9}
     crowd = fly("position", world="hover", duration=3e-7, **trembles).streams["position"]
     assert len(crowd) > 200
     assert (np.diff(crowd.time) > 0).all()

@@ -35,6 +35,9 @@ def test_a_world_at_a_tick_is_that_of_all_times(name: str) -> None:
 
 
 def test_a_world_stands_at_its_end() -> None:
-    found = simulate(moving.build(world=Hover(1.0, drift=0.2).shaped(np.linspace(0.6, 3.1, 18))), {"clock": ticks("1s", until="4s")}).output
+    found = simulate(
+        moving.build(world=Hover(1.0, drift=0.2).shaped(np.linspace(0.6, 3.1, 18))),
+        {"clock": ticks("1s", until="4s")},
+    ).output
     assert (found["position"][2:] == found["position"][1]).all()
     assert (found["position"][0] != found["position"][1]).any()
