@@ -29,7 +29,7 @@ def test_a_streamed_run_writes_what_a_whole_one_gives_and_goes_on(tmp_path):
     assert done.exit_code == 0
     assert any(n.startswith("info: streamed to") for n in report["notes"])
     assert "assumed: the start is the truth's" in report["notes"]
-    flight = load_flight("sim", settings={"duration": 1.0})
+    flight = load_flight("sim", settings={"duration": "1"})
     case = find_graph("ins_eskf").case(flight)
     whole = simulate(case.graph, case.inputs)
     assert report["ticks"] == whole.ticks
