@@ -60,7 +60,7 @@ def test_after_15_s_the_error_is_at_most_a_fifth_of_that_of_the_gyroscope_alone(
 
 
 def test_with_the_heading_of_the_gyroscope_the_tilt_is_as_good():
-    """Root mean squares of three flights: in one of them the gyroscope alone drifts little about the level."""
+    """Root mean squares of three flights: in one the gyroscope alone drifts little about the level."""
     rms = lambda rows: np.sqrt(np.mean([row["tilt_rmse_deg"] ** 2 for row in rows]))
     filtered = [score(seed, 0.98, "gyroscope") for seed in range(3)]
     assert rms(filtered) <= rms([score(seed, 1.0) for seed in range(3)]) / 5.0
