@@ -153,7 +153,7 @@ def whole(runs: int, sample: int, duration: float, chunk: int) -> Row:
     """
     parameters = {"duration": duration, "start": "truth"}
     study = Study(
-        graphs=["ekf"], data=["sim:figure"], seeds=runs, engine="c", chunk=8 * chunk, parameters=parameters
+        graphs=["ekf"], data=["sim"], seeds=runs, engine="c", chunk=8 * chunk, parameters=parameters
     )
     before = _pool(sample, duration)
     with tempfile.TemporaryDirectory() as folder:
