@@ -34,7 +34,7 @@ class Writer(Elements):
             for i in program.instructions[first : first + _TOGETHER]:
                 given = [self.bound.fractions.get(a) for a in i.args]
                 out = self.bound.fractions.get(i.out) if i.spec.dtype == "real" else None
-                self.put(f"/* v{i.out} = {i.op} {list(i.spec.shape)}  {i.line} */")
+                self.said(i)
                 taken = max((widths[a] for a in i.args if a in widths), default=width)
                 self.most = self.bound.most(i.out) if i.out in widths else None
                 self.instruction(
@@ -129,12 +129,12 @@ class Writer(Elements):
         if i.op == "sum":
             return self.word(i.args[0], index)
         if i.op == "vecdot":
-            return f"{self.word(i.args[0], index)} * {self.word(i.args[1], index)}"
+            return self.product(self.word(i.args[0], index), self.word(i.args[1], index))
         *batch, row, k, column = index
         a, b = (self.shape(n) for n in i.args)
         left = [k] if len(a) == 1 else [*batch, row, k]
         right = [k] if len(b) == 1 else [*batch, k, column]
-        return f"{self.word(i.args[0], left)} * {self.word(i.args[1], right)}"
+        return self.product(self.word(i.args[0], left), self.word(i.args[1], right))
 
     def result(self, s: Site, index: list[str], axes: tuple[int, ...]) -> str:
         i = s.i
