@@ -5,7 +5,8 @@ must carry gravity and the acceleration, which fixes the body's z axis; with the
 and the jerk fixes the body rate (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control
 for quadrotors", ICRA 2011, eqs. 5-9 and sec. III).
 
-`figure_shape` draws the waves of a flight, once, where it fires; `figure_motion` is where the body is at a tick.
+`figure_shape` draws the waves of a flight, once, where it fires; `figure_motion` is where the body is at a
+tick.
 """
 
 from __future__ import annotations

@@ -70,9 +70,7 @@ def cases_of(name: str, settings: dict[str, str], more: dict[str, Any]) -> list[
     """Those of two seeds, and their flights."""
     found = []
     for seed in (0, 1):
-        flight = load_flight(
-            "sim", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings}
-        )
+        flight = load_flight("sim", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings})
         case, _ = tasks.prepared(name, "sim", seed, more, flight)
         found.append((case, flight))
     return found

@@ -15,7 +15,6 @@ from flowgraph.blocks.sensors import as_position
 from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-
 QUIET: dict[str, str | float] = {
     f"{sensor}.{part}": 0.0 for sensor in ("gyro", "accelerometer") for part in ("noise", "walk", "bias")
 }
@@ -26,7 +25,8 @@ def motion_of(seed: int, rate: float, duration: float = 20.0) -> dict[str, np.nd
     flight = load(seed=seed, settings={**QUIET, "imu.rate": rate, "duration": duration})
     imu, truth = flight.streams["imu"], flight.truth
     assert truth is not None
-    assert not truth.gyro_bias.any() and not truth.accelerometer_bias.any()
+    assert not truth.gyro_bias.any()
+    assert not truth.accelerometer_bias.any()
     parts = {name: truth[name] for name in ("position", "velocity", "attitude")}
     return {"seconds": imu.seconds, **parts, "rate": imu.gyro, "force": imu.specific_force}
 
