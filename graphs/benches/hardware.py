@@ -41,6 +41,7 @@ def hardware(
     duration: float = 3.0,
     compared: float = 0.5,
     particles: int = 0,
+    lanes: int = 1,
     routed: bool = False,
     folder: str = "",
     seed: int = 0,
@@ -55,6 +56,7 @@ def hardware(
         duration: of a flight, s.
         compared: seconds of it that are played in Verilator.
         particles: of the filters that have some; as many as `bench fixed` takes if left out.
+        lanes: of the machine; each has a multiplier of 34 bits.
         routed: whether to synthesise, place and route each.
         folder: where the files of each go; a temporary one if left out.
         seed: of the first flight.
@@ -71,7 +73,8 @@ def hardware(
     names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
     for name in names:
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
-            "graph": name, "particles": particles or None, "width": width, "lanes": 1, "multipliers": 1,
+            "graph": name, "particles": particles or None, "width": width,
+            "lanes": lanes, "multipliers": lanes,
         }  # fmt: skip
         try:
             some = [flown(name, seed + k, duration, particles) for k in range(flights + 1)]
@@ -108,7 +111,7 @@ def _tape(flight: Any, seconds: float | None) -> tuple[Any, Any]:
 
 def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
     events, start = _tape(flight, seconds)
-    player = Simulated(pipeline, events.patterns, check=True)
+    player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
     player.play(events, start.cells, seed_words(flight.seed), None)
     row |= {
         "values_compared": player.compared,
@@ -125,6 +128,6 @@ def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> Non
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / pipeline.name
         at.mkdir(parents=True, exist_ok=True)
-        for name, text in texts(Image(pipeline, events.patterns)).items():
+        for name, text in texts(Image(pipeline, events.patterns, row["lanes"])).items():
             put(at / name, text)
         row |= vars(route(at, pipeline.name))

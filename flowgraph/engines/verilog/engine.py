@@ -22,11 +22,21 @@ from flowgraph.recorder.random import seed_words
 
 
 class VerilogEngine(PipelineEngine):
-    """Registers, multipliers and block memory, clock by clock; equal to the engine `fixed` to the bit."""
+    """Registers, multipliers and block memory, clock by clock; equal to the engine `fixed` to the bit.
+
+    Args:
+        lanes: terms that the machine begins in a cycle.
+    """
 
     name = "verilog"
     dtypes = ("fixed", "float64")  # the second is what a user gets who leaves dtype out
     writes = True
+
+    def __init__(self, lanes: int = 1) -> None:
+        self.lanes = lanes
+
+    def with_lanes(self, lanes: int) -> VerilogEngine:
+        return VerilogEngine(lanes)
 
     def need(self) -> None:
         verilator()
@@ -35,13 +45,13 @@ class VerilogEngine(PipelineEngine):
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
         pipeline.need_numbers("fixed")
-        return Simulated(need_formats(pipeline), patterns)
+        return Simulated(need_formats(pipeline), patterns, lanes=self.lanes)
 
     def write(
         self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
     ) -> Mapping[str, Path]:
         found = {}
-        for name, text in texts(_image(pipeline)).items():
+        for name, text in texts(self._image(pipeline)).items():
             found[name] = folder / name
             with writes(found[name]):
                 folder.mkdir(parents=True, exist_ok=True)
@@ -52,16 +62,15 @@ class VerilogEngine(PipelineEngine):
         """Write the script that the bench plays: each tick, with the interpreter's words to compare."""
         tape = events_of(pipeline, inputs)
         cells = [c.reset for r in pipeline.registers for c in r.cells]
-        script = Script(_image(pipeline), tape, cells, seed_words(0), check=True)
+        script = Script(self._image(pipeline), tape, cells, seed_words(0), check=True)
         with writes(file):
             put(file, "\n".join(script.checked()) + "\n")
         return len(tape.time)
 
-
-def _image(pipeline: Pipeline) -> Image:
-    """The machine with all patterns of present inputs that have formats."""
-    known, _ = patterns_with_formats(need_formats(pipeline))
-    return Image(pipeline, known)
+    def _image(self, pipeline: Pipeline) -> Image:
+        """The machine with all patterns of present inputs that have formats."""
+        known, _ = patterns_with_formats(need_formats(pipeline))
+        return Image(pipeline, known, self.lanes)
 
 
 ENGINE = VerilogEngine()

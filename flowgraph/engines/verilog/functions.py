@@ -152,12 +152,27 @@ class Functions(Rows, abc.ABC):
         least = self.constant(1 - 2 ** (self.now - 1))
         return self.sum([Term("SEL", value, above), Term("SELN", least, above)])
 
+    def _top(self, a: int, b: int, fraction_a: int, fraction_b: int) -> int:
+        """The place of the highest bit of the larger of two numbers."""
+        lengths = (self.sum([Term("BITS", x, self.one)], mode="RAW") for x in (a, b))
+        top_a, top_b = (
+            self.sum([self.plain(n), self.plain(self.constant(-f))], mode="RAW")
+            for n, f in zip(lengths, (fraction_a, fraction_b), strict=True)
+        )
+        higher = self.compared("greater", top_a, top_b, 0, 0)
+        return self.chosen(higher, top_a, top_b, mode="RAW")
+
+    def length(self, a: int, b: int, fraction_a: int, fraction_b: int, out: int) -> int:
+        """sqrt(a^2 + b^2): squares of 30 bits, whose sum goes to the root as it is."""
+        top = self._top(a, b, fraction_a, fraction_b)
+        p = self.sum([Term("DYN", a, top, fraction_a - 30)], mode="RAW")
+        q = self.sum([Term("DYN", b, top, fraction_b - 30)], mode="RAW")
+        root = self.take(self.begin("root", [Term("MUL", p, p), Term("MUL", q, q)]), mode="RAW")
+        down = self.sum([self.plain(top, 0, True)], mode="RAW")
+        return self.sum([Term("DYN", root, down, 30 - out)])
+
     def angle(self, y: int, x: int, fraction_y: int, fraction_x: int, out: int) -> int:
-        length_y, length_x = (self.sum([Term("BITS", a, self.one)], mode="RAW") for a in (y, x))
-        top_y = self.sum([self.plain(length_y), self.plain(self.constant(-fraction_y))], mode="RAW")
-        top_x = self.sum([self.plain(length_x), self.plain(self.constant(-fraction_x))], mode="RAW")
-        higher = self.compared("greater", top_y, top_x, 0, 0)
-        top = self.chosen(higher, top_y, top_x, mode="RAW")
+        top = self._top(y, x, fraction_y, fraction_x)
         along, up = Term("DYN", x, top, fraction_x - 59), Term("DYN", y, top, fraction_y - 59)
         value = self.take(self.begin("angle", [along, up]), shift=60 - out)
         flat = self.sum([self.plain(y)], mode="EQ")

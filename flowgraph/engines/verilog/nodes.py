@@ -44,6 +44,8 @@ MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START"
 unit, cut to a wider word, or made an index: a place in a row, 0 for what is less."""
 
 UNITS = ("divide", "root", "logarithm", "angle")
+PAIRED = ("divide", "angle")
+"""Units that are given two numbers, one term each; others are given a sum."""
 
 NO_LIMIT = 15
 """Of a sum whose terms are not cut."""
@@ -69,7 +71,7 @@ class Sum:
     """A word that is computed, or a row of them.
 
     Args:
-        terms: at least one; those of a START go to its unit, one after the other.
+        terms: at least one; those of a START of a unit that is `PAIRED` go there one after the other.
         mode: what becomes of the sum.
         end: how far the sum is shifted to the right.
         limit: terms are cut to 2^(62 - limit).

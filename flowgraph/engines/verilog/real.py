@@ -122,9 +122,15 @@ class Real(Functions):
     def _log(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._of_one(self.logarithm, s, a)
 
-    def _atan2(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def _of_two(self, function: Callable[..., int], s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         f, g = (shifts.bound_fraction(s.real(k)) for k in (0, 1))
-        return self._each(s.i.spec.shape, self.angle, (a, b), f, g, s.out)
+        return self._each(s.i.spec.shape, function, (a, b), f, g, s.out)
+
+    def _atan2(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return self._of_two(self.angle, s, a, b)
+
+    def _hypot(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return self._of_two(self.length, s, a, b)
 
     def _where(self, s: Site, c: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return self._each(

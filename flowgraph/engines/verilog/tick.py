@@ -148,6 +148,8 @@ class Tick(Lookup):
             return args[0]
         if i.op in shifts.MOVES and i.op not in ("negative", "abs"):
             return self._moved(s, args, real)
+        if i.op in ("sort", "argsort"):
+            return self._sorted(s, args[0], kinds[0] == "real")
         if i.op == "cumulative_sum":
             return self._running(s, args[0], real)
         if i.op == "searchsorted":
