@@ -105,7 +105,9 @@ class SharedPlaces:
         self._view = found.view
         doubtful = may_be_nan(program.instructions, self._player.formats.absent)
         wide = {
-            found.place[root_of(found.view, n)[0]] for n in doubtful if root_of(found.view, n)[0] in found.place
+            found.place[root_of(found.view, n)[0]]
+            for n in doubtful
+            if root_of(found.view, n)[0] in found.place
         }
         sizes = dict(self.held)
         buffers = [
