@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowgraph.engines.fixed.engine import Integers
+from flowgraph.engines.verilog.bounds import need_room
 from flowgraph.engines.verilog.nodes import (
     KINDS,
     MODES,
@@ -94,6 +95,8 @@ class Image:
         self.width = self.player.formats.width
         self.wide = max(self.width, self.player.formats.held_width)
         plans = [Plan(Tick(self.player, key)) for key in keys]
+        for plan in plans:
+            need_room(plan)
         self.has_rows = any(_has_rows(p) for p in plans)
         self.places = self._held()
         self._constants(plans)

@@ -8,6 +8,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import shifts
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.bounds import proved
 from flowgraph.engines.verilog.nodes import NO_LIMIT, Term
 from flowgraph.engines.verilog.real import no_form
 from flowgraph.engines.verilog.whole import Pair, Whole
@@ -45,6 +46,7 @@ class Lookup(Whole):
         found = np.moveaxis(found, behind, range(axis, axis + len(index)))
         return found[..., 0] if real else found
 
+    @proved
     def _chosen(self, line: np.ndarray, n: int, size: int) -> Pair:
         """The words of the element of a line at n, or of the first or last one."""
         known = self.known(n)
@@ -174,7 +176,7 @@ class Lookup(Whole):
             mode = {"uint32": "U32", "int32": "S32"}.get(dtype, "RAW")
             return self.elements(self._sums(columns[0][0], mode), size)[:, None]
         low = self._sums(columns[0][0], "U32")
-        carry, above = self._sums(columns[0][0], "RAW", 32), self._sums(columns[1][0], "RAW")
+        carry, above = self._sums(columns[0][0], "RAW", 32), self._sums(columns[1][0], "S32")
         mode = "U32" if dtype == "uint64" else "S32"
         high = self.sum([self.plain(carry), self.plain(above)], mode=mode, limit=NO_LIMIT)
         return np.stack([self.elements(low, size), self.elements(high, size)], axis=-1)

@@ -161,6 +161,8 @@ class Nodes:
         now: bits of the words that are made now: one of these two.
         line: for each word, where in the source it comes from.
         doubtful: numbers of words that may be none.
+        proved: numbers of words that fit by how they are made.
+        sizes: the largest size of a word, where it is known.
     """
 
     width: int
@@ -168,6 +170,8 @@ class Nodes:
     nodes: list[Node] = field(default_factory=list)
     line: list[str] = field(default_factory=list)
     doubtful: set[int] = field(default_factory=set)
+    proved: set[int] = field(default_factory=set)
+    sizes: dict[int, int] = field(default_factory=dict)
     here: str = ""
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import shifts
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.bounds import proved
 from flowgraph.engines.verilog.functions import Functions
 from flowgraph.engines.verilog.nodes import Term
 from flowgraph.errors import LoweringError
@@ -219,6 +220,7 @@ class Real(Functions):
             return self.sum([Term("SEL", up, below, 0, True), Term("SELN", down, below)], end=end)
         return self.whole_to_even(x, f, end)
 
+    @proved
     def whole_to_even(self, x: int, f: int, end: int | None = None) -> int:
         """The whole number nearest to x 2^-f, of two the even one, shifted by `end`; or as it is."""
         down = self.sum([self.plain(x)], end=f, mode="RAW", floor=True)

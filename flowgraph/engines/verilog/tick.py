@@ -120,6 +120,8 @@ class Tick(Lookup):
             low = np.array([self.elements(n, long) for n in rows]).ravel().tolist()
         else:
             rows = low = [self.add(Held(value, k, False, width)) for k in range(size)]
+        if spec.dtype == "bool":
+            self.sizes.update(dict.fromkeys(rows, 1))
         if real:
             if value in self.formats.absent:
                 self.doubtful.update(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.engines.verilog import ENGINE as VERILOG
 from flowgraph.engines.verilog import simulate as simulation
+from flowgraph.engines.verilog.bounds import most_of, need_room
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.nodes import Constant, Held, Nodes, Sum, Term, shifted
 from flowgraph.engines.verilog.schedule import UNIT_LATENCY, Lanes, Plan, schedule
@@ -352,3 +354,21 @@ def test_numbers_that_may_not_be_there_are_refused_where_the_machine_has_no_word
     doubtful = replace(pipeline, formats=replace(formats, absent=frozenset([x])))
     with pytest.raises(LoweringError, match="may meet a reading that is not there"):
         Image(doubtful, tape.patterns)
+
+
+def test_whole_numbers_have_as_many_words_as_they_need_and_what_may_not_fit_is_refused(made):
+    _, _, pipeline, tape = made
+    cells = [c.reset for r in pipeline.registers for c in r.cells]
+    tick = Tick(Integers(pipeline, cells, np.zeros(2, np.uint32)), tape.patterns[-1])
+    large, small = (tick.sum([Term("MUL", 1, 2, -k)], mode="U32") for k in (3, 4))
+    above = tick.sum([tick.plain(1)], mode="LT")
+    assert len(tick.wrapped([tick.plain(large), tick.plain(above)], "int64")) == 1
+    assert len(tick.wrapped([tick.plain(large), tick.plain(small)], "int64")) == 2  # 2^33 fits no word
+    fits = tick.sum([Term("SEL", large, above), Term("SELN", small, above)], mode="RAW")
+    assert most_of(tick, fits) == 2**32
+    tick.here = "a line"
+    over = tick.sum([tick.plain(large), tick.plain(fits)], mode="RAW")
+    need_room(SimpleNamespace(tick=tick, order=[fits]))
+    with pytest.raises(LoweringError, match="may not fit a word of the machine") as caught:
+        need_room(SimpleNamespace(tick=tick, order=[fits, over]))
+    assert caught.value.path == "a line"
