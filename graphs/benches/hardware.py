@@ -69,7 +69,8 @@ def hardware(
         seed: of the first flight.
 
     Returns:
-        A row a graph and number of lanes: `graph`, `particles` (the setting above), `width`, `lanes`, `multipliers` (of 34 bits),
+        A row a graph and number of lanes: `graph`, `particles` (the setting above), `width`, `lanes`,
+        `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
         the program and `words` of memory; where `energy` is asked for, `energy_estimate_operations` (terms of
