@@ -146,7 +146,8 @@ VERILATOR ?= verilator
 SOURCES = {name}.v {modules}
 
 obj/V{name}: $(SOURCES) bench.cpp
-\t$(VERILATOR) --cc --exe --build -CFLAGS -O1 --top-module {name} --Mdir obj $(SOURCES) bench.cpp
+\t$(VERILATOR) --cc --exe --build --output-split 0 -CFLAGS -O1 --top-module {name} --Mdir obj \\
+\t  $(SOURCES) bench.cpp
 
 lint:
 \t$(VERILATOR) --lint-only -Wall --top-module {name} $(SOURCES)
