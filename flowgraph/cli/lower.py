@@ -62,7 +62,9 @@ def lower(
         typer.Option(metavar="PASS", help=f"Leave a pass out, repeatable: {', '.join(PASSES)}."),
     ] = None,
     multipliers: Annotated[int, typer.Option(min=1, help="Of a lane, for the report.")] = 16,
-    lanes: Annotated[int, typer.Option(min=1, help="Particles at once, for the report.")] = 1,
+    lanes: Annotated[
+        int, typer.Option(min=1, help="Of the machine in Verilog; for the report, particles at once.")
+    ] = 1,
     clock: Annotated[float, typer.Option(min=1.0, help="In Hz, for the report.")] = 100e6,
     as_json: AsJson = False,
 ) -> None:
@@ -93,6 +95,7 @@ def lower(
         pipeline = renamed(pipeline, name)
     pipeline.save(output)
     if engine is not None:
+        engine = engine.with_lanes(lanes)
         for file in engine.write(pipeline, output, dtype, passes).values():
             err_console.print(f"wrote {file}", markup=False)
         if events is not None:

@@ -231,6 +231,10 @@ class PipelineEngine(Engine):
         """Play many runs in one call; only asked of an engine that `takes_many`."""
         raise NotImplementedError(f"engine {self.name!r} says that it takes many runs, and has no play_many")
 
+    def with_lanes(self, lanes: int) -> PipelineEngine:
+        """The engine that writes a machine of so many lanes; itself where what it writes has none."""
+        return self
+
     def write(
         self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
     ) -> Mapping[str, Path]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ def hardware(
     duration: float = 3.0,
     compared: float = 0.5,
     particles: int = 0,
+    lanes: str = "1",
     played: str = "verilog",
     energy: bool = False,
     routed: bool = False,
@@ -57,6 +59,7 @@ def hardware(
         duration: of a flight, s.
         compared: seconds of it that are played in Verilator.
         particles: of the filters that have some; as many as `bench fixed` takes if left out.
+        lanes: of the machine, some between commas; each has a multiplier of 34 bits.
         played: "verilog", or "hls" for the C++ of high-level synthesis, which has no cycles.
         energy: whether to count what the energy of a tick goes with.
         routed: whether to synthesise, place and route each.
@@ -66,7 +69,8 @@ def hardware(
         seed: of the first flight.
 
     Returns:
-        A row a graph: `graph`, `particles` (the setting above), `width`, `lanes`, `multipliers` (of 34 bits),
+        A row a graph and number of lanes: `graph`, `particles` (the setting above), `width`, `lanes`,
+        `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
         the program and `words` of memory; where `energy` is asked for, `energy_estimate_operations` (terms of
@@ -78,6 +82,7 @@ def hardware(
     if played not in ("verilog", "hls"):
         raise UnknownNameError("text to play", played, ("verilog", "hls"), path="played")
     names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
+    counts = numbers(lanes, "lanes")
     if space:
         if len(names) != 1:
             raise DeclarationError(
@@ -85,13 +90,14 @@ def hardware(
                 got=", ".join(names) or "none", fix="write --set graphs=kalman",
             )  # fmt: skip
         return design_space(
-            names[0], numbers(space, "space"), (1,), flights=flights, duration=duration,
+            names[0], numbers(space, "space"), counts, flights=flights, duration=duration,
             particles=particles, routed=routed, folder=folder, seed=seed,
         )  # fmt: skip
     rows: list[dict[str, Any]] = []
-    for name in names:
+    for name, count in product(names, counts):
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
-            "graph": name, "particles": particles or None, "width": width, "lanes": 1, "multipliers": 1,
+            "graph": name, "particles": particles or None, "width": width,
+            "lanes": count, "multipliers": count,
         }  # fmt: skip
         try:
             some = [flown(name, seed + k, duration, particles) for k in range(flights + 1)]
@@ -128,7 +134,7 @@ _COLUMNS = (
 
 def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
     events, start = taped(flight, seconds)
-    player = Simulated(pipeline, events.patterns, check=True)
+    player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
     player.play(events, start.cells, seed_words(flight.seed), None)
     row |= {
         "values_compared": player.compared,
@@ -149,7 +155,7 @@ def _compiled(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -
 
 def _weighed(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
     events, start = taped(flight, seconds)
-    image = Image(pipeline, events.patterns)
+    image = Image(pipeline, events.patterns, row["lanes"])
     if not image.has_rows:
         row["energy_estimate_operations"] = max(e.terms for e in image.entries)
     row["energy_estimate_toggles"] = round(toggles(image, events, start.cells, seed_words(flight.seed)))
@@ -160,6 +166,6 @@ def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> Non
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / pipeline.name
         at.mkdir(parents=True, exist_ok=True)
-        for name, text in texts(Image(pipeline, events.patterns)).items():
+        for name, text in texts(Image(pipeline, events.patterns, row["lanes"])).items():
             put(at / name, text)
         row |= vars(route(at, pipeline.name))

@@ -121,7 +121,7 @@ def _reason(error: FlowgraphError) -> dict[str, str]:
 
 
 def _made(pipeline: Any, patterns: Sequence[int], lanes: int, routed: bool, folder: str) -> dict[str, Any]:
-    image = Image(pipeline, patterns)
+    image = Image(pipeline, patterns, lanes)
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / f"{pipeline.name}_{image.width}_{lanes}"
         at.mkdir(parents=True, exist_ok=True)

@@ -416,8 +416,8 @@ MODULE.o: MODULE.c MODULE.h
 \t$(CC) -std=c99 -O1 -Wall -Wextra -pedantic -c -o $@ MODULE.c
 
 obj_host/host: $(SOURCES) $(STREAM) host.cpp MODULE.o
-\t$(VERILATOR) --cc --exe --build -CFLAGS "-O1 -I$(CURDIR)" --top-module NAME_stream --Mdir obj_host \\
-\t  -o host $(STREAM) $(SOURCES) host.cpp $(CURDIR)/MODULE.o
+\t$(VERILATOR) --cc --exe --build --output-split 0 -CFLAGS "-O1 -I$(CURDIR)" --top-module NAME_stream \\
+\t  --Mdir obj_host -o host $(STREAM) $(SOURCES) host.cpp $(CURDIR)/MODULE.o
 
 lint_stream:
 \t$(VERILATOR) --lint-only -Wall --top-module NAME_stream $(STREAM) $(SOURCES)

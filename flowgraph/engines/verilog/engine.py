@@ -23,11 +23,21 @@ from flowgraph.recorder.random import seed_words
 
 
 class VerilogEngine(PipelineEngine):
-    """Registers, multipliers and block memory, clock by clock; equal to the engine `fixed` to the bit."""
+    """Registers, multipliers and block memory, clock by clock; equal to the engine `fixed` to the bit.
+
+    Args:
+        lanes: terms that the machine begins in a cycle.
+    """
 
     name = "verilog"
     dtypes = ("fixed", "float64")  # the second is what a user gets who leaves dtype out
     writes = True
+
+    def __init__(self, lanes: int = 1) -> None:
+        self.lanes = lanes
+
+    def with_lanes(self, lanes: int) -> VerilogEngine:
+        return VerilogEngine(lanes)
 
     def need(self) -> None:
         verilator()
@@ -36,12 +46,12 @@ class VerilogEngine(PipelineEngine):
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
         pipeline.need_numbers("fixed")
-        return Simulated(need_formats(pipeline), patterns)
+        return Simulated(need_formats(pipeline), patterns, lanes=self.lanes)
 
     def write(
         self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
     ) -> Mapping[str, Path]:
-        image = _image(pipeline)
+        image = self._image(pipeline)
         driver = Driver(image)
         written = texts(image) | driver.texts()
         written["Makefile"] += driver.make()
@@ -60,17 +70,16 @@ class VerilogEngine(PipelineEngine):
         """
         tape = events_of(pipeline, inputs)
         cells = [c.reset for r in pipeline.registers for c in r.cells]
-        script = Script(_image(pipeline), tape, cells, seed_words(0), check=True)
+        script = Script(self._image(pipeline), tape, cells, seed_words(0), check=True)
         with writes(file):
             put(file, "\n".join(script.checked()) + "\n")
             put(file.with_name(f"{file.name}.host"), events_text(tape))
         return len(tape.time)
 
-
-def _image(pipeline: Pipeline) -> Image:
-    """The machine with all patterns of present inputs that have formats."""
-    known, _ = patterns_with_formats(need_formats(pipeline))
-    return Image(pipeline, known)
+    def _image(self, pipeline: Pipeline) -> Image:
+        """The machine with all patterns of present inputs that have formats."""
+        known, _ = patterns_with_formats(need_formats(pipeline))
+        return Image(pipeline, known, self.lanes)
 
 
 ENGINE = VerilogEngine()

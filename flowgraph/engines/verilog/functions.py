@@ -11,6 +11,7 @@ import abc
 import numpy as np
 
 from flowgraph.engines.fixed import integers as z
+from flowgraph.engines.verilog.bounds import proved
 from flowgraph.engines.verilog.nodes import Term
 from flowgraph.engines.verilog.rows import Rows
 from flowgraph.errors import LoweringError
@@ -43,6 +44,7 @@ class Functions(Rows, abc.ABC):
         made = self.sum([self.plain(quotient), self.plain(turned, 0, True)], end=end)
         return self.sum([Term("SEL", made, b)])
 
+    @proved
     def _divided(self, a: int, b: int, p: int, q: int) -> tuple[int, int, int]:
         """The quotient rounded towards zero, what it leaves, and whether that has not the sign of b.
 
@@ -73,6 +75,7 @@ class Functions(Rows, abc.ABC):
             total = self.sum([Term("MUL", total, u, 30), self.plain(self.constant(c))], mode="RAW")
         return total
 
+    @proved
     def sine(self, x: int, fraction: int, out: int, ahead: int, mode: str = "FIT") -> int:
         known = self.known(x)
         if known is not None:
@@ -97,6 +100,7 @@ class Functions(Rows, abc.ABC):
         back = self.sum([Term("AND", n, self.constant(2))], mode="RAW")
         return self.sum([Term("SEL", value, back, 0, True), Term("SELN", value, back)], mode=mode)
 
+    @proved
     def sinc(self, x: int, fraction: int, out: int) -> int:
         """sin(x) / x: as a polynomial near 0, as a quotient elsewhere."""
         known = self.known(x)
@@ -121,6 +125,7 @@ class Functions(Rows, abc.ABC):
                 fix="keep the angle within some turns",
             )
 
+    @proved
     def exponential(self, x: int, fraction: int, out: int) -> int:
         known = self.known(x)
         if known is not None:
@@ -133,6 +138,7 @@ class Functions(Rows, abc.ABC):
         down = self.sum([self.plain(n, 0, True)], mode="RAW")
         return self.sum([Term("DYN", m, down, 30 - out)])
 
+    @proved
     def logarithm(self, x: int, fraction: int, out: int) -> int:
         known = self.known(x)
         if known is not None:
@@ -152,12 +158,29 @@ class Functions(Rows, abc.ABC):
         least = self.constant(1 - 2 ** (self.now - 1))
         return self.sum([Term("SEL", value, above), Term("SELN", least, above)])
 
+    def _top(self, a: int, b: int, fraction_a: int, fraction_b: int) -> int:
+        """The place of the highest bit of the larger of two numbers."""
+        lengths = (self.sum([Term("BITS", x, self.one)], mode="RAW") for x in (a, b))
+        top_a, top_b = (
+            self.sum([self.plain(n), self.plain(self.constant(-f))], mode="RAW")
+            for n, f in zip(lengths, (fraction_a, fraction_b), strict=True)
+        )
+        higher = self.compared("greater", top_a, top_b, 0, 0)
+        return self.chosen(higher, top_a, top_b, mode="RAW")
+
+    @proved
+    def length(self, a: int, b: int, fraction_a: int, fraction_b: int, out: int) -> int:
+        """sqrt(a^2 + b^2): squares of 30 bits, whose sum goes to the root as it is."""
+        top = self._top(a, b, fraction_a, fraction_b)
+        p = self.sum([Term("DYN", a, top, fraction_a - 30)], mode="RAW")
+        q = self.sum([Term("DYN", b, top, fraction_b - 30)], mode="RAW")
+        root = self.take(self.begin("root", [Term("MUL", p, p), Term("MUL", q, q)]), mode="RAW")
+        down = self.sum([self.plain(top, 0, True)], mode="RAW")
+        return self.sum([Term("DYN", root, down, 30 - out)])
+
+    @proved
     def angle(self, y: int, x: int, fraction_y: int, fraction_x: int, out: int) -> int:
-        length_y, length_x = (self.sum([Term("BITS", a, self.one)], mode="RAW") for a in (y, x))
-        top_y = self.sum([self.plain(length_y), self.plain(self.constant(-fraction_y))], mode="RAW")
-        top_x = self.sum([self.plain(length_x), self.plain(self.constant(-fraction_x))], mode="RAW")
-        higher = self.compared("greater", top_y, top_x, 0, 0)
-        top = self.chosen(higher, top_y, top_x, mode="RAW")
+        top = self._top(y, x, fraction_y, fraction_x)
         along, up = Term("DYN", x, top, fraction_x - 59), Term("DYN", y, top, fraction_y - 59)
         value = self.take(self.begin("angle", [along, up]), shift=60 - out)
         flat = self.sum([self.plain(y)], mode="EQ")

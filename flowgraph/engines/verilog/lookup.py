@@ -8,6 +8,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import shifts
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.bounds import proved
 from flowgraph.engines.verilog.nodes import NO_LIMIT, Term
 from flowgraph.engines.verilog.real import no_form
 from flowgraph.engines.verilog.whole import Pair, Whole
@@ -45,6 +46,7 @@ class Lookup(Whole):
         found = np.moveaxis(found, behind, range(axis, axis + len(index)))
         return found[..., 0] if real else found
 
+    @proved
     def _chosen(self, line: np.ndarray, n: int, size: int) -> Pair:
         """The words of the element of a line at n, or of the first or last one."""
         known = self.known(n)
@@ -174,7 +176,7 @@ class Lookup(Whole):
             mode = {"uint32": "U32", "int32": "S32"}.get(dtype, "RAW")
             return self.elements(self._sums(columns[0][0], mode), size)[:, None]
         low = self._sums(columns[0][0], "U32")
-        carry, above = self._sums(columns[0][0], "RAW", 32), self._sums(columns[1][0], "RAW")
+        carry, above = self._sums(columns[0][0], "RAW", 32), self._sums(columns[1][0], "S32")
         mode = "U32" if dtype == "uint64" else "S32"
         high = self.sum([self.plain(carry), self.plain(above)], mode=mode, limit=NO_LIMIT)
         return np.stack([self.elements(low, size), self.elements(high, size)], axis=-1)
@@ -183,6 +185,49 @@ class Lookup(Whole):
         """A sum as a place in a row."""
         return self.sum(terms, mode="INDEX")
 
+    def _sorted(self, s: Site, x: np.ndarray, real: bool) -> np.ndarray:
+        """`sort` and `argsort` of a short axis: an element's rank is how many come before it."""
+        i = s.i
+        axes = shifts.axes_of(i)(x.ndim if real else x.ndim - 1)
+        count = s.specs[i.args[0]].shape[axes[0]]
+        if not real or count > _RANKED or any(n >= self.shortest > 0 for n in i.spec.shape):
+            raise no_form(i)
+        f = s.real(0)
+        at = shifts.common_along(f, axes)
+        by = np.moveaxis(shifts.between(f, np.broadcast_to(at, f.shape)), axes[0], -1)
+        words = np.moveaxis(x, axes[0], -1)
+        places = i.op == "argsort"
+        ends = np.zeros_like(by) if places else np.moveaxis(np.broadcast_to(at - s.out, f.shape), axes[0], -1)
+        made = np.empty_like(words)
+        for here in np.ndindex(*words.shape[:-1]):
+            row = [self.word(n) for n in words[here].tolist()]
+            ranks = self._ranks(row, by[here].tolist())
+            for k in range(count):
+                at_k = [self.compared("equal", r, self.constant(k), 0, 0) for r in ranks]
+                if places:
+                    terms = [Term("MUL", c, self.constant(n)) for n, c in enumerate(at_k)]
+                else:
+                    terms = [
+                        Term("SEL", a, c, up) for a, c, up in zip(row, at_k, by[here].tolist(), strict=True)
+                    ]
+                mode = "RAW" if places else "FIT"
+                made[(*here, k)] = self.sum(terms, mode=mode, end=int(ends[(*here, k)]))
+        found = np.moveaxis(made, -1, axes[0])
+        return found[..., None] if places else found
+
+    def _ranks(self, row: list[int], by: list[int]) -> list[int]:
+        """How many of a row lie before each; of equal ones the first is first."""
+        before: list[list[int]] = [[] for _ in row]
+        for k in range(len(row)):
+            for n in range(k):
+                above = self.sum([self.plain(row[k], by[k]), self.plain(row[n], by[n], True)], mode="LT")
+                before[n].append(above)  # k lies before n
+                before[k].append(self.sum([self.plain(above)], mode="EQ"))
+        return [self.sum([self.plain(x) for x in xs], mode="RAW") for xs in before]
+
 
 _TABLE = 64
 """What is read at a computed place is a row of the memory from this length on, where nothing else is."""
+
+_RANKED = 16
+"""Elements that are sorted, at most: each is compared with each."""

@@ -44,6 +44,8 @@ MODES = ("", "FIT", "RAW", "U32", "S32", "LT", "LE", "EQ", "NE", "HOLD", "START"
 unit, cut to a wider word, or made an index: a place in a row, 0 for what is less."""
 
 UNITS = ("divide", "root", "logarithm", "angle")
+PAIRED = ("divide", "angle")
+"""Units that are given two numbers, one term each; others are given a sum."""
 
 NO_LIMIT = 15
 """Of a sum whose terms are not cut."""
@@ -69,7 +71,7 @@ class Sum:
     """A word that is computed, or a row of them.
 
     Args:
-        terms: at least one; those of a START go to its unit, one after the other.
+        terms: at least one; those of a START of a unit that is `PAIRED` go there one after the other.
         mode: what becomes of the sum.
         end: how far the sum is shifted to the right.
         limit: terms are cut to 2^(62 - limit).
@@ -159,6 +161,8 @@ class Nodes:
         now: bits of the words that are made now: one of these two.
         line: for each word, where in the source it comes from.
         doubtful: numbers of words that may be none.
+        proved: numbers of words that fit by how they are made.
+        sizes: the largest size of a word, where it is known.
     """
 
     width: int
@@ -166,6 +170,8 @@ class Nodes:
     nodes: list[Node] = field(default_factory=list)
     line: list[str] = field(default_factory=list)
     doubtful: set[int] = field(default_factory=set)
+    proved: set[int] = field(default_factory=set)
+    sizes: dict[int, int] = field(default_factory=dict)
     here: str = ""
 
     def __post_init__(self) -> None:

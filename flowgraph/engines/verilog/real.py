@@ -9,6 +9,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import shifts
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.bounds import proved
 from flowgraph.engines.verilog.functions import Functions
 from flowgraph.engines.verilog.nodes import Term
 from flowgraph.errors import LoweringError
@@ -122,9 +123,15 @@ class Real(Functions):
     def _log(self, s: Site, a: np.ndarray) -> np.ndarray:
         return self._of_one(self.logarithm, s, a)
 
-    def _atan2(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def _of_two(self, function: Callable[..., int], s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         f, g = (shifts.bound_fraction(s.real(k)) for k in (0, 1))
-        return self._each(s.i.spec.shape, self.angle, (a, b), f, g, s.out)
+        return self._each(s.i.spec.shape, function, (a, b), f, g, s.out)
+
+    def _atan2(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return self._of_two(self.angle, s, a, b)
+
+    def _hypot(self, s: Site, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return self._of_two(self.length, s, a, b)
 
     def _where(self, s: Site, c: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return self._each(
@@ -213,6 +220,7 @@ class Real(Functions):
             return self.sum([Term("SEL", up, below, 0, True), Term("SELN", down, below)], end=end)
         return self.whole_to_even(x, f, end)
 
+    @proved
     def whole_to_even(self, x: int, f: int, end: int | None = None) -> int:
         """The whole number nearest to x 2^-f, of two the even one, shifted by `end`; or as it is."""
         down = self.sum([self.plain(x)], end=f, mode="RAW", floor=True)

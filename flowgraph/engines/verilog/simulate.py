@@ -89,8 +89,10 @@ class Simulated(Player):
         compared, differing: with `check`, words compared with the interpreter's, and those that differ.
     """
 
-    def __init__(self, pipeline: Pipeline, patterns: Sequence[int], *, check: bool = False) -> None:
-        self.pipeline, self.image = pipeline, Image(pipeline, patterns)
+    def __init__(
+        self, pipeline: Pipeline, patterns: Sequence[int], *, check: bool = False, lanes: int = 1
+    ) -> None:
+        self.pipeline, self.image = pipeline, Image(pipeline, patterns, lanes)
         self.built = build(self.image)
         self.check = check
         self.cycles: list[int] = []

@@ -6,11 +6,22 @@ from importlib.resources import files
 
 import numpy as np
 
-from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.image import BLOCK, Image
 from flowgraph.engines.verilog.nodes import UNITS
 from flowgraph.pipeline.formats import FREE
 
-MODULES = ("fg_machine", "fg_multiply", "fg_shift", "fg_divide", "fg_root", "fg_logarithm", "fg_angle")
+MODULES = (
+    "fg_machine",
+    "fg_lane",
+    "fg_memory",
+    "fg_units",
+    "fg_multiply",
+    "fg_shift",
+    "fg_divide",
+    "fg_root",
+    "fg_logarithm",
+    "fg_angle",
+)
 _PARAMETER = {"divide": "DIVIDES", "root": "ROOTS", "logarithm": "LOGARITHMS", "angle": "ANGLES"}
 
 
@@ -20,11 +31,23 @@ def texts(image: Image) -> dict[str, str]:
     shipped = files("flowgraph.engines.verilog") / "machine"
     found = {f"{m}.v": (shipped / f"{m}.v").read_text() for m in MODULES}
     found[f"{name}.v"] = _top(image)
-    found[f"{name}_program.hex"] = "\n".join(f"{w:x}" for w in image.program) + "\n"
-    found[f"{name}_memory.hex"] = "\n".join(f"{w:x}" for w in image.memory) + "\n"
+    found |= _blocks(f"{name}_program", image.program, 1) | _blocks(
+        f"{name}_memory", image.memory, image.lanes.banks
+    )
     found[f"{name}.lst"] = "\n".join(image.listing) + "\n"
     found["bench.cpp"] = (shipped / "bench.cpp").read_text().replace("TOP", f"V{name}")
     found["Makefile"] = _MAKEFILE.format(name=name, modules=" ".join(f"{m}.v" for m in MODULES))
+    return found
+
+
+def _blocks(name: str, words: list[int], banks: int) -> dict[str, str]:
+    """A file for each block of a memory whose words go round its banks."""
+    each = -(-len(words) // banks)
+    found = {}
+    for level in range(-(-each // BLOCK)):
+        for bank in range(banks):
+            block = words[bank::banks][level * BLOCK : (level + 1) * BLOCK]
+            found[f"{name}_{level * banks + bank:02d}.hex"] = "\n".join(f"{w:x}" for w in block) + "\n"
     return found
 
 
@@ -61,9 +84,13 @@ def _top(image: Image) -> str:
         f"      .WIDTH({image.width}), .WIDE({image.wide}),",
         f"      .PLACE({image.place_bits}), .STEP({image.step_bits}),",
         f"      .WORDS({len(image.memory)}), .STEPS({len(image.program)}),",
-        f"      .ROWS({int(image.has_rows)}), .INDICES({max(image.indices, 2)}), .LANE({image.lane_bits}),",
-        "      " + ", ".join(f".{_PARAMETER[u]}({int(u in image.units)})" for u in UNITS) + ",",
-        f'      .MEMORY("{name}_memory.hex"), .PROGRAM("{name}_program.hex")',
+        f"      .LANES({image.lanes.count}), .BANKS({image.lanes.banks}), .DEEP({int(image.lanes.deep)}),",
+        f"      .ROWS({int(image.has_rows)}), .INDICES({max(image.indices, 2)}),",
+        f"      .ELEMENT({image.element_bits}),",
+        "      "
+        + ", ".join(f".{_PARAMETER[u]}({n})" for u, n in zip(UNITS, image.lanes.copies, strict=True))
+        + ",",
+        f'      .MEMORY("{name}_memory"), .PROGRAM("{name}_program")',
         "  ) machine (",
         "      .clk(clk), .reset(reset), .ready(ready), .start(start), .from(from), .put(put), .at(at),",
         "      .put_word(put_word), .word(word), .cut(cut)",
@@ -119,7 +146,8 @@ VERILATOR ?= verilator
 SOURCES = {name}.v {modules}
 
 obj/V{name}: $(SOURCES) bench.cpp
-\t$(VERILATOR) --cc --exe --build -CFLAGS -O1 --top-module {name} --Mdir obj $(SOURCES) bench.cpp
+\t$(VERILATOR) --cc --exe --build --output-split 0 -CFLAGS -O1 --top-module {name} --Mdir obj \\
+\t  $(SOURCES) bench.cpp
 
 lint:
 \t$(VERILATOR) --lint-only -Wall --top-module {name} $(SOURCES)

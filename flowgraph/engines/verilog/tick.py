@@ -120,6 +120,8 @@ class Tick(Lookup):
             low = np.array([self.elements(n, long) for n in rows]).ravel().tolist()
         else:
             rows = low = [self.add(Held(value, k, False, width)) for k in range(size)]
+        if spec.dtype == "bool":
+            self.sizes.update(dict.fromkeys(rows, 1))
         if real:
             if value in self.formats.absent:
                 self.doubtful.update(rows)
@@ -148,6 +150,8 @@ class Tick(Lookup):
             return args[0]
         if i.op in shifts.MOVES and i.op not in ("negative", "abs"):
             return self._moved(s, args, real)
+        if i.op in ("sort", "argsort"):
+            return self._sorted(s, args[0], kinds[0] == "real")
         if i.op == "cumulative_sum":
             return self._running(s, args[0], real)
         if i.op == "searchsorted":

@@ -13,6 +13,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import shifts
 from flowgraph.engines.fixed.shifts import Site
+from flowgraph.engines.verilog.bounds import MOST, most_of_sum, proved
 from flowgraph.engines.verilog.nodes import NO_LIMIT, Term
 from flowgraph.engines.verilog.real import COMPARE, Real, no_form
 
@@ -45,7 +46,8 @@ class Whole(Real):
     def wrapped(self, terms: list[Term], dtype: str) -> Pair:
         """A sum as a number of a kind; what does not fit falls off."""
         if dtype in _BIG:
-            if all(t.shift == 0 and t.kind == "MUL" and t.b == self.one for t in terms):
+            plain = all(t.shift == 0 and t.kind == "MUL" and t.b == self.one for t in terms)
+            if plain and most_of_sum(self, terms) <= MOST:
                 return (self.sum(terms, mode="RAW", limit=NO_LIMIT),)
             return self.halves(terms, dtype)
         return (self.sum(terms, mode="U32" if dtype == "uint32" else "S32", limit=NO_LIMIT),)
@@ -150,6 +152,7 @@ class Whole(Real):
         terms = [Term(t.kind, t.a, t.b, t.shift - by) for t in self.terms(a)]
         return self.wrapped(terms, s.i.spec.dtype)
 
+    @proved
     def int_floor_divide(self, s: Site, a: Pair, b: Pair) -> Pair:
         """Rounded down, by a number that is known: digit after digit, each by a product with 2^k / b."""
         by = self.known(b[0]) if len(b) == 1 else None
@@ -175,6 +178,7 @@ class Whole(Real):
             found.append(self.plain(divided, -digit * k))
         return self.wrapped(found, s.i.spec.dtype)
 
+    @proved
     def int_float32_bits(self, s: Site, a: Pair) -> Pair:
         """The bits of the float32 nearest to a number of 32 bits, halves to even."""
         length = self.sum([Term("BITS", a[0], self.one)], mode="RAW")

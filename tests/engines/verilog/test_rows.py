@@ -13,7 +13,7 @@ from flowgraph.engines.verilog import simulate as simulation
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.nodes import Sum
 from flowgraph.engines.verilog.plan import Plan
-from flowgraph.engines.verilog.schedule import AHEAD, LATENCY, Loop, schedule
+from flowgraph.engines.verilog.schedule import FETCH, Lanes, Loop, schedule
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.tick import Tick
 from flowgraph.pipeline.format_files import with_formats
@@ -133,10 +133,11 @@ def test_the_program_does_not_grow_with_the_particles(made):
     assert found.cycles > len(found.words) > 0
 
 
-def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_until_then(made):
+@pytest.mark.parametrize("lanes", [Lanes(), Lanes(2, True, (2, 1, 1, 1)), Lanes(4, True, (4, 2, 4, 2))])
+def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_until_then(made, lanes):
     """Played step by step as the machine does: which word lies at each place when it is read."""
     plan = plan_of(made)
-    found = schedule(plan, rows=True)
+    found = schedule(plan, rows=True, lanes=lanes)
     made_ = plan.tick.made
     ends = dict(found.loops)
     lies: dict[tuple[bool, int], tuple[int, int]] = {}
@@ -176,7 +177,7 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
                     look(n, 0 if every else slot.nth, lane, every)
         if slot.writes is not None and slot.writes not in plan.fixed:
             place, word = place_of(slot.writes, slot.nth, lane)
-            due.append((now + LATENCY + AHEAD * (slot.mode == "INDEX"), place, word))
+            due.append((now + lanes.latency(slot.node), place, word))
 
     k = 0
     head = Loop(0)
@@ -188,21 +189,25 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
             k += 1
             if k in ends:
                 body = found.words[k : ends[k] + 1]
-                assert [w.back for w in body].index(True) == len(body) - 4
+                assert [w.back for w in body].index(True) == len(body) - FETCH - 1
                 for lane in range(0, head.last + 1, head.step):
                     for w in body:
-                        if w.does is not None:
-                            step(w.does, lane)
+                        for slot in w.does:
+                            if slot is not None:
+                                step(slot, lane)
                         now += 1
                 k += len(body)
             continue
-        times = head.last + 1 if word.repeat or (word.does and word.does.term.times) else 1
+        repeated = any(slot is not None and slot.term.times for slot in word.does)
+        assert not repeated or sum(slot is not None for slot in word.does) == 1
+        times = head.last + 1 if word.repeat or repeated else 1
         for lane in range(times):
-            slot = word.does
-            if slot is not None:
+            for slot in word.does:
+                if slot is None:
+                    continue
                 last = lane == times - 1 or slot.node.gather == "running"
                 if last or slot.writes is None:
-                    step(slot, lane if slot.node.gather == "running" else 0 if times == 1 else lane)
+                    step(slot, 0 if times == 1 else lane)
                 else:
                     arrive()
                     for n in (slot.term.a, slot.term.b):

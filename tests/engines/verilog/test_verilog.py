@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
 import pytest
 
 from flowgraph import (
+    DeclarationError,
     LoweringError,
     MissingDependencyError,
     Scalar,
@@ -26,9 +28,10 @@ from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.engines.verilog import ENGINE as VERILOG
 from flowgraph.engines.verilog import simulate as simulation
+from flowgraph.engines.verilog.bounds import most_of, need_room
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.nodes import Constant, Held, Nodes, Sum, Term, shifted
-from flowgraph.engines.verilog.schedule import LATENCY, UNIT_LATENCY, Plan, schedule
+from flowgraph.engines.verilog.schedule import UNIT_LATENCY, Lanes, Plan, schedule
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.text import texts
 from flowgraph.engines.verilog.tick import Tick
@@ -40,6 +43,7 @@ from tests.support import same_state
 
 MS = 1_000_000
 Three = Annotated[Any, real(3)]
+Nine = Annotated[Any, real(9, 9)]
 
 
 def need_verilator():
@@ -93,6 +97,17 @@ def made():
     return built, formats, with_formats(subject.pipeline, formats), subject.tape(flight())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [2, 3])
+def test_several_lanes_are_equal_and_take_fewer_cycles(made, lanes):
+    need_verilator()
+    built, _, pipeline, tape = made
+    player = Simulated(pipeline, tape.patterns, check=True, lanes=lanes)
+    player.play(tape, LoweredGraph(built).start(RunOptions()).cells, seed_words(0), None)
+    assert player.compared > 400
+    assert player.differing == 0
+
+
 def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(made, tmp_path):
     need_verilator()
     built, formats, pipeline, tape = made
@@ -126,6 +141,33 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     lines[last] = f"{lines[last]}1"
     file.write_text("\n".join(lines))
     assert _bench(player, file) == (1, compared, 1)
+
+
+@block
+def in_order(x: Three, y: Scalar, *, xp) -> Three:
+    """Lengths, and small sorts: of equal numbers, and of very different ones."""
+    some = xp.stack([x[0], 1e3 * x[1], x[0], xp.hypot(x[1], 1e-3 * x[2])])
+    low, order = xp.sort(some), xp.argsort(some)
+    return xp.stack(
+        [xp.hypot(x[0] + 0.0 * y, 3.0 * x[1]), low[0] - low[2], 1e-3 * low[3] + low[1]]
+    ) + xp.asarray(order[0] + 2 * order[3] - order[1], dtype=x.dtype)
+
+
+@graph
+def lengths(x: Stream[Three], y: Stream[Scalar]):
+    return {"z": in_order(x, latest(y, init=0.5))}
+
+
+def test_lengths_and_small_sorts_are_equal():
+    need_verilator()
+    built = lengths.build()
+    subject = LoweredGraph(built)
+    pipeline = with_formats(subject.pipeline, sizes_of(built, flight()).formats(26, 2.0))
+    tape = subject.tape(flight())
+    player = Simulated(pipeline, tape.patterns, check=True)
+    player.play(tape, subject.start(RunOptions()).cells, seed_words(0), None)
+    assert player.compared > 180
+    assert player.differing == 0
 
 
 @block
@@ -177,42 +219,73 @@ def test_a_filter_with_readings_that_are_not_there_is_equal():
     assert theirs.stats["cycles"] < 3000
 
 
-def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(made):
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_a_word_is_read_after_it_is_written_and_its_place_is_kept_until_then(made, count):
     _, _, pipeline, tape = made
     player = Integers(
         pipeline, [c.reset for r in pipeline.registers for c in r.cells], np.zeros(2, np.uint32)
     )
     plan = Plan(Tick(player, tape.patterns[-1]))
-    found = schedule(plan)
+    lanes = Lanes(count, count > 1, (2, 1, 1, 1))
+    found = schedule(plan, lanes=lanes)
     nodes = plan.tick.nodes
-    at = {s.writes: t for t, s in enumerate(found.slots) if s and s.writes is not None}
-    started: dict[int, tuple[Sum, int]] = {}
+    at = {s.writes: t for t, s in found.slots if s.writes is not None}
+    started: dict[tuple[int, int], tuple[Sum, int]] = {}
     lies: dict[int, int] = {}
     due: list[tuple[int, int]] = []
-    for t, slot in enumerate(found.slots):
+    banks: dict[int, list[int]] = {}
+    for t, slot in found.slots:
         for when, n in [d for d in due if d[0] <= t]:
             lies[found.place.get((n, 0), -1 - n)] = n
             due.remove((when, n))
-        if slot is None:
-            continue
         for r in (slot.term.a, *([] if slot.term.kind == "TAKE" else [slot.term.b])):
             node = nodes[r]
             if isinstance(node, Sum) and node.mode != "START":
-                assert t >= at[r] + LATENCY
+                assert t >= at[r] + lanes.latency(node)
                 assert lies[found.place.get((r, 0), -1 - r)] == r
+        unit = slot.node.unit, slot.copy
         if slot.term.kind == "TAKE":
-            assert (
-                t
-                >= started[slot.node.unit][1]
-                + UNIT_LATENCY[("divide", "root", "logarithm", "angle")[slot.node.unit]]
-            )
-            assert started[slot.node.unit][0] == nodes[slot.term.a]
+            names = ("divide", "root", "logarithm", "angle")
+            assert t >= started[unit][1] + UNIT_LATENCY[names[slot.node.unit]]
+            assert started[unit][0] == nodes[slot.term.a]
         if slot.mode == "START":
-            started[slot.node.unit] = (slot.node, t)
+            started[unit] = (slot.node, t)
         if slot.writes is not None:
-            due.append((t + LATENCY, slot.writes))
-    assert len([s for s in found.slots if s]) == sum(len(plan.tick.made(n).terms) for n in plan.order)
+            due.append((t + lanes.latency(slot.node), slot.writes))
+            place = found.place.get((slot.writes, 0))
+            banks.setdefault(t, []).append(slot.bank)
+            assert place is None or place % lanes.banks == slot.bank
+    assert all(len(set(b)) == len(b) <= lanes.banks for b in banks.values())  # a bank takes a word a cycle
+    assert sum(1 for _ in found.slots) == sum(len(plan.tick.made(n).terms) for n in plan.order)
     assert found.size < len(plan.order)  # places are used again
+    assert len(found.words) == found.cycles
+
+
+@block
+def squared(x: Nine, *, xp) -> Nine:
+    """Many sums that do not wait for each other."""
+    return x @ x
+
+
+@graph
+def wide(x: Stream[Nine]):
+    return {"y": squared(x)}
+
+
+def test_more_lanes_give_their_share():
+    built = wide.build()
+    inputs = {"x": (np.arange(2, dtype=np.int64), np.linspace(-1.0, 1.0, 162).reshape(2, 9, 9))}
+    pipeline = with_formats(LoweredGraph(built).pipeline, sizes_of(built, inputs).formats(24, 2.0))
+    one, two, four = (Image(pipeline, [1], lanes).entries[0].cycles for lanes in (1, 2, 4))
+    assert one == 729
+    assert two < 0.52 * one
+    assert four < 0.28 * one
+
+
+def test_a_machine_without_lanes_is_refused(made):
+    _, _, pipeline, tape = made
+    with pytest.raises(DeclarationError, match="a machine has some lanes"):
+        Image(pipeline, tape.patterns, 0)
 
 
 def test_what_is_known_costs_nothing():
@@ -236,20 +309,20 @@ def test_shifts_round_halves_upwards_and_keep_to_62_bits(x, by, made):
 
 
 @block
-def sorted_(x: Three, *, xp) -> Three:
-    """An operation that the machine does not have."""
-    return xp.sort(x)
+def sorted_(x: Nine, *, xp) -> Nine:
+    """More than the machine sorts."""
+    return xp.reshape(xp.sort(xp.reshape(x, (81,))), (9, 9))
 
 
 @graph
-def sorting(x: Stream[Three]):
+def sorting(x: Stream[Nine]):
     """One block."""
     return {"y": sorted_(x)}
 
 
 def test_an_operation_that_is_not_there_is_named_with_its_line():
     built = sorting.build()
-    inputs = {"x": flight()["x"]}
+    inputs = {"x": (np.arange(2, dtype=np.int64), np.linspace(-1.0, 1.0, 162).reshape(2, 9, 9))}
     pipeline = with_formats(LoweredGraph(built).pipeline, sizes_of(built, inputs).formats(24, 2.0))
     with pytest.raises(LoweringError, match="sort of real has no form in hardware yet") as caught:
         Image(pipeline, [1])
@@ -262,7 +335,8 @@ def test_the_files_name_places_and_lines(made, tmp_path):
     assert "module everything (" in found["everything.v"]
     assert "input 0 x.value: [" in found["everything.v"]
     assert "tests.engines.verilog.test_verilog" in found["everything.lst"]
-    assert len(found["everything_program.hex"].split()) == len(found["everything.lst"].splitlines())
+    program = [line for name, text in found.items() if "program" in name for line in text.split()]
+    assert len(program) == len(found["everything.lst"].splitlines())
 
 
 def test_without_verilator_the_engine_says_what_to_install(monkeypatch):
@@ -280,3 +354,21 @@ def test_numbers_that_may_not_be_there_are_refused_where_the_machine_has_no_word
     doubtful = replace(pipeline, formats=replace(formats, absent=frozenset([x])))
     with pytest.raises(LoweringError, match="may meet a reading that is not there"):
         Image(doubtful, tape.patterns)
+
+
+def test_whole_numbers_have_as_many_words_as_they_need_and_what_may_not_fit_is_refused(made):
+    _, _, pipeline, tape = made
+    cells = [c.reset for r in pipeline.registers for c in r.cells]
+    tick = Tick(Integers(pipeline, cells, np.zeros(2, np.uint32)), tape.patterns[-1])
+    large, small = (tick.sum([Term("MUL", 1, 2, -k)], mode="U32") for k in (3, 4))
+    above = tick.sum([tick.plain(1)], mode="LT")
+    assert len(tick.wrapped([tick.plain(large), tick.plain(above)], "int64")) == 1
+    assert len(tick.wrapped([tick.plain(large), tick.plain(small)], "int64")) == 2  # 2^33 fits no word
+    fits = tick.sum([Term("SEL", large, above), Term("SELN", small, above)], mode="RAW")
+    assert most_of(tick, fits) == 2**32
+    tick.here = "a line"
+    over = tick.sum([tick.plain(large), tick.plain(fits)], mode="RAW")
+    need_room(SimpleNamespace(tick=tick, order=[fits]))
+    with pytest.raises(LoweringError, match="may not fit a word of the machine") as caught:
+        need_room(SimpleNamespace(tick=tick, order=[fits, over]))
+    assert caught.value.path == "a line"

@@ -6,7 +6,7 @@ module fg_root (
     output wire [65:0] value
 );
   reg [63:0] rest, root, bit_;
-  wire [63:0] trial = root + bit_;
+  wire [63:0] trial = root | bit_;  // its places are lower than those of the root
 
   always @(posedge clk)
     if (start) begin
@@ -17,7 +17,7 @@ module fg_root (
       bit_ <= bit_ >> 2;
       if (rest >= trial) begin
         rest <= rest - trial;
-        root <= (root >> 1) + bit_;
+        root <= (root >> 1) | bit_;
       end else root <= root >> 1;
     end
   assign value = {2'd0, root};

@@ -1,0 +1,95 @@
+// A memory of blocks with one reader and a writer for each of its banks. A word lies in the bank of its place's
+// lowest bits, so that a cycle writes a word to each bank. Of a deep memory each block has its own registers
+// behind it, before one block is chosen.
+//
+// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP; nothing moves without `go`.
+// A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later.
+module fg_memory #(
+    parameter WIDTH = 36,
+    parameter PLACE = 12,  // bits of an address
+    parameter WORDS = 2048,
+    parameter BANKS = 1,  // 1 or 2
+    parameter DEEP = 0,  // needed for more than a block, or more than a bank
+    parameter READS = 0,  // whether it is never written
+    parameter FILE = "memory"  // begin of the files' names, one for each block: FILE_00.hex and so on
+) (
+    input wire clk,
+    input wire go,
+    // verilator lint_off UNUSEDSIGNAL
+    input wire [PLACE-1:0] place,
+    input wire [BANKS-1:0] write,
+    input wire [BANKS*PLACE-1:0] to,
+    input wire [BANKS*WIDTH-1:0] written,
+    // verilator lint_on UNUSEDSIGNAL
+    output wire [WIDTH-1:0] word
+);
+  localparam LOW = BANKS - 1;  // bits of the bank
+  localparam EACH = (WORDS + BANKS - 1) / BANKS;  // words of a bank
+  localparam DEPTH = 2048;  // words of a block
+  localparam LEVELS = (EACH + DEPTH - 1) / DEPTH;
+  localparam COUNT = LEVELS * BANKS;
+  localparam BITS = LEVELS > 1 ? 11 : PLACE - LOW;  // of a place in a block
+  localparam PICK = COUNT > 1 ? $clog2(COUNT) : 1;
+
+  // Which block a place lies in.
+  function [PICK-1:0] block_of(input [PLACE-1:0] x);
+    integer n;
+    for (n = 0; n < PICK; n = n + 1) block_of[n] = n < LOW ? x[n] : n - LOW + BITS + LOW < PLACE ? x[n-LOW+BITS+LOW] : 1'b0;
+  endfunction
+
+  wire [COUNT*WIDTH-1:0] found;
+  genvar k;
+  generate
+    for (k = 0; k < COUNT; k = k + 1) begin : blocks
+      localparam LEFT = EACH - k / BANKS * DEPTH;
+      localparam SIZE = LEFT < DEPTH ? LEFT : DEPTH;
+      localparam IN = SIZE > 1 ? $clog2(SIZE) : 1;  // bits of a place in it
+      localparam [7:0] TENS = 8'd48 + k / 10, ONES = 8'd48 + k % 10;
+      (* ram_style = "block" *) reg [WIDTH-1:0] words[0:SIZE-1];
+      initial $readmemh({FILE, "_", TENS, ONES, ".hex"}, words);
+      reg [WIDTH-1:0] read, out;
+      assign found[k*WIDTH+:WIDTH] = out;
+      wire [IN-1:0] at;
+      if (DEEP != 0) begin : deep
+        reg [IN-1:0] near;
+        always @(posedge clk) if (go) near <= place[LOW+:IN];
+        assign at = near;
+      end else begin : shallow
+        assign at = place[LOW+:IN];
+      end
+      always @(posedge clk)
+        if (go) begin
+          read <= words[at];
+          out <= read;
+        end
+      if (READS == 0 && DEEP != 0) begin : deep_write
+        reg here;
+        reg [IN-1:0] near;
+        reg [WIDTH-1:0] given;
+        wire [PICK-1:0] chosen = block_of(to[k%BANKS*PLACE+:PLACE]);
+        always @(posedge clk) begin
+          here <= write[k%BANKS] && chosen == k[PICK-1:0];
+          near <= to[k%BANKS*PLACE+LOW+:IN];
+          given <= written[k%BANKS*WIDTH+:WIDTH];
+          if (here) words[near] <= given;
+        end
+      end else if (READS == 0) begin : shallow_write
+        always @(posedge clk) if (write[0]) words[to[IN-1:0]] <= written;
+      end
+    end
+    if (DEEP != 0) begin : choice
+      reg [PICK-1:0] pick1, pick2, pick3;
+      reg [WIDTH-1:0] picked;
+      always @(posedge clk)
+        if (go) begin
+          pick1 <= block_of(place);
+          pick2 <= pick1;
+          pick3 <= pick2;
+          picked <= found[pick3*WIDTH+:WIDTH];
+        end
+      assign word = picked;
+    end else begin : alone
+      assign word = found;
+    end
+  endgenerate
+endmodule
