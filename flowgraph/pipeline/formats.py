@@ -2,7 +2,8 @@
 
 A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included, but for
 those of registers and of what is added up in them, which may be wider: what is held gathers the rounding of
-many ticks, and an adder costs less than a multiplier. The fraction f is chosen for each element from the
+many ticks, and an adder costs less than a multiplier. A product takes no more than the upper 32 bits of one.
+The fraction f is chosen for each element from the
 largest size that the element takes, since the entries of one covariance differ by many powers of ten.
 Elements along an axis of particles share one. Values that are only moved (an element, a row, a transpose)
 keep the formats that they had.
@@ -21,6 +22,9 @@ from flowgraph.errors import DeclarationError
 
 NARROWEST, WIDEST = 8, 32
 """Bits of a word: two of the widest, multiplied, fit 64."""
+
+WIDEST_HELD = 48
+"""Bits of a word that is held: it is added and compared as it is, and multiplied by its upper `WIDEST`."""
 
 FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
@@ -61,14 +65,17 @@ class Formats:
 
     def __post_init__(self) -> None:
         wide = self.held_width or self.width
-        for name, width, least in (("width", self.width, NARROWEST), ("held_width", wide, self.width)):
-            if not least <= width <= WIDEST:
+        for name, width, least, most in (
+            ("width", self.width, NARROWEST, WIDEST),
+            ("held_width", wide, self.width, WIDEST_HELD),
+        ):
+            if not least <= width <= most:
                 raise DeclarationError(
                     "no word has this width",
                     path=name,
-                    expected=f"{least} to {WIDEST} bits",
+                    expected=f"{least} to {most} bits",
                     got=str(width),
-                    fix=f"choose {WIDEST} or fewer: products of two words are kept in 64 bits",
+                    fix=f"choose {most} or fewer: products of two words of {WIDEST} bits are kept in 64",
                 )
 
     def width_of(self, value: int) -> int:

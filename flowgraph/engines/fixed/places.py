@@ -15,6 +15,7 @@ import numpy as np
 
 from flowgraph.engines.fixed.absent import may_be_nan
 from flowgraph.engines.fixed.engine import Bound, Integers
+from flowgraph.pipeline.formats import WIDEST
 from flowgraph.pipeline.optimise.memory import plan
 from flowgraph.recorder.ops import Spec
 
@@ -98,7 +99,8 @@ class SharedPlaces:
             *((-1 - c.read, Spec(c.shape, c.dtype)) for c in cells),
         ):
             kept = n if n >= 0 else -1 - n
-            self._held[n] = self._next(self.held, _array(spec.dtype, kept in absent), spec.shape)
+            wide = kept in absent or player.formats.width_of(kept) > WIDEST
+            self._held[n] = self._next(self.held, _array(spec.dtype, wide), spec.shape)
         self.sizes = dict(self.held)
         self._at: dict[int, Place] = {}
         self.copies: dict[int, Place] = {}
@@ -113,10 +115,10 @@ class SharedPlaces:
         program = bound.program
         found = plan(program, ("reuse",), scalars=True)
         self._view = found.view
-        doubtful = may_be_nan(program.instructions, self._player.formats.absent)
-        wide = {
-            found.place[_root(found.view, n)[0]] for n in doubtful if _root(found.view, n)[0] in found.place
-        }
+        long = may_be_nan(program.instructions, self._player.formats.absent)
+        long |= {n for n, bits in bound.widths.items() if bits > WIDEST}
+        roots = {_root(found.view, n)[0] for n in long}
+        wide = {found.place[n] for n in roots if n in found.place}
         sizes = dict(self.held)
         buffers = [
             self._next(sizes, _array(b.dtype, k in wide), (b.size,)) for k, b in enumerate(found.buffers)
