@@ -187,11 +187,18 @@ class _Search:
             self.sizes.play(one.pipeline, one.tape, one.start.cells, one.seed)
 
     def at(self, bits: int) -> tuple[Formats, dict[str, Any]]:
-        """Formats of so many bits, and their figures on the flights that were held out."""
+        """Formats of so many bits, and their figures on the flights that were held out.
+
+        Each width begins with the sizes in floating point: what another had to widen says nothing of it.
+        """
+        self.sizes.forget()
+        self._more.clear()
         formats, player = self._settled(bits)
         figures = self._judge(formats, player)
         if figures["saturations"] and not self._joined:
             self._join(bits)
+            self.sizes.forget()
+            self._more.clear()
             formats, player = self._settled(bits)
             figures = self._judge(formats, player)
         for _ in range(_ROUNDS):
@@ -235,16 +242,22 @@ class _Search:
         return self._widen(counts, where, bits)
 
     def _widen(self, counts: Counts, where: str, bits: int) -> bool:
-        """Widen the formats of what saturated; tells whether anything did."""
-        for value, marks in counts.cut.items():
+        """Widen the formats of what saturated; tells whether anything was, and whether that may help.
+
+        A quotient by zero fits no word, nor does a filter that has gone astray: what was widened by all of
+        `_WIDEST` and saturates again always will.
+        """
+        cut = {n: marks for n, marks in counts.cut.items() if n not in counts.divisions_by_zero}
+        if not cut or any(self._more.get(n) == _WIDEST for n in cut):
+            return False
+        for value, marks in cut.items():
             more = self._more[value] = min(2 * self._more.get(value, _WIDER // 2), _WIDEST)
             self.sizes.widen(value, marks, 2.0**more)
-        if counts.cut:
-            names = names_of(self.pipeline)
-            some = ", ".join(names[v] for v in list(counts.cut)[:3])
-            self.notes.append(f"{len(counts.cut)} values widened at {bits} bits, after {where}: {some}")
-            self._say(self.notes[-1])
-        return bool(counts.cut)
+        names = names_of(self.pipeline)
+        some = ", ".join(names[v] for v in list(cut)[:3])
+        self.notes.append(f"{len(cut)} values widened at {bits} bits, after {where}: {some}")
+        self._say(self.notes[-1])
+        return True
 
     def _judge(self, formats: Formats, player: _Fleet) -> dict[str, Any]:
         self._worst = Counts()

@@ -296,8 +296,9 @@ def site_of(
 
 
 def _upper(x: Any, n: int) -> Any:
-    """Words without their lowest n bits."""
-    return np.where(x == NOT_A_NUMBER, NOT_A_NUMBER, x >> n)
+    """Words without their lowest n bits: rounded half upwards, but for what would not fit then."""
+    upper = np.minimum((x + (1 << (n - 1))) >> n, 2 ** (WIDEST - 1) - 1)
+    return np.where(x == NOT_A_NUMBER, NOT_A_NUMBER, upper)
 
 
 def _moving(have: np.ndarray, want: np.ndarray, spec: Spec) -> Run:

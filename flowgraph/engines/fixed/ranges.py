@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.tape import Tape
-from flowgraph.engines.fixed.shifts import MOVES, Site, moved
+from flowgraph.engines.fixed.shifts import MOVES, READ_WHOLE, Site, moved
 from flowgraph.engines.reference import Interpreter
 from flowgraph.pipeline.format_files import structure_of
-from flowgraph.pipeline.formats import FREE, Formats, fraction_for, fraction_of_constant
+from flowgraph.pipeline.formats import FREE, WIDEST, Formats, fraction_for, fraction_of_constant
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import needed
 from flowgraph.recorder.ops import Spec
@@ -68,6 +68,7 @@ class Sizes:
         self._waiting: dict[int, list[Any]] = {}
         self._idle: dict[int, list[Any]] = {}
         self._fits: dict[int, np.ndarray] = {}
+        self._wider: dict[int, np.ndarray] = {}
 
     def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
         """Play one flight, and widen the sizes by what occurs in it.
@@ -129,8 +130,10 @@ class Sizes:
             waiting.clear()
 
     def _size(self, value: int) -> np.ndarray | None:
-        """Of what was taken; where an element never was, of what it would have been."""
+        """Of what was taken, and of what was asked for; where an element never was, of what it would be."""
         found = self.largest.get(value)
+        if found is not None and value in self._wider:
+            found = np.maximum(found, self._wider[value])
         if found is None or value not in self.untaken:
             return found
         return np.asarray(np.where(found > 0.0, found, self.untaken[value]))
@@ -139,8 +142,12 @@ class Sizes:
         """Make the elements that are marked larger than what the last formats were made for, by so much."""
         axes = tuple(a for a, n in enumerate(marks.shape) if n in self._shared)
         wider = marks.any(axis=axes, keepdims=True)
-        size = np.maximum(self.largest[value], np.where(wider, self._fits[value] * factor, 0.0))
-        self.largest[value] = size
+        size = np.where(wider, self._fits[value] * factor, 0.0)
+        self._wider[value] = np.maximum(self._wider.get(value, 0.0), size)
+
+    def forget(self) -> None:
+        """Take back what was made wider."""
+        self._wider.clear()
 
     def formats(self, width: int, margin: float = 2.0, held_width: int = 0) -> Formats:
         """Formats in which numbers fit that are `margin` times as large as any that was seen.
@@ -153,10 +160,10 @@ class Sizes:
         fractions: dict[int, np.ndarray] = {}
         held = _held(self.pipeline) if held_width > width else frozenset()
         bits = {n: held_width for n in held}
-        errors = _Errors(self.pipeline, width)
-        for n, size in self.largest.items():
+        errors = _Errors(self.pipeline, width, {n: w - WIDEST for n, w in bits.items() if w > WIDEST})
+        for n in self.largest:
             if n in errors.given:
-                wide = margin * _beside_its_diagonal(size)
+                wide = margin * _beside_its_diagonal(np.asarray(self._size(n)))
                 fractions[n] = fraction_for(wide, bits.get(n, width))
                 errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
@@ -168,7 +175,7 @@ class Sizes:
             rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
             size = margin * _beside_its_diagonal(np.maximum(found, rounding))
             fractions[i.out] = fraction_for(size, bits.get(i.out, width))
-            errors.add(i, fractions[i.out], size, rounding)
+            errors.add(i, fractions[i.out], size, rounding, np.where(rounding > found, rounding, 0.0))
         self._fits = {
             n: np.ldexp(0.5, bits.get(n, width) - 1 - f.astype(int)) / margin for n, f in fractions.items()
         }
@@ -217,9 +224,10 @@ class _Errors:
         given: the inputs and registers.
     """
 
-    def __init__(self, pipeline: Pipeline, width: int) -> None:
+    def __init__(self, pipeline: Pipeline, width: int, drop: Mapping[int, int]) -> None:
         self._specs: Mapping[int, Spec] = pipeline.specs
         self._width = width
+        self._drop = dict(drop)
         self._size: dict[int, np.ndarray] = {}
         self._error: dict[int, np.ndarray] = {}
         self._fraction: dict[int, np.ndarray] = {}
@@ -230,27 +238,33 @@ class _Errors:
                 fraction = fraction_of_constant(array, width)
                 self._keep(n, fraction, np.abs(array), 0.0)
 
-    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any) -> None:
+    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any, alone: Any = 0.0) -> None:
         shape = self._specs[n].shape
         last = np.where(fraction == FREE, 0.0, np.ldexp(1.0, -np.minimum(fraction, 1000).astype(int)))
         self._fraction[n] = np.broadcast_to(fraction, shape)
         self._size[n] = np.broadcast_to(size, shape)
-        self._error[n] = np.broadcast_to(np.minimum(error + last, _MOST * last), shape)
+        most = np.maximum(_MOST * last, alone)
+        self._error[n] = np.broadcast_to(np.minimum(error + last, most), shape)
 
     def start(self, n: int, fraction: np.ndarray, size: np.ndarray) -> None:
         """A value that is given."""
         last = np.ldexp(1.0, -fraction.astype(int))
         self._keep(n, fraction, size, (_HELD - 1.0) * last if n in self._registers else 0.0)
 
-    def add(self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray) -> None:
-        """A value that was computed; one that is only moved keeps its formats."""
+    def add(
+        self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray, alone: np.ndarray
+    ) -> None:
+        """A value that was computed, `alone` the error of what is nothing else; what is only moved keeps its
+        formats."""
         if i.op in MOVES and all(a in self._fraction for a in i.args[:1]):
             given = [self._fraction.get(a) for a in i.args]
             if all(f is not None for f in given) or i.op == "take":
+                self._drop[i.out] = max(self._drop.get(a, 0) for a in i.args)
                 fraction = moved(i, given)
-                self._keep(i.out, fraction, size, error - np.ldexp(1.0, -np.minimum(fraction, 1000)))
+                last = np.ldexp(1.0, -np.minimum(fraction, 1000))
+                self._keep(i.out, fraction, size, error - last, alone)
                 return
-        self._keep(i.out, fraction, size, error)
+        self._keep(i.out, fraction, size, error, alone)
 
     def of(self, i: Instruction) -> np.ndarray:
         """The error of a result from those of its arguments, of its shape; zero where none is known."""
@@ -260,8 +274,17 @@ class _Errors:
         if rule is None or any(a not in self._size for a in i.args):
             return np.zeros(i.spec.shape)
         site = Site(i, [], None, self._specs, self._width)
-        sizes, errors = [self._size[a] for a in i.args], [self._error[a] for a in i.args]
+        sizes, errors = [self._size[a] for a in i.args], [self._read(a, i.op) for a in i.args]
         return np.asarray(np.broadcast_to(rule(site, sizes, errors), i.spec.shape))
+
+    def _read(self, n: int, op: str) -> np.ndarray:
+        """The error of an argument as an operation reads it."""
+        drop = 0 if op in READ_WHOLE else self._drop.get(n, 0)
+        if not drop:
+            return self._error[n]
+        f = self._fraction[n]
+        upper = np.where(f == FREE, 0.0, np.ldexp(1.0, drop - np.minimum(f, 1000).astype(int)))
+        return np.maximum(self._error[n], upper)
 
 
 def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
