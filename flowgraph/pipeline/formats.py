@@ -50,6 +50,7 @@ class Formats:
         structure: a digest of the plain pipeline that they are for; empty where nobody asks.
         held: the inputs, registers and values that are kept in wider words.
         held_width: bits of those; 0 where there are none.
+        proven: the values whose size is proven; that of the others was seen on flights.
 
     Raises:
         DeclarationError: for a width that no word has.
@@ -62,6 +63,7 @@ class Formats:
     structure: str = ""
     held: frozenset[int] = frozenset()
     held_width: int = 0
+    proven: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         wide = self.held_width or self.width
@@ -91,6 +93,7 @@ class Formats:
             "margin": self.margin,
             "absent": sorted(self.absent),
             "structure": self.structure,
+            **({"proven": sorted(self.proven)} if self.proven else {}),
             **({"held": {"width": self.held_width, "values": sorted(self.held)}} if self.held else {}),
             "fractions": [
                 {"value": n, "fraction": np.asarray(f).tolist()} for n, f in sorted(self.fractions.items())
@@ -122,6 +125,7 @@ class Formats:
             str(data["structure"]),
             frozenset(map(int, held["values"])),
             int(held["width"]),
+            frozenset(map(int, data.get("proven", ()))),
         )
 
 

@@ -78,7 +78,8 @@ class Quantised:
     pipeline: Pipeline
 
     def values(self) -> list[dict[str, Any]]:
-        """For a person: each value with its line, bits, and the fractions of its elements."""
+        """For a person: each value with its line, bits, the fractions of its elements, and whether its size
+        is proven or was observed."""
         names = names_of(self.pipeline)
         return [
             {
@@ -86,6 +87,7 @@ class Quantised:
                 "name": names.get(n, f"v{n}"),
                 "bits": self.formats.width_of(n),
                 "fraction": [int(np.min(f)), int(np.max(f))],
+                "bound": "proven" if n in self.formats.proven else "observed",
             }
             for n, f in sorted(self.formats.fractions.items())
         ]

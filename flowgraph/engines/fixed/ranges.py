@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.tape import Tape
+from flowgraph.engines.fixed.bounds import proven_sizes
 from flowgraph.engines.fixed.shifts import MOVES, READ_WHOLE, Site, moved
 from flowgraph.engines.reference import Interpreter
 from flowgraph.pipeline.format_files import structure_of
@@ -30,6 +31,9 @@ _HELD = 16.0
 
 _MOST = 256.0
 """Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
+
+_ROUNDED = 1.0 / 64.0
+"""The part by which rounding may exceed what is proven of real numbers."""
 
 _ALIKE = frozenset(["particles", "members"])
 """Axes along which elements are alike and share a format; those of a state differ by powers of ten."""
@@ -69,6 +73,8 @@ class Sizes:
         self._idle: dict[int, list[Any]] = {}
         self._fits: dict[int, np.ndarray] = {}
         self._wider: dict[int, np.ndarray] = {}
+        self._varying: set[int] = set()
+        self._proven: dict[int, np.ndarray] | None = None
 
     def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
         """Play one flight, and widen the sizes by what occurs in it.
@@ -79,6 +85,10 @@ class Sizes:
             cells: register cells at the start.
             seed: (2,) uint32.
         """
+        self._varying |= {
+            n for n, a in self.pipeline.constants.items() if not np.array_equal(a, pipeline.constants[n])
+        }
+        self._proven = None
         player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
         rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
         for cell, value in zip(self._cells, cells, strict=True):
@@ -130,13 +140,29 @@ class Sizes:
             waiting.clear()
 
     def _size(self, value: int) -> np.ndarray | None:
-        """Of what was taken, and of what was asked for; where an element never was, of what it would be."""
+        """Of what was taken; where an element never was, of what it would have been."""
         found = self.largest.get(value)
-        if found is not None and value in self._wider:
-            found = np.maximum(found, self._wider[value])
         if found is None or value not in self.untaken:
             return found
         return np.asarray(np.where(found > 0.0, found, self.untaken[value]))
+
+    def _bound(self, value: int, seen: np.ndarray) -> np.ndarray:
+        """What no element can exceed, with room for rounding; no bound where one did."""
+        if self._proven is None:
+            self._proven = proven_sizes(self.pipeline, self._varying)
+        size = self._proven.get(value)
+        if size is None:
+            return np.full(seen.shape, np.inf)
+        axes = tuple(a for a, n in enumerate(size.shape) if n in self._shared)
+        most = size.max(axis=axes, keepdims=True, initial=0.0)
+        return np.where((most > 0.0) & (seen <= most), most * (1.0 + _ROUNDED), np.inf)
+
+    def _fitting(self, value: int, seen: np.ndarray, margin: float) -> tuple[np.ndarray, bool]:
+        """The size that a format is for, and whether all of it is proven."""
+        size, bound = margin * _beside_its_diagonal(seen), self._bound(value, seen)
+        asked = margin * self._wider.get(value, np.zeros(()))
+        proven = bool((bound <= size).all()) and not (asked > bound).any()
+        return np.maximum(np.minimum(size, bound), asked), proven
 
     def widen(self, value: int, marks: np.ndarray, factor: float) -> None:
         """Make the elements that are marked larger than what the last formats were made for, by so much."""
@@ -150,7 +176,8 @@ class Sizes:
         self._wider.clear()
 
     def formats(self, width: int, margin: float = 2.0, held_width: int = 0) -> Formats:
-        """Formats in which numbers fit that are `margin` times as large as any that was seen.
+        """Formats in which numbers fit that are `margin` times as large as any that was seen, or as large as
+        any can be, where that is proven and less.
 
         Args:
             width: bits of a word.
@@ -158,12 +185,14 @@ class Sizes:
             held_width: bits of inputs, registers and what is added up in them; 0: those of `width`.
         """
         fractions: dict[int, np.ndarray] = {}
+        proven: set[int] = set()
         held = _held(self.pipeline) if held_width > width else frozenset()
         bits = {n: held_width for n in held}
         errors = _Errors(self.pipeline, width, {n: w - WIDEST for n, w in bits.items() if w > WIDEST})
         for n in self.largest:
             if n in errors.given:
-                wide = margin * _beside_its_diagonal(np.asarray(self._size(n)))
+                wide, sure = self._fitting(n, np.asarray(self._size(n)), margin)
+                proven |= {n} if sure else set()
                 fractions[n] = fraction_for(wide, bits.get(n, width))
                 errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
@@ -173,7 +202,8 @@ class Sizes:
             rounding = errors.of(i)
             axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
             rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
-            size = margin * _beside_its_diagonal(np.maximum(found, rounding))
+            size, sure = self._fitting(i.out, np.maximum(found, rounding), margin)
+            proven |= {i.out} if sure else set()
             fractions[i.out] = fraction_for(size, bits.get(i.out, width))
             errors.add(i, fractions[i.out], size, rounding, np.where(rounding > found, rounding, 0.0))
         self._fits = {
@@ -181,7 +211,8 @@ class Sizes:
         }
         structure = structure_of(self.pipeline)
         most = held_width if held else 0
-        return Formats(width, fractions, margin, frozenset(self.absent), structure, held, most)
+        absent = frozenset(self.absent)
+        return Formats(width, fractions, margin, absent, structure, held, most, frozenset(proven))
 
 
 def _held(pipeline: Pipeline) -> frozenset[int]:
@@ -284,7 +315,7 @@ class _Errors:
             return self._error[n]
         f = self._fraction[n]
         upper = np.where(f == FREE, 0.0, np.ldexp(1.0, drop - np.minimum(f, 1000).astype(int)))
-        return np.maximum(self._error[n], upper)
+        return np.asarray(np.maximum(self._error[n], upper))
 
 
 def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:

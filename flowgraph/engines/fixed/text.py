@@ -89,7 +89,7 @@ class Text:
             self.put("}")
 
     def word(self, value: int, index: Sequence[str]) -> str:
-        """The element of a value at an index of a shape that it broadcasts to, as the 64 bits that are read."""
+        """The element of a value at an index of a shape that it broadcasts to: 64 bits that are read."""
         found = wide(self.to(value, index))
         return f"fx_upper({found}, {self.drop[value]})" if value in self.drop else found
 
