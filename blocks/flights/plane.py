@@ -2,22 +2,27 @@
 
 The point goes along a random smooth figure, a sum of sinusoids that starts at the origin. A velocity reading
 is the mean over the time since the reading before, so position is its exact integral, and the whole error is
-white noise of the density that is told.
+white noise of the density that is told. A flight is a run of the graph `plane`; see `figure`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from flowgraph import Flight, Series
-from flowgraph.blocks.signals import PlanePosition, PlaneVelocity
-from flowgraph.blocks.world import generator
+from flowgraph import Flight, Graph, Stream, Tick, graph, latest, simulate, ticks
+from flowgraph.blocks.sensors import read_plane_position, read_plane_velocity
+from flowgraph.blocks.signals import PlaneShape
+from flowgraph.blocks.world import plane_motion, plane_shape
+from flowgraph.data.experiment import Experiment
+from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["DEFAULTS", "load_plane"]
+__all__ = ["DEFAULTS", "load_plane", "plane"]
 
 DEFAULTS: Mapping[str, float] = {
     "duration": 20.0,
@@ -28,8 +33,31 @@ DEFAULTS: Mapping[str, float] = {
 }
 """s, Hz, m/s/sqrt(Hz), Hz, m."""
 
-_WAVES = 3
 _MOST_SAMPLES = 10_000_000
+
+
+@graph
+def plane(
+    start: Stream[Tick],
+    velocity: Stream[Tick],
+    position: Stream[Tick],
+    *,
+    velocity_noise: float,
+    position_noise: float,
+    first: float,
+) -> dict[str, Stream[Any]]:
+    """A point in the plane; `start` ticks once, at 0, where the figure is drawn. There is a truth at every
+    reading of either."""
+    shape = latest(plane_shape(at=start), init=_NO_SHAPE, name="shape")
+    here = plane_motion(shape, at=velocity | position)
+    return {
+        "velocity": read_plane_velocity(here, at=velocity, noise=velocity_noise, first=first),
+        "position": read_plane_position(here, at=position, noise=position_noise),
+        "truth": here,
+    }
+
+
+_NO_SHAPE = PlaneShape(sizes=np.zeros((2, 3)), phases=np.zeros((2, 3)), paces=np.zeros(3))
 
 
 def load_plane(*, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
@@ -59,38 +87,37 @@ def load_plane(*, seed: int = 0, settings: Mapping[str, str | float] | None = No
             got=", ".join(f"{k}={n[k]:g}" for k in ("duration", "velocity.rate", "position.rate")),
             fix="choose a shorter duration or a lower rate",
         )
-    end = round(n["duration"] * 1e9)
-    often, seldom = (
-        np.arange(0, end + 1, max(round(1e9 / n[f"{s}.rate"]), 1), dtype=np.int64)
-        for s in ("velocity", "position")
-    )
-    dt = np.diff(often, prepend=often[0]) * 1e-9
-    step = np.where(dt > 0.0, dt, often[-1] * 1e-9 + 1.0)  # the first reading covers no time, and is noise
-    draw = lambda name, *shape: generator(seed, f"plane.{name}").standard_normal(shape)
-    moved = np.diff(_figure(often, seed), axis=0, prepend=np.zeros((1, 2)))
-    white = draw("velocity", len(often), 2) * n["velocity.noise"]
-    velocity = PlaneVelocity(velocity=moved / step[:, None] + white / np.sqrt(step)[:, None])
-    place = _figure(seldom, seed) + draw("position", len(seldom), 2) * n["position.noise"]
-    time = np.union1d(often, seldom)
+    world = _world(tuple(n.items()))
+    flown = simulate(_built(tuple(n.items())), world.ticks, engine="numpy", seed=seed)
     return Flight(
         name=f"sim-plane-{seed}",
-        streams={
-            "velocity": Series(often, velocity, name="velocity"),
-            "position": Series(seldom, PlanePosition(position=place), name="position"),
-        },
-        truth=Series(time, PlanePosition(position=_figure(time, seed)), name="truth"),
+        streams={name: flown[name] for name in ("velocity", "position")},
+        truth=flown["truth"],
         info={"velocity_noise": n["velocity.noise"], "position_noise": n["position.noise"]},
         notes=(note("info", f"simulated with seed {seed}: a smooth figure in the plane"),),
+        experiment=world,
     )
 
 
-def _figure(time: np.ndarray, seed: int) -> np.ndarray:
-    """Positions (n, 2) in m."""
-    random = generator(seed, "plane.figure")
-    size, phase = random.normal(size=(2, _WAVES)), random.uniform(0.0, 2.0 * np.pi, (2, _WAVES))
-    pace = random.uniform(0.3, 1.5, _WAVES)  # rad/s
-    angle = (time * 1e-9)[:, None, None] * pace + phase
-    return np.asarray(np.sum(size * (np.sin(angle) - np.sin(phase)), axis=-1))
+@lru_cache(maxsize=8)
+def _world(settings: tuple[tuple[str, float], ...]) -> Experiment:
+    n = dict(settings)
+    end = round(n["duration"] * 1e9) + 1
+    periods = {s: max(round(1e9 / n[f"{s}.rate"]), 1) for s in ("velocity", "position")}
+    told = {
+        "velocity_noise": n["velocity.noise"],
+        "position_noise": n["position.noise"],
+        # the first reading covers no time, and is noise
+        "first": (end - 1) // periods["velocity"] * periods["velocity"] * 1e-9 + 1.0,
+    }
+    clocks = {"start": end, **periods}
+    return Experiment(plane, {s: ticks(each, until=end, name=s) for s, each in clocks.items()}, told)
+
+
+@lru_cache(maxsize=8)
+def _built(settings: tuple[tuple[str, float], ...]) -> Graph:
+    world = _world(settings)
+    return plane.build(**clocks_of(world.ticks), **world.settings)
 
 
 def _positive(name: str, text: str | float) -> float:

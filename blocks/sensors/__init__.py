@@ -35,6 +35,7 @@ from flowgraph.blocks.sensors.inertial import (
 )
 from flowgraph.blocks.sensors.magnetic import MagneticAttitude, Magnetometer, earth_field
 from flowgraph.blocks.sensors.noise import NO_NOISE, Noise
+from flowgraph.blocks.sensors.plane import read_plane_position, read_plane_velocity
 from flowgraph.blocks.sensors.pose import AttitudeSensor, PositionSensor, Vicon, turned
 from flowgraph.blocks.sensors.sensor import Recording, Sensor
 
@@ -48,6 +49,8 @@ __all__ = [
     "read_magnetometer",
     "read_pose",
     "read_position",
+    "read_plane_position",
+    "read_plane_velocity",
     "true_state",
     "Sensor",
     "Recording",

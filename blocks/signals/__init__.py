@@ -36,7 +36,7 @@ from flowgraph.blocks.signals.calibration import (
     Window,
 )
 from flowgraph.blocks.signals.control import Controller, FlightCommand
-from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, Vector
+from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, PlaneShape, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
     Attitude,
@@ -123,6 +123,7 @@ __all__ = [
     "FlightCommand",
     "BodyMotion",
     "FigureShape",
+    "PlaneShape",
     "Vector",
     "Bounds",
     "Extremes",

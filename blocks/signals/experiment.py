@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flowgraph import Array, Signal, real
 
-__all__ = ["BodyMotion", "FigureShape", "Vector"]
+__all__ = ["BodyMotion", "FigureShape", "PlaneShape", "Vector"]
 
 
 class BodyMotion(Signal):
@@ -34,6 +34,17 @@ class FigureShape(Signal):
     yaw_phases: Array = real(2, unit="rad")
     origin: Array = real(3, 3, unit="m")
     yaw_origin: Array = real(2, unit="rad")
+
+
+class PlaneShape(Signal):
+    """A smooth figure in the plane: three waves an axis, of one pace each.
+
+    sizes: m. phases: rad, at the start. paces: rad/s.
+    """
+
+    sizes: Array = real(2, 3, unit="m")
+    phases: Array = real(2, 3, unit="rad")
+    paces: Array = real(3, unit="rad/s")
 
 
 class Vector(Signal):

@@ -14,6 +14,7 @@ from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join, primitive
 from flowgraph.blocks.world.motion import Motion, World, world_motion
+from flowgraph.blocks.world.plane import plane_motion, plane_shape
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
 from flowgraph.blocks.world.smooth import AT_REST, figure_motion, figure_shape, shaped, smooth_motion
@@ -43,5 +44,7 @@ __all__ = [
     "figure_motion",
     "figure_shape",
     "shaped",
+    "plane_motion",
+    "plane_shape",
     "smooth_motion",
 ]

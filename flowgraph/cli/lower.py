@@ -46,7 +46,7 @@ def lower(
     settings_file: SettingsFile = None,
     seed: Seed = 0,
     target: Annotated[
-        str, typer.Option(metavar="TARGET", help="description, and c for C99 or verilog too.")
+        str, typer.Option(metavar="TARGET", help="description, and c for C99, verilog, or hls for C++ too.")
     ] = "description",
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Of the filter in what is written; that of the graph.")
@@ -66,7 +66,7 @@ def lower(
     clock: Annotated[float, typer.Option(min=1.0, help="In Hz, for the report.")] = 100e6,
     as_json: AsJson = False,
 ) -> None:
-    """Lower a graph to a fixed-size pipeline description, and to C or Verilog as well."""
+    """Lower a graph to a fixed-size pipeline description, and to C, Verilog or C++ for HLS as well."""
     writing_engines = writers()
     engine = writing_engines.get(target)
     kinds = NUMBERS if engine is None else engine.dtypes

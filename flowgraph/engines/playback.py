@@ -35,7 +35,7 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     """Play what was lowered over its inputs to their end."""
     engine = find_pipeline_engine(options.engine)
     engine.check(options)
-    pipeline = _formatted(subject.pipeline, options)
+    pipeline = _formatted(subject.pipeline, engine, options)
     start = subject.start(options)
     events = subject.tape(inputs, start.last)
     pipeline.need_numbers(options.dtype)
@@ -106,7 +106,7 @@ def _result(
     return Result(pipeline.name, engine, series, state, stats, ticks, outcome.wall_s, outcome.notes)
 
 
-def _formatted(pipeline: Pipeline, options: RunOptions) -> Pipeline:
+def _formatted(pipeline: Pipeline, engine: PipelineEngine, options: RunOptions) -> Pipeline:
     """The pipeline with the number formats that the options have.
 
     Raises:
@@ -115,11 +115,11 @@ def _formatted(pipeline: Pipeline, options: RunOptions) -> Pipeline:
     formats = options.formats
     if formats is None:
         return pipeline
-    if options.engine not in ("fixed", "verilog") and options.dtype != "fixed":
+    if engine.dtypes[0] != "fixed" and options.dtype != "fixed":
         raise DeclarationError(
             "number formats are for a run in fixed point",
             path="formats",
-            expected='engine="fixed" or "verilog", or engine="c" with dtype="fixed"',
+            expected='engine="fixed", or one equal to it, or engine="c" with dtype="fixed"',
             got=f"engine={options.engine!r}, dtype={options.dtype!r}",
             fix="choose one of these, or leave formats out",
         )

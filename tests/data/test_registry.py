@@ -110,7 +110,7 @@ def test_a_broken_engine_is_in_no_other_engines_way(install: Install):
     assert writers() == before
     with pytest.raises(UnknownNameError) as caught:
         find_pipeline_engine("python")
-    assert caught.value.valid == ["c", "fixed", "numpy", "reference", "verilog", "xla"]
+    assert caught.value.valid == ["c", "fixed", "hls", "numpy", "reference", "verilog", "xla"]
     with pytest.raises(PluginError):
         find_pipeline_engine("broken")
 

@@ -54,7 +54,7 @@ class Elements(Text):
                 f"fx_shift(fx_shift({x[0]}, {a}) {'+' if op == 'add' else '-'} fx_shift({x[1]}, {b}), {end})"
             )
         if op == "multiply":
-            return f"fx_shift({x[0]} * {x[1]}, {self.shift(shifts.shift_of_product(s), index)})"
+            return f"fx_shift({self.product(*x)}, {self.shift(shifts.shift_of_product(s), index)})"
         if op == "divide":
             return f"fx_quotient({x[0]}, {x[1]}, {self.shift(shifts.shift_of_quotient(s), index)})"
         fractions = [

@@ -17,6 +17,7 @@ from flowgraph.engines.fixed.absent import may_be_nan
 from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.pipeline.formats import WIDEST
 from flowgraph.pipeline.optimise.memory import plan
+from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.ops import Spec
 
 Place = tuple[str, int]
@@ -85,22 +86,11 @@ class SharedPlaces:
         self.known: dict[str, list[int]] = {KNOWN: [], KNOWN_SMALL: []}
         self._held: dict[int, Place] = {}
         self._constants: dict[tuple[str, bytes], int] = {}
-        cells = [c for r in pipeline.registers for c in r.cells]
-        leaves = [leaf for port in pipeline.inputs for leaf in port.leaves]
-        absent = set(player.formats.absent)
-        for program in (player.bind(key).program for key in keys):
-            doubtful = may_be_nan(program.instructions, absent)
-            absent |= {c.read for c, n in zip(cells, program.writes, strict=True) if n in doubtful}
-        for n, spec in (
-            *((c.read, Spec(c.shape, c.dtype)) for c in cells),
-            *((x.value, Spec(x.shape, x.dtype)) for x in leaves),
-            (pipeline.time, Spec((), "int64")),
-            (pipeline.seed, Spec((2,), "uint32")),
-            *((-1 - c.read, Spec(c.shape, c.dtype)) for c in cells),
-        ):
+        absent = holding_none(player, keys)
+        for n, spec in held_values(pipeline):
             kept = n if n >= 0 else -1 - n
             wide = kept in absent or player.formats.width_of(kept) > WIDEST
-            self._held[n] = self._next(self.held, _array(spec.dtype, wide), spec.shape)
+            self._held[n] = self._next(self.held, array_of(spec.dtype, wide), spec.shape)
         self.sizes = dict(self.held)
         self._at: dict[int, Place] = {}
         self.copies: dict[int, Place] = {}
@@ -117,25 +107,25 @@ class SharedPlaces:
         self._view = found.view
         long = may_be_nan(program.instructions, self._player.formats.absent)
         long |= {n for n, bits in bound.widths.items() if bits > WIDEST}
-        roots = {_root(found.view, n)[0] for n in long}
+        roots = {root_of(found.view, n)[0] for n in long}
         wide = {found.place[n] for n in roots if n in found.place}
         sizes = dict(self.held)
         buffers = [
-            self._next(sizes, _array(b.dtype, k in wide), (b.size,)) for k, b in enumerate(found.buffers)
+            self._next(sizes, array_of(b.dtype, k in wide), (b.size,)) for k, b in enumerate(found.buffers)
         ]
         self._at = dict(self._held)
         for n, array in bound.known.items():
             if n not in self._held:
                 self._at[n] = self._constant(np.asarray(array), program.specs[n].dtype)
         for i in program.instructions:
-            root, begin = _root(found.view, i.out)
+            root, begin = root_of(found.view, i.out)
             array, base = buffers[found.place[root]] if root in found.place else self._at[root]
             self._at[i.out] = array, base + begin
         self.copies = {}
         for n in {n for flag, leaves in program.outputs if flag is not None for n in leaves}:
             if n in bound.known and n not in self._held:
                 spec = program.specs[n]
-                self.copies[n] = self._next(sizes, _array(spec.dtype, False), spec.shape)
+                self.copies[n] = self._next(sizes, array_of(spec.dtype, False), spec.shape)
         self.sizes = {array: max(n, self.sizes[array]) for array, n in sizes.items()}
 
     def _constant(self, words: np.ndarray, dtype: str) -> Place:
@@ -155,12 +145,35 @@ class SharedPlaces:
         return found is not None and found[0] == whole and begin in (None, found[1])
 
 
-def _array(dtype: str, wide: bool) -> str:
+def held_values(pipeline: Pipeline) -> list[tuple[int, Spec]]:
+    """What is there before a tick or after it: registers, inputs, time, seed, new words of registers."""
+    cells = [c for r in pipeline.registers for c in r.cells]
+    leaves = [leaf for port in pipeline.inputs for leaf in port.leaves]
+    return [
+        *((c.read, Spec(c.shape, c.dtype)) for c in cells),
+        *((x.value, Spec(x.shape, x.dtype)) for x in leaves),
+        (pipeline.time, Spec((), "int64")),
+        (pipeline.seed, Spec((2,), "uint32")),
+        *((-1 - c.read, Spec(c.shape, c.dtype)) for c in cells),
+    ]
+
+
+def holding_none(player: Integers, keys: Sequence[int]) -> set[int]:
+    """The inputs and registers that may hold a reading that is not there."""
+    cells = [c for r in player.pipeline.registers for c in r.cells]
+    absent = set(player.formats.absent)
+    for program in (player.bind(key).program for key in keys):
+        doubtful = may_be_nan(program.instructions, absent)
+        absent |= {c.read for c, n in zip(cells, program.writes, strict=True) if n in doubtful}
+    return absent
+
+
+def array_of(dtype: str, wide: bool) -> str:
     """The array of words of a kind."""
     return SMALL if dtype in ("real", "bool") and not wide else WORDS
 
 
-def _root(view: Mapping[int, tuple[int, int]], value: int) -> tuple[int, int]:
+def root_of(view: Mapping[int, tuple[int, int]], value: int) -> tuple[int, int]:
     """The value in whose memory another lies, and where in it."""
     begin = 0
     while value in view:

@@ -11,6 +11,7 @@ from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.places import KNOWN, WORDS, Places
 from flowgraph.engines.fixed.shifts import slim
 from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.trace import Instruction
 
 _WRAP = {"uint32": "(int64_t)(uint32_t)({})", "int32": "(int64_t)(int32_t)({})", "bool": "(({}) != 0)"}
 
@@ -102,6 +103,14 @@ class Text:
         """The element of a value at a place in it."""
         array, base = self.places.at(value, shape)
         return f"{array}[{plus(base, place)}]"
+
+    def said(self, i: Instruction) -> None:
+        """What a reader is told of an instruction, ahead of it."""
+        self.put(f"/* v{i.out} = {i.op} {list(i.spec.shape)}  {i.line} */")
+
+    def product(self, a: str, b: str) -> str:
+        """Two words multiplied."""
+        return f"{a} * {b}"
 
     def put_to(self, to: str, text: str) -> None:
         """The statement that puts words that fit into their place."""

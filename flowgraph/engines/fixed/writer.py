@@ -33,7 +33,7 @@ class Writer(Elements):
         bodies = []
         for first in range(0, len(program.instructions), _TOGETHER):
             for i in program.instructions[first : first + _TOGETHER]:
-                self.put(f"/* v{i.out} = {i.op} {list(i.spec.shape)}  {i.line} */")
+                self.said(i)
                 self.most = self.bound.most(i.out) if i.out in widths else None
                 site = site_of(i, self.bound.fractions, widths, program.specs, width)
                 self.drop = {a: n for a, n in zip(i.args, site.drop, strict=True) if n}
@@ -128,12 +128,12 @@ class Writer(Elements):
         if i.op == "sum":
             return self.word(i.args[0], index)
         if i.op == "vecdot":
-            return f"{self.word(i.args[0], index)} * {self.word(i.args[1], index)}"
+            return self.product(self.word(i.args[0], index), self.word(i.args[1], index))
         *batch, row, k, column = index
         a, b = (self.shape(n) for n in i.args)
         left = [k] if len(a) == 1 else [*batch, row, k]
         right = [k] if len(b) == 1 else [*batch, k, column]
-        return f"{self.word(i.args[0], left)} * {self.word(i.args[1], right)}"
+        return self.product(self.word(i.args[0], left), self.word(i.args[1], right))
 
     def result(self, s: Site, index: list[str], axes: tuple[int, ...]) -> str:
         i = s.i
