@@ -53,19 +53,7 @@ def header(
         "#endif",
         "",
     ]
-    for title, ports, called, leaves in (
-        ("input", pipeline.inputs, names.inputs, names.input_leaves),
-        ("output", pipeline.outputs, names.outputs, names.output_leaves),
-    ):
-        for k, (port, name, members) in enumerate(zip(ports, called, leaves, strict=True)):
-            lines.append(
-                f"/* {title} {k}: {comment(port.name)}, a {comment(port.type)}; {comment(port.clock)} */"
-            )
-            lines.append(f"#define {m.upper()}_{name.upper()} (UINT64_C(1) << {k})")
-            lines.append("typedef struct {")
-            lines += [_member(n, leaf, real) for n, leaf in zip(members, port.leaves, strict=True)]
-            lines += _empty(port.leaves)
-            lines += [f"}} {m}_{name};", ""]
+    lines += port_types(pipeline, names, real)
     lines.append("/* what lasts from one call to the next; set by reset, changed by react alone */")
     lines.append("typedef struct {")
     for register, members in zip(pipeline.registers, names.registers, strict=True):
@@ -108,6 +96,26 @@ def header(
         "#endif",
     ]
     return "\n".join(lines) + "\n"
+
+
+def port_types(pipeline: Pipeline, names: Names, real: str) -> list[str]:
+    """The lines that declare for each port its bit and its struct."""
+    m = names.module
+    lines = []
+    for title, ports, called, leaves in (
+        ("input", pipeline.inputs, names.inputs, names.input_leaves),
+        ("output", pipeline.outputs, names.outputs, names.output_leaves),
+    ):
+        for k, (port, name, members) in enumerate(zip(ports, called, leaves, strict=True)):
+            lines.append(
+                f"/* {title} {k}: {comment(port.name)}, a {comment(port.type)}; {comment(port.clock)} */"
+            )
+            lines.append(f"#define {m.upper()}_{name.upper()} (UINT64_C(1) << {k})")
+            lines.append("typedef struct {")
+            lines += [_member(n, leaf, real) for n, leaf in zip(members, port.leaves, strict=True)]
+            lines += _empty(port.leaves)
+            lines += [f"}} {m}_{name};", ""]
+    return lines
 
 
 def react_signature(names: Names, restrict: str = "") -> str:

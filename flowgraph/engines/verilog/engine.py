@@ -12,6 +12,7 @@ from flowgraph.engines.contract import PipelineEngine, Player
 from flowgraph.engines.fixed.engine import need_formats
 from flowgraph.engines.fixed.files import patterns_with_formats
 from flowgraph.engines.pipeline_inputs import events_of
+from flowgraph.engines.verilog.driver import Driver, events_text
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.script import Script
 from flowgraph.engines.verilog.simulate import Simulated, verilator
@@ -40,8 +41,12 @@ class VerilogEngine(PipelineEngine):
     def write(
         self, pipeline: Pipeline, folder: Path, dtype: str, passes: Collection[str]
     ) -> Mapping[str, Path]:
+        image = _image(pipeline)
+        driver = Driver(image)
+        written = texts(image) | driver.texts()
+        written["Makefile"] += driver.make()
         found = {}
-        for name, text in texts(_image(pipeline)).items():
+        for name, text in written.items():
             found[name] = folder / name
             with writes(found[name]):
                 folder.mkdir(parents=True, exist_ok=True)
@@ -49,12 +54,16 @@ class VerilogEngine(PipelineEngine):
         return found
 
     def write_events(self, pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: Path) -> int:
-        """Write the script that the bench plays: each tick, with the interpreter's words to compare."""
+        """Write the script that the bench plays: each tick, with the interpreter's words to compare.
+
+        Beside it, in FILE.host, lie the numbers of the inputs, for the driver.
+        """
         tape = events_of(pipeline, inputs)
         cells = [c.reset for r in pipeline.registers for c in r.cells]
         script = Script(_image(pipeline), tape, cells, seed_words(0), check=True)
         with writes(file):
             put(file, "\n".join(script.checked()) + "\n")
+            put(file.with_name(f"{file.name}.host"), events_text(tape))
         return len(tape.time)
 
 
