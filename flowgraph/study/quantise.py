@@ -132,6 +132,15 @@ def quantise(
             got=f"{len(flights)} and {len(held_out)} held out",
             fix="write --seeds 4 --held-out-seeds 3",
         )
+    Formats(width, {}, held_width=held_width)  # refuses words that there are not
+    if not NARROWEST <= least <= width:
+        raise DeclarationError(
+            "no width can be tried",
+            path="--least",
+            expected=f"{NARROWEST} to {width} bits",
+            got=str(least),
+            fix="ask for fewer bits at least, or for more at most (--width)",
+        )
     search = _Search(flights, held_out, margin, say, held_width)
     tried: list[Mapping[str, Any]] = []
     best: tuple[Formats, Mapping[str, Any]] | None = None
