@@ -13,6 +13,7 @@ if _TYPE_CHECKING:
     from flowgraph.data.flight import Flight
     from flowgraph.data.inputs import arrays, clocks_of, ticks, timing_of
     from flowgraph.data.progress import ProgressBar
+    from flowgraph.data.reading import read_pieces
     from flowgraph.data.registry import Case, Report, find_graph, load_flight
     from flowgraph.data.result import Result
     from flowgraph.data.series import Series
@@ -145,6 +146,7 @@ _LATER = {
     "Report": "flowgraph.data.registry",
     "find_graph": "flowgraph.data.registry",
     "load_flight": "flowgraph.data.registry",
+    "read_pieces": "flowgraph.data.reading",
     "Result": "flowgraph.data.result",
     "Flight": "flowgraph.data.flight",
     "Series": "flowgraph.data.series",
@@ -273,6 +275,7 @@ __all__ = [
     "merge",
     "padded",
     "periodic",
+    "read_pieces",
     "real",
     "reduce",
     "reorder",

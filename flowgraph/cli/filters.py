@@ -34,6 +34,7 @@ from flowgraph.cli.options import (
 )
 from flowgraph.cli.pages import recorder_of, runs_before, shown_again, write_page
 from flowgraph.cli.resume import kept_in, resumed
+from flowgraph.cli.stream import stream_folder, streamed
 from flowgraph.cli.terminal import (
     err_console,
     first_line,
@@ -155,18 +156,27 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Go on from a checkpoint; what is left out is as it was."),
+        typer.Option(
+            metavar="FILE", help="Go on from a checkpoint, or a folder of --stream; the rest is as it was."
+        ),
+    ] = None,
+    stream: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write results to Parquet as they come; nothing else is kept."),
     ] = None,
     formats: Formats = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a graph on a flight and compare it with the truth."""
     settings = with_file(settings, settings_file) or None
+    whole = {"--out": out, "--export": export, "--html": html, "--beside": beside, "--formats": formats,
+             "--checkpoint": checkpoint, "--every": every}  # fmt: skip
+    folder = stream_folder(stream, resume, whole)
     command = resumed(resume, graph=graph, data=data, truth=truth, engine=engine, dtype=dtype, seed=seed,
                       settings=settings)  # fmt: skip
     graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
     truth, settings = command.truth, command.settings
-    kept = kept_in(checkpoint, every, resume, command)
+    kept = kept_in(checkpoint, every, resume if folder is None else None, command)
     forms = wanted_forms(export, out)
     if out is not None:
         make_ready(out)
@@ -184,6 +194,17 @@ def run(
     say(command.notes)
     spec = one_flight(command.data) or ""
     case, flight = case_of(graph, spec, settings, seed, truth, say)  # said before the run, which may fail
+    about = {"data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
+    about |= {"truth": truth} if truth else {}
+    if folder is not None:
+        row = streamed(
+            case, command, folder, resume=resume is not None, diverged=diverged, quiet=as_json, say=say
+        )
+        return (
+            print_json({**row, **about, "notes": list(notes)})
+            if as_json
+            else out_console.print(runs_table([row]))
+        )
     recorder = recorder_of(case) if html is not None else None
     watcher = recorder if engine == "python" and kept is None else None
     result, row = _measure(
@@ -196,9 +217,7 @@ def run(
         options = {"dtype": dtype, "seed": seed, "diverged": diverged}
         recorder, words = shown_again(case, result, recorder, **options)
         say((words,))
-    report = {**row, "data": spec, "flight": flight.name, "seed": seed, "settings": list(settings or [])}
-    report |= {"truth": truth} if truth else {}
-    report["notes"] = list(notes)
+    report = {**row, **about, "notes": list(notes)}
     if out is not None and forms:
         say(tuple(exported(forms, out, case, flight, result)))
         report["notes"] = list(notes)

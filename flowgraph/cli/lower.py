@@ -99,8 +99,10 @@ def lower(
             ticks = engine.write_events(pipeline, inputs, events)
             err_console.print(f"wrote {events}: {ticks} ticks", markup=False)
         if (output / "Makefile").exists():
-            played = events or "EVENTS.csv (which --data SPEC --events EVENTS.csv writes)"
-            err_console.print(f"next: make -C {output}, then {output}/replay {played}", markup=False)
+            played = events or "EVENTS (which --data SPEC --events EVENTS writes)"
+            err_console.print(
+                f"next: make -C {output}; the Makefile says what then plays {played}", markup=False
+            )
     totals: dict[str, Any] = {"graph": graph, **pipeline.totals(), "latency": pipeline.latency()}
     if report:
         from flowgraph.pipeline.costs import cost_report  # only a report needs it

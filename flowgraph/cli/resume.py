@@ -1,4 +1,5 @@
-"""A run that goes on from a checkpoint: what its command leaves out is as it was in the first one."""
+"""A run that goes on from a checkpoint, or in the folder of a streamed run: what its command leaves out is as
+it was in the first one."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from typing import Any
 from flowgraph.data.notes import note
 from flowgraph.engines.checkpoint import read_checkpoint
 from flowgraph.engines.options import Checkpoint
+from flowgraph.engines.streaming import streamed_about
 from flowgraph.errors import DeclarationError
 
 
@@ -36,13 +38,15 @@ class Command:
 
 
 def resumed(resume: Path | None, **given: Any) -> Command:
-    """The command as given, filled up with that of the checkpoint, or else with the defaults.
+    """The command as given, filled up with that of the checkpoint or folder, or else with the defaults.
 
     Raises:
-        DataError: for a file that is no checkpoint.
+        DataError: for a file that is no checkpoint, or a folder without a streamed run.
         DeclarationError: where neither says which graph, or which data.
     """
-    before: Mapping[str, Any] = {} if resume is None else read_checkpoint(resume).about
+    before: Mapping[str, Any] = {}
+    if resume is not None:
+        before = streamed_about(resume) if resume.is_dir() else read_checkpoint(resume).about
     found = {**before, **{name: value for name, value in given.items() if value is not None}}
     for name, spelled in (("graph", "GRAPH"), ("data", "--data SPEC")):
         if not found.get(name):

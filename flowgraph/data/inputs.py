@@ -1,9 +1,9 @@
 """What goes into a run: events of each source, checked against its declared clock.
 
 A source is given as a `Series`, as a pair `(times, values)` of arrays, or as any iterable of
-`(time, value)` pairs, read lazily. Nothing is repaired in silence: stamps out of order, two events of one
-source at one time, values that are not finite, and stamps that do not keep to the declared clock are refused
-unless the source names a rule.
+`(time, value)` pairs, or of `Series` one after the other, read lazily. Nothing is repaired in silence:
+stamps out of order, two events of one source at one time, values that are not finite, and stamps that do not
+keep to the declared clock are refused unless the source names a rule.
 """
 
 from __future__ import annotations
@@ -146,6 +146,22 @@ def prepare(
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
     """
+    before = dict(last or dict.fromkeys(graph.sources, NEVER))
+    resumed = max(before.values(), default=NEVER)
+    found: dict[str, Series | Iterator[tuple[int, Any]]] = {}
+    for name, given in sources_of(graph, inputs).items():
+        node = graph.sources[name]
+        check = check_recording if isinstance(given, Series) else single_events
+        found[name] = check(name, given, node.type, node.clock.timing, before[name], resumed)
+    return found
+
+
+def sources_of(graph: Graph, inputs: Inputs) -> dict[str, Any]:
+    """What each source is given, in declaration order: a `Series`, or an iterable of events or of `Series`.
+
+    Raises:
+        UnknownNameError, DataError: naming a source that is not there, or that is given no events.
+    """
     need_inputs(graph, inputs)
     given = dict(inputs.streams) if isinstance(inputs, Flight) else dict(inputs)
     if not isinstance(inputs, Flight):
@@ -153,9 +169,7 @@ def prepare(
             if name not in graph.sources:
                 raise UnknownNameError("source", name, graph.sources, path=graph.name)
     given = with_stamps(graph.sources, given)
-    found: dict[str, Series | Iterator[tuple[int, Any]]] = {}
-    before = dict(last or dict.fromkeys(graph.sources, NEVER))
-    resumed = max(before.values(), default=NEVER)
+    found: dict[str, Any] = {}
     for name, node in graph.sources.items():
         if name not in given:
             raise DataError(
@@ -168,14 +182,7 @@ def prepare(
         value = given[name]
         if isinstance(value, tuple) and len(value) == 2:
             value = Series(value[0], value[1], name=name)
-        if isinstance(value, Series):
-            series = _typed(name, value, node.type)
-            if len(series):
-                _check_after(name, int(series.time[0]), resumed)
-            found[name] = _checked(name, series, node.clock.timing, before[name])
-        elif isinstance(value, Iterable):
-            found[name] = _events(name, value, node.type, node.clock.timing, before[name], resumed)
-        else:
+        if not isinstance(value, Iterable):
             raise DataError(
                 f"source {name!r} is given something that holds no events",
                 path=graph.name,
@@ -183,7 +190,26 @@ def prepare(
                 got=type(value).__name__,
                 fix="write Series(time, values)",
             )
+        found[name] = value
     return found
+
+
+def check_recording(
+    name: str, given: Series, type_: Type, timing: Timing, before: int, resumed: int
+) -> Series:
+    """Check the events of a source, all or the next of them; returns them as of its type.
+
+    Args:
+        name, given, type_, timing: the source, its events, and what it is declared to be.
+        before: the stamp of the source's event before these, or `NEVER`.
+        resumed: the time at which a state was saved, or `NEVER`; nothing may come before it.
+    """
+    series = _typed(name, given, type_)
+    if len(series):
+        _check_after(name, int(series.time[0]), resumed)
+    check_finite(name, series)
+    check_times(name, series.time, timing, before, series.steps)
+    return series
 
 
 def _typed(name: str, series: Series, wanted: Type) -> Series:
@@ -220,12 +246,6 @@ def _check_after(name: str, time: int, resumed: int) -> None:
             got=f"t = {time} ns",
             fix="give a resumed run the inputs that come after: series[series.time > time]",
         )
-
-
-def _checked(name: str, series: Series, timing: Timing, before: int = NEVER) -> Series:
-    check_finite(name, series)
-    check_times(name, series.time, timing, before, series.steps)
-    return series
 
 
 def check_finite(name: str, series: Series) -> None:
@@ -372,10 +392,19 @@ def check_value(name: str, time: int, value: Any, type_: Type, not_finite: str |
     return made
 
 
-def _events(
+def single_events(
     name: str, events: Iterable[Any], type_: Type, timing: Timing, before: int, resumed: int
 ) -> Iterator[tuple[int, Any]]:
+    """The events of an iterable as they are read, each checked; of a `Series` among them one after the other.
+
+    Args: as of `check_recording`.
+    """
     for event in events:
+        if isinstance(event, Series):
+            part = check_recording(name, event, type_, timing, before, resumed)
+            before = int(part.time[-1]) if len(part) else before
+            yield from zip(part.time.tolist(), part, strict=True)
+            continue
         if not isinstance(event, tuple) or len(event) != 2:
             raise DataError(
                 "an event is not a pair",

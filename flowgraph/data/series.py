@@ -257,6 +257,18 @@ class Series:
         return f"<Series {self.name}: {len(self)} x {self.type}, {span}>"
 
 
+def chained(parts: Sequence[Series]) -> Series:
+    """Series of one type, one after the other, as one; named as the last, with its rule for gaps."""
+    last = parts[-1]
+    time, *leaves = (
+        np.concatenate(arrays) for arrays in zip(*((p.time, *p.leaves.values()) for p in parts), strict=True)
+    )
+    time.flags.writeable = False  # nobody else has it: no copy is made
+    stamp = np.concatenate([p.stamp for p in parts]) if any(p.is_late for p in parts) else None
+    values = unflatten(last.type, iter(leaves))
+    return Series(time, values, type=last.type, name=last.name, gaps=last.gaps, stamp=stamp)
+
+
 def _array(values: Any, name: str, dtype: Any = None) -> np.ndarray:
     """An array of what was given, if it is one; NaN where it is masked."""
     values = unmasked(values, name, dtype)

@@ -22,7 +22,7 @@ import numpy as np
 
 from flowgraph.data.files import arrays_of, whole
 from flowgraph.data.result import Result
-from flowgraph.data.series import Series
+from flowgraph.data.series import Series, chained
 from flowgraph.data.tape import Tape
 from flowgraph.engines.options import Checkpoint, Meter, RunOptions
 from flowgraph.engines.state import flat_state, nested_state
@@ -236,12 +236,7 @@ def _series(leaves: Mapping[str, np.ndarray], type_: Type, name: str) -> Series:
 
 
 def _joined(parts: list[Result], types: Mapping[str, Type]) -> Result:
-    series = {}
-    for name, type_ in types.items():
-        some = [p.series[name] for p in parts]
-        made = [np.concatenate(arrays) for arrays in zip(*(s.leaves.values() for s in some), strict=True)]
-        time = np.concatenate([s.time for s in some])
-        series[name] = Series(time, unflatten(type_, iter(made)), type=type_, name=name, gaps=some[-1].gaps)
+    series = {name: chained([p.series[name] for p in parts]) for name in types}
     ticks, wall = sum(p.ticks for p in parts), sum(p.wall_s for p in parts)
     return replace(parts[-1], series=series, ticks=ticks, wall_s=wall)
 

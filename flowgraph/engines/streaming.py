@@ -14,18 +14,18 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.export.packages import needed
 from flowgraph.data.export.tables import ParquetParts
 from flowgraph.data.files import put, text_of
-from flowgraph.data.inputs import Inputs, prepare
+from flowgraph.data.inputs import Inputs
+from flowgraph.data.pieces import nothing, stretches
 from flowgraph.data.result import Result, statistics
-from flowgraph.data.series import Series
-from flowgraph.data.tape import Tape, merged, stack
 from flowgraph.engines.checkpoint import program_digest
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.parts import run_graph
@@ -33,7 +33,6 @@ from flowgraph.engines.state import load_state, save_state
 from flowgraph.errors import DataError, writes
 from flowgraph.language.checks import need_count
 from flowgraph.language.graph import NEVER, Graph
-from flowgraph.types import ArrayType
 
 NOTE = "run.json"
 FORMAT = 1
@@ -75,22 +74,27 @@ def simulate_to_parquet(
     ticks: int = TICKS,
     parts: int = PARTS,
     resume: bool = False,
+    about: Mapping[str, Any] | None = None,
 ) -> Streamed:
     """Run a graph over inputs of any length, and write what comes of it as it comes.
 
     Args:
         graph, inputs, engine, dtype, init, state, seed, progress, diverged: as `simulate` takes them. Inputs
-            that are iterables are read as far as they are needed.
+            that are iterables, of `(time, value)` or of `Series` one after the other, are read as far as they
+            are needed; arrays are read and checked many times faster than single events.
         folder: for the files; made if missing. What an earlier run of it has left must be resumed or gone.
         ticks: that are played at a time: what they take is the memory of the run.
         parts: of so many of these a file is made, after which a run can be resumed.
         resume: go on with what the folder says. Give the same inputs, from their beginning or from any event
             that was not played yet on; of what was played nothing is played again.
+        about: plain values to keep in the note, such as the command.
 
     Raises:
         As `simulate`. DeclarationError: for less than one tick or part. DataError: for a folder that holds
         another run, or none to go on with. MissingDependencyError: without pyarrow.
     """
+    for package in ("pyarrow", "pyarrow.parquet"):
+        needed(package, "Parquet", "parquet")
     for name, given in (("ticks", ticks), ("parts", parts)):
         need_count("simulate_to_parquet", name, given, least=1)
     target = Path(folder)
@@ -101,17 +105,20 @@ def simulate_to_parquet(
     }  # fmt: skip
     done, number = 0, 0
     found = _noted(target, which, resume)
+    about = about or {}
     if found is not None:
+        about = about or found.get("about", {})
         done, number = int(found["ticks"]), int(found["part"])
         options = options.but(init=None, state=load_state(target / found["state"]))
     with writes(target):
         target.mkdir(parents=True, exist_ok=True)
     last: Result | None = None
     wall, notes = 0.0, dict[str, None]()
-    stretches = _stretches(graph, inputs, options, ticks)
-    for head in stretches:
+    before = {} if options.state is None else options.state["sources"]
+    played = stretches(graph, inputs, {n: int(before.get(n, NEVER)) for n in graph.sources}, ticks)
+    for head in played:
         with ParquetParts(target, number, {"graph": graph.name, "engine": engine}) as files:
-            for stretch in itertools.chain([head], itertools.islice(stretches, parts - 1)):
+            for stretch in itertools.chain([head], itertools.islice(played, parts - 1)):
                 last = run_graph(graph, stretch, options)
                 files.add(last.series)
                 options = options.but(init=None, state=last.state)
@@ -121,55 +128,10 @@ def simulate_to_parquet(
                     progress.update(done, max(int(t) for t in last.state["sources"].values()))
         number += 1
         assert last is not None
-        _write_note(target, which, done, number, last.state)
+        _write_note(target, {**which, "about": dict(about)}, done, number, last.state)
     if last is None:  # nothing came
-        last = run_graph(graph, _empty(graph), options)
+        last = run_graph(graph, nothing(graph), options)
     return Streamed(target, done, wall, last.state, statistics(graph, last.state), tuple(notes))
-
-
-def _stretches(graph: Graph, inputs: Inputs, options: RunOptions, ticks: int) -> Iterator[dict[str, Series]]:
-    """The inputs some ticks at a time, without those that a state has behind it."""
-    before = {} if options.state is None else options.state["sources"]
-    last = {name: int(before.get(name, NEVER)) for name in graph.sources}
-    start = max(last.values(), default=NEVER)
-    prepared = prepare(graph, _after(graph, inputs, start), last)
-    series = tuple(s for s in prepared.values() if isinstance(s, Series))
-    if len(series) == len(prepared):
-        whole = Tape.of(series)
-        for first in range(0, len(whole.time), ticks):
-            yield dict(zip(prepared, whole.part(first, first + ticks).series, strict=True))
-        return
-    events, feeds = merged(prepared)
-    while batch := list(itertools.islice(events, ticks)):
-        made = {}
-        for k, name in enumerate(prepared):
-            times = [time for time, key in batch if key >> k & 1]
-            values = [feeds[k]() for _ in times]
-            made[name] = stack(times, values, graph.sources[name].type, name)
-        yield made
-
-
-def _after(graph: Graph, inputs: Inputs, start: int) -> Any:
-    """The inputs less what is not after a time."""
-    if start == NEVER:
-        return inputs
-    streams = inputs if isinstance(inputs, Mapping) else inputs.streams
-    cut: dict[str, Any] = {}
-    for name, given in streams.items():
-        if isinstance(given, tuple) and len(given) == 2:
-            given = Series(given[0], given[1], name=name)
-        if isinstance(given, Series):
-            cut[name] = given[given.time > start]
-        else:
-            cut[name] = itertools.dropwhile(lambda event: event[0] <= start, given)
-    return {name: given for name, given in cut.items() if name in graph.sources}
-
-
-def _empty(graph: Graph) -> dict[str, Any]:
-    return {
-        name: stack([], [], node.type, name) if isinstance(node.type, ArrayType) else iter(())
-        for name, node in graph.sources.items()
-    }
 
 
 def _noted(folder: Path, which: Mapping[str, Any], resume: bool) -> dict[str, Any] | None:
@@ -179,7 +141,8 @@ def _noted(folder: Path, which: Mapping[str, Any], resume: bool) -> dict[str, An
         if file.exists():
             raise DataError(
                 "a streamed run is already here", path=str(file), expected="a folder without one",
-                got="its note", fix="go on with resume=True, name another folder, or remove this one",
+                got="its note",
+                fix="go on with resume=True (--resume DIR), name another folder, or remove this one",
             )  # fmt: skip
         return None
     try:
@@ -190,7 +153,8 @@ def _noted(folder: Path, which: Mapping[str, Any], resume: bool) -> dict[str, An
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             "there is no streamed run to go on with", path=str(file), expected="the note of one",
-            got=f"{type(error).__name__}: {error}"[:200], fix="start it anew, without resume",
+            got=f"{type(error).__name__}: {error}"[:200],
+            fix="name the folder of one, or start it anew, without resume",
         ) from None  # fmt: skip
     if wrong:
         raise DataError(
@@ -198,6 +162,17 @@ def _noted(folder: Path, which: Mapping[str, Any], resume: bool) -> dict[str, An
             got=str(found[wrong[0]]), fix="give what the first run was given, or start anew elsewhere",
         )  # fmt: skip
     return found
+
+
+def streamed_about(folder: str | Path) -> dict[str, Any]:
+    """What was kept with a streamed run, such as its command.
+
+    Raises:
+        DataError: for a folder without one.
+    """
+    found = _noted(Path(folder), {}, True)
+    about = None if found is None else found.get("about", {})
+    return about if isinstance(about, dict) else {}
 
 
 def _write_note(folder: Path, which: Mapping[str, Any], ticks: int, part: int, state: Any) -> None:

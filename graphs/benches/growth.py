@@ -1,8 +1,14 @@
 """How time and memory grow with the length of a recording, and with the number of particles, in each engine.
 
-Each run has a process of its own, whose largest memory the system tells; what it took before the run, with
-everything imported and compiled, is taken off. A run is of a whole recording with all of its outputs, or
-streamed from a generator to Parquet. The exponent is the slope of log(time) over log(number): 1 is linear.
+Each run has a process of its own. Its time is that of the processor (of all threads, the system's part
+included), which other programs on the machine do not lengthen much, the least of some runs where they are
+short; what is imported and compiled once is done before. Its memory is the most that the process held, less
+what it held before. A run is of a whole recording with all of its outputs, or streamed, from arrays that are
+made as they are needed to Parquet; of particles only the pose is kept.
+
+The exponent p of time is that of t = a + b n^p, with the smallest errors relative to t: what a run costs
+whatever its length is `a`, and is no growth. That of memory is the slope of log(memory) over log(n) where the
+run took more than the allocator's own. 1 is linear.
 """
 
 from __future__ import annotations
@@ -10,10 +16,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -25,24 +32,36 @@ from flowgraph import (
     Scalar,
     Series,
     Stream,
+    UnknownNameError,
     find_graph,
     graph,
     latest,
     periodic,
     scan,
     simulate,
+    simulate_many,
     simulate_to_parquet,
 )
 from flowgraph.blocks.flights import simulated
 from flowgraph.graphs.benches.endurance import memory
 
 PERIOD_NS, EVERY = 5_000_000, 5
-WARM = 200
-LEAST_MEMORY = 2.0e6
+PIECE = 65_536
+"""Ticks of a streamed run that are made, played and written at a time."""
+LEAST_MEMORY = 1.0e6
 """Bytes below which growth is that of the allocator, and no exponent is told."""
+ENOUGH, REPEATS = 0.3, 7
+"""Seconds after which no run is repeated, and how often one is at most."""
 
-LIMITS = {("reference", "whole"): 100_000, ("reference", "streamed"): 10_000}
-"""Ticks that the reference is not asked to go beyond, since it only defines the others."""
+RANGES: dict[str, dict[str, tuple[int, int]]] = {
+    "python": {"whole": (1_000, 10_000_000), "streamed": (1_000, 10_000_000), "particles": (10, 100_000)},
+    "numpy": {"whole": (100, 1_000_000), "streamed": (100, 1_000_000), "particles": (10, 100_000)},
+    "xla": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 100_000)},
+    "c": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 100_000)},
+    "reference": {"whole": (10, 10_000), "streamed": (10, 10_000), "particles": (10, 1_000)},
+}
+"""From where to where each engine is measured: four decades or more, and what takes minutes at most. The
+reference only defines the others."""
 
 
 @graph
@@ -54,25 +73,26 @@ def two_rates(a: Stream[Scalar], b: Stream[Scalar]):
 
 def growth(
     *,
-    engines: str = "python,reference,xla,c",
-    least: int = 10_000,
-    most: int = 1_000_000,
-    least_particles: int = 10,
-    most_particles: int = 10_000,
-    duration: float = 2.0,
+    engines: str = "python,numpy,xla,c",
+    least: int = 1,
+    most: int = 100_000_000,
+    least_particles: int = 1,
+    most_particles: int = 100_000,
+    duration: float = 0.3,
 ) -> Report:
     """Time and memory of each engine against ticks, whole and streamed, and against particles.
 
     Args:
         engines: with commas between.
-        least, most: ticks, a power of ten apart each.
-        least_particles, most_particles: of `rbpf_indoor`, likewise; in C, XLA and Python.
+        least, most: ticks, for no more than the numbers between, a power of ten apart, that an engine is
+            measured at.
+        least_particles, most_particles: of `rbpf_indoor`, likewise.
         duration: of the particles' flight, s.
 
     Returns:
-        A row a run: `engine`, `of` ("ticks" or "particles"), `mode`, `number`, `seconds`, `memory_bytes`; and
-        a row a series of them with `time_exponent` and `memory_exponent` (None below 2 MB).
-        Figure `growth.svg`.
+        A row a run: `engine`, `of` ("ticks" or "particles"), `mode`, `number`, `seconds` of the processor,
+        `memory_bytes`; and a row a series of them with `number` None, `time_exponent` (None of fewer than
+        three) and `memory_exponent` (None below 1 MB). Figures `growth.svg` and, as a table, `growth.md`.
     """
     if not (1 <= least <= most and 1 <= least_particles <= most_particles):
         raise DeclarationError(
@@ -82,18 +102,23 @@ def growth(
         )  # fmt: skip
     rows: list[dict[str, Any]] = []
     for engine in engines.split(","):
-        for mode in ("whole", "streamed"):
-            for number in _decades(least, min(most, LIMITS.get((engine, mode), most))):
-                rows.append(_apart("ticks", mode, engine, number, duration))
-    for engine in (e for e in engines.split(",") if e != "reference"):
-        for number in _decades(least_particles, most_particles):
-            rows.append(_apart("particles", "whole", engine, number, duration))
+        if engine not in RANGES:
+            raise UnknownNameError("engine", engine, RANGES, path="growth.engines")
+        for mode, (low, high) in RANGES[engine].items():
+            of, how = ("particles", "whole") if mode == "particles" else ("ticks", mode)
+            ends = (least_particles, most_particles) if mode == "particles" else (least, most)
+            for number in _decades(max(low, ends[0]), min(high, ends[1])):
+                rows.append(_apart(of, how, engine, number, duration))
     fits = [_fit(some) for some in _series(rows).values() if len(some) > 1]
-    return Report([*rows, *fits], {"growth.svg": lambda path: _draw(rows, path)})
+    made = [*rows, *fits]
+    return Report(
+        made,
+        {"growth.svg": lambda path: _draw(rows, path), "growth.md": lambda path: _write(made, path)},
+    )
 
 
 def _decades(least: int, most: int) -> list[int]:
-    return [n for n in (least * 10**k for k in range(10)) if n <= most]
+    return [n for n in (10**k for k in range(10)) if least <= n <= most]
 
 
 def _series(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
@@ -105,17 +130,33 @@ def _series(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[
 
 def _fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The exponents of a series of runs."""
-
-    def slope(some: list[dict[str, Any]], name: str) -> float:
-        number, value = ([r[key] for r in some] for key in ("number", name))
-        return float(np.polyfit(np.log(number), np.log(np.maximum(value, 1e-9)), 1)[0])
-
-    grows = [r for r in rows if r["memory_bytes"] > LEAST_MEMORY]
+    number, seconds, held = (
+        np.array([r[name] for r in rows], float) for name in ("number", "seconds", "memory_bytes")
+    )
+    grows = held > LEAST_MEMORY
     return {
         "engine": rows[0]["engine"], "of": rows[0]["of"], "mode": rows[0]["mode"], "number": None,
-        "time_exponent": slope(rows, "seconds"),
-        "memory_exponent": slope(grows, "memory_bytes") if len(grows) > 1 else None,
+        "time_exponent": exponent(number, seconds) if len(rows) > 2 else None,
+        "memory_exponent": float(np.polyfit(np.log(number[grows]), np.log(held[grows]), 1)[0])
+        if grows.sum() > 1
+        else None,
     }  # fmt: skip
+
+
+def exponent(number: np.ndarray, taken: np.ndarray) -> float:
+    """p of a + b n^p, with a and b >= 0, of which the sum of squared relative errors is least."""
+
+    def error(p: float) -> float:
+        rest = []
+        for columns in ([0 * number + 1, number**p], [number**p]):
+            basis = np.stack(columns, axis=1) / taken[:, None]
+            found = np.linalg.lstsq(basis, np.ones(len(taken)), rcond=None)[0]
+            if (found >= 0).all():
+                rest.append(float(((basis @ found - 1) ** 2).sum()))
+        return min(rest)
+
+    tried = np.arange(0.05, 3.0, 0.005)
+    return float(tried[int(np.argmin([error(p) for p in tried]))])
 
 
 def _apart(of: str, mode: str, engine: str, number: int, duration: float) -> dict[str, Any]:
@@ -127,71 +168,111 @@ def _apart(of: str, mode: str, engine: str, number: int, duration: float) -> dic
 
 
 def one(of: str, mode: str, engine: str, number: int, duration: float) -> None:
-    """Run, and print the seconds of the run and the bytes that it took at most, as JSON."""
+    """Run, and print the seconds of a run and the bytes that the first took at most, as JSON."""
     if of == "particles":
         case = find_graph("rbpf_indoor").case(
             simulated.load(settings={"duration": duration}), particles=number
         )
-        run = lambda: simulate(case.graph, case.inputs, engine=engine).wall_s
-        if engine != "python":
-            run()
-        held = memory()
-        print(json.dumps({"seconds": run(), "memory_bytes": max(peak() - held, 0)}))
-        return
-    built = two_rates.build(a=periodic(PERIOD_NS), b=periodic(EVERY * PERIOD_NS))
-    ticks = lambda count: _play(built, mode, engine, count)
-    ticks(WARM)
-    if engine == "xla":
-        ticks(min(number, 131_072))  # each size of a chunk is compiled once
+        options: dict[str, Any] = {"engine": engine, "keep": ["pose"], "runs_at_once": 1}
+        run: Callable[[], object] = lambda: simulate_many(case.graph, case.inputs, [0], **options)
+        ready: Callable[[], object] = run if engine in ("c", "xla") else lambda: None
+    else:
+        built = two_rates.build(a=periodic(PERIOD_NS), b=periodic(EVERY * PERIOD_NS))
+        run = lambda: _play(built, mode, engine, number)
+        # XLA compiles for each number of ticks; and the first run of any loads what it needs
+        ready = lambda: _play(built, mode, engine, min(number, PIECE) if engine == "xla" else 200)
+    ready()
+    forget_peak()
     held = memory()
-    start = perf_counter()
-    ticks(number)
-    print(json.dumps({"seconds": perf_counter() - start, "memory_bytes": max(peak() - held, 0)}))
+    seconds = [_timed(run)]
+    taken = max(peak() - held, 0)
+    while sum(seconds) < ENOUGH and len(seconds) < REPEATS:
+        seconds.append(_timed(run))
+    print(json.dumps({"seconds": min(seconds), "memory_bytes": taken, "runs": len(seconds)}))
+
+
+def _timed(run: Callable[[], object]) -> float:
+    start = process_time()
+    run()
+    return process_time() - start
 
 
 def _play(built: Graph, mode: str, engine: str, count: int) -> None:
     if mode == "whole":
-        time = np.arange(count, dtype=np.int64) * PERIOD_NS
-        a, b = np.sin(time * 1e-9), np.cos(time[::EVERY] * 1e-9)
-        simulate(built, {"a": Series(time, a), "b": Series(time[::EVERY], b)}, engine=engine)
+        a, b = (next(_pieces(n, every, max(n, 1))) for n, every in ((count, 1), (-(-count // EVERY), EVERY)))
+        simulate(built, {"a": a, "b": b}, engine=engine)
         return
     with TemporaryDirectory() as folder:
-        given = {"a": _events(count, 1), "b": _events(-(-count // EVERY), EVERY)}
-        simulate_to_parquet(built, given, Path(folder) / "run", engine=engine, ticks=4096)
+        given = {"a": _pieces(count, 1, PIECE), "b": _pieces(-(-count // EVERY), EVERY, PIECE)}
+        simulate_to_parquet(built, given, Path(folder) / "run", engine=engine, ticks=PIECE)
 
 
-def _events(count: int, every: int) -> Iterator[tuple[int, float]]:
-    return ((k * every * PERIOD_NS, float(k % 7)) for k in range(count))
+def _pieces(count: int, every: int, size: int) -> Iterator[Series]:
+    """So many values of a stream, at each n-th tick."""
+    for first in range(0, count, size):
+        time = np.arange(first, min(first + size, count), dtype=np.int64) * (every * PERIOD_NS)
+        yield Series(time, np.sin(time * 1e-9))
 
 
 def peak() -> int:
-    """The most bytes that this process has held."""
+    """The most bytes that this process has held, since that was forgotten."""
     with open("/proc/self/status") as file:
         return 1024 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
+
+
+def forget_peak() -> None:
+    """From here on the peak is counted, where the system lets it."""
+    with suppress(OSError), open("/proc/self/clear_refs", "w") as file:
+        file.write("5")
+
+
+def _write(rows: list[dict[str, Any]], path: Path) -> None:
+    """The exponents, and where they come from, as a table."""
+    known = _series([r for r in rows if r["number"] is not None])
+    lines = [
+        "| engine | of | run | from | to | time | exponent | memory | exponent |",
+        "|---|---|---|---:|---:|---|---:|---|---:|",
+    ]
+    for fit in (r for r in rows if r["number"] is None):
+        first, *_, last = known[fit["of"], fit["mode"], fit["engine"]]
+        spans = [f"{end['number']:,}" for end in (first, last)]
+        time = f"{_short(first['seconds'])} to {_short(last['seconds'])} s"
+        held = f"{first['memory_bytes'] / 1e6:.1f} to {last['memory_bytes'] / 1e6:.1f} MB"
+        powers = ["" if fit[k] is None else f"{fit[k]:.2f}" for k in ("time_exponent", "memory_exponent")]
+        cells = [f"`{fit['engine']}`", fit["of"], fit["mode"], *spans, time, powers[0], held, powers[1]]
+        lines.append("| " + " | ".join(cells) + " |")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _short(seconds: float) -> str:
+    return f"{seconds:.2g}" if seconds < 10 else f"{seconds:.0f}"
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     from matplotlib.figure import Figure  # only who wants the picture waits for it
 
-    figure = Figure(figsize=(10.0, 6.5), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure = Figure(figsize=(11.0, 6.2), layout="constrained")
+    panels = figure.subplots(2, 3, sharex="col")
+    columns = [("ticks", "whole"), ("ticks", "streamed"), ("particles", "whole")]
     for (of, mode, engine), some in _series(rows).items():
-        column = 0 if of == "ticks" else 1
-        style = {"whole": "-o", "streamed": "--s"}[mode]
+        column = columns.index((of, mode))
         number = [r["number"] for r in some]
-        colour = f"C{_KNOWN.index(engine) if engine in _KNOWN else 5}"
-        label = f"{engine}, {mode}" if of == "ticks" else engine
-        for line, name, unit in ((0, "seconds", 1.0), (1, "memory_bytes", 1e6)):
-            values = [max(r[name] / unit, 1e-3 if line == 0 else 0.1) for r in some]
-            panels[line, column].loglog(number, values, style, color=colour, label=label, markersize=4)
-    for column, name in enumerate(("ticks", "particles")):
-        panels[0, column].set_ylabel("time, s")
-        panels[1, column].set_ylabel("memory of the run, MB")
-        panels[1, column].set_xlabel(name)
-        panels[0, column].legend(fontsize=7)
-    for panel in panels.flat:
-        panel.grid(alpha=0.3)
+        place = list(RANGES).index(engine)
+        style = {"color": f"C{place}", "marker": "os^Dv"[place], "markersize": 4, "label": engine}
+        panels[0, column].loglog(number, [r["seconds"] for r in some], **style)
+        panels[1, column].loglog(number, [max(r["memory_bytes"] / 1e6, 0.1) for r in some], **style)
+    titles = ("whole recording", "streamed to Parquet", "rbpf_indoor")
+    for k, ((of, _), title) in enumerate(zip(columns, titles, strict=True)):
+        panels[0, k].set_title(title, fontsize=10)
+        panels[1, k].set_xlabel(of)
+        for panel in panels[:, k]:
+            (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
+            linear = [top * low / high, top]  # to the upper corner: what is steeper is not linear
+            panel.loglog([low, high], linear, color="0.75", linewidth=1.0, zorder=0, label="linear")
+            panel.set(xlim=(low, high), ylim=(bottom, top))
+            panel.grid(alpha=0.3)
+    panels[0, 0].set_ylabel("processor time, s")
+    panels[1, 0].set_ylabel("memory of the run, MB")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     figure.savefig(path)
-
-
-_KNOWN = ("python", "reference", "xla", "c")

@@ -12,18 +12,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from flowgraph import FlowgraphError, Report
+from flowgraph import DeclarationError, FlowgraphError, Report, UnknownNameError
 from flowgraph.data.files import put
 from flowgraph.data.registry import graph_names
-from flowgraph.engines.options import RunOptions
-from flowgraph.engines.subject import LoweredGraph
+from flowgraph.engines.hls.play import PlayedHls
 from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.place import TARGET_HZ, route
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.text import texts
+from flowgraph.engines.verilog.toggles import toggles
 from flowgraph.graphs.benches.fixed import flown
+from flowgraph.graphs.benches.hardware_space import design_space, numbers, taped
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import RELATIVE, quantise
 
@@ -41,7 +40,10 @@ def hardware(
     duration: float = 3.0,
     compared: float = 0.5,
     particles: int = 0,
+    played: str = "verilog",
+    energy: bool = False,
     routed: bool = False,
+    space: str = "",
     folder: str = "",
     seed: int = 0,
 ) -> Report:
@@ -55,7 +57,11 @@ def hardware(
         duration: of a flight, s.
         compared: seconds of it that are played in Verilator.
         particles: of the filters that have some; as many as `bench fixed` takes if left out.
+        played: "verilog", or "hls" for the C++ of high-level synthesis, which has no cycles.
+        energy: whether to count what the energy of a tick goes with.
         routed: whether to synthesise, place and route each.
+        space: widths between commas, such as 16,20,24: then one graph is made in each, and a row is a
+            machine, with a picture of the Pareto front. See `hardware_space`.
         folder: where the files of each go; a temporary one if left out.
         seed: of the first flight.
 
@@ -63,12 +69,26 @@ def hardware(
         A row a graph: `graph`, `particles` (the setting above), `width`, `lanes`, `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
-        the program and `words` of memory, `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
+        the program and `words` of memory; where `energy` is asked for, `energy_estimate_operations` (terms of
+        sums in the longest tick; None of a filter with loops) and `energy_estimate_toggles` (bits that change
+        in a mean tick, block memories left out); `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
         routed), `us_per_tick` (with all aids, at that clock, or else at 100 MHz), and `reason`, why
         there is no machine.
     """
-    rows = []
+    if played not in ("verilog", "hls"):
+        raise UnknownNameError("text to play", played, ("verilog", "hls"), path="played")
     names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
+    if space:
+        if len(names) != 1:
+            raise DeclarationError(
+                "the machines of one graph are compared", path="space", expected="one name in graphs",
+                got=", ".join(names) or "none", fix="write --set graphs=kalman",
+            )  # fmt: skip
+        return design_space(
+            names[0], numbers(space, "space"), (1,), flights=flights, duration=duration,
+            particles=particles, routed=routed, folder=folder, seed=seed,
+        )  # fmt: skip
+    rows: list[dict[str, Any]] = []
     for name in names:
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
             "graph": name, "particles": particles or None, "width": width, "lanes": 1, "multipliers": 1,
@@ -77,37 +97,37 @@ def hardware(
             some = [flown(name, seed + k, duration, particles) for k in range(flights + 1)]
             found = quantise(some[:-1], some[-1:], width=width, least=width, bounds={RELATIVE: bound})
             row |= {k: v for k, v in found.figures.items() if k in row}
-            _played(row, replace(found.pipeline, formats=found.formats), some[-1], compared)
+            pipeline = replace(found.pipeline, formats=found.formats)
+            if played == "hls":
+                _compiled(row, pipeline, some[-1], compared)
+                rows.append(row)
+                continue
+            _played(row, pipeline, some[-1], compared)
+            if energy:
+                _weighed(row, pipeline, some[-1], compared)
             if routed:
-                _routed(row, replace(found.pipeline, formats=found.formats), some[-1], folder)
+                _routed(row, pipeline, some[-1], folder)
             clock = row["fmax_hz"] or TARGET_HZ
             row["us_per_tick"] = row["cycles_all_aids"] / clock * 1e6
         except FlowgraphError as error:
             row["reason"] = f"{error.path}: {error.message}; {error.got}"[:300]
         rows.append(row)
-    note = f"formats from {flights} flights of {duration:g} s; {compared:g} s of another played in Verilator"
+    where = "Verilator" if played == "verilog" else "C++ compiled here"
+    note = f"formats from {flights} flights of {duration:g} s; {compared:g} s of another played in {where}"
     return Report(rows, {}, (note,))
 
 
 _COLUMNS = (
     "graph", "particles", "width", "lanes", "multipliers", "position_difference_rms_m",
     "attitude_difference_rms_deg", "saturations", "values_compared", "values_differing",
-    "cycles", "cycles_all_aids", "steps", "words", "lut", "ff", "dsp", "bram", "fmax_hz", "us_per_tick",
-    "reason",
+    "cycles", "cycles_all_aids", "steps", "words",
+    "energy_estimate_operations", "energy_estimate_toggles", "lut", "ff", "dsp", "bram", "fmax_hz",
+    "us_per_tick", "reason",
 )  # fmt: skip
 
 
-def _tape(flight: Any, seconds: float | None) -> tuple[Any, Any]:
-    subject = LoweredGraph(flight.graph)
-    start = subject.start(RunOptions(seed=flight.seed))
-    events = subject.tape(flight.inputs, start.last)
-    if seconds is None:
-        return events, start
-    return events.first(int(np.searchsorted(events.time, events.time[0] + int(seconds * 1e9)))), start
-
-
 def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
-    events, start = _tape(flight, seconds)
+    events, start = taped(flight, seconds)
     player = Simulated(pipeline, events.patterns, check=True)
     player.play(events, start.cells, seed_words(flight.seed), None)
     row |= {
@@ -120,8 +140,23 @@ def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> 
     }
 
 
+def _compiled(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
+    events, start = taped(flight, seconds)
+    player = PlayedHls(pipeline, events.patterns, check=True)
+    player.play(events, start.cells, seed_words(flight.seed), None)
+    row |= {"values_compared": player.compared, "values_differing": player.differing}
+
+
+def _weighed(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
+    events, start = taped(flight, seconds)
+    image = Image(pipeline, events.patterns)
+    if not image.has_rows:
+        row["energy_estimate_operations"] = max(e.terms for e in image.entries)
+    row["energy_estimate_toggles"] = round(toggles(image, events, start.cells, seed_words(flight.seed)))
+
+
 def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> None:
-    events, _ = _tape(flight, None)
+    events, _ = taped(flight, None)
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / pipeline.name
         at.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import gc
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,16 +17,24 @@ import pytest
 from flowgraph import (
     DataError,
     DeclarationError,
+    FlowgraphError,
     OutputError,
+    Run,
     Scalar,
     Series,
     Stream,
+    UnknownNameError,
     graph,
     latest,
+    read_pieces,
     scan,
     simulate,
 )
+from flowgraph.data.export.tables import write_parquet
+from flowgraph.engines.python import run as run_module
 from flowgraph.engines.streaming import NOTE, simulate_to_parquet
+from flowgraph.graphs.benches.endurance import memory
+from flowgraph.graphs.benches.growth import forget_peak, peak
 from tests.support import scalars
 
 dataset = pytest.importorskip("pyarrow.dataset")
@@ -167,3 +177,154 @@ def test_memory_does_not_grow_with_the_length(tmp_path):
 
     most(1000)  # what is imported and compiled once
     assert most(12_000) < 1.2 * most(3000) + 60_000  # kept, 9,000 more ticks would be 1.5 MB
+
+
+def pieces(series: Series, *sizes: int) -> Iterator[Series]:
+    """A series in pieces of these lengths, and the rest."""
+    first = 0
+    for size in sizes:
+        yield series[first : first + size]
+        first += size
+    yield series[first:]
+
+
+@pytest.mark.parametrize("engine", ["python", "c"])
+def test_series_one_after_the_other_are_a_source(tmp_path, engine):
+    given = inputs(100)
+    mixed = {"x": pieces(given["x"], 0, 1, 33, 40), "y": events(given["y"])}
+    found = simulate_to_parquet(two.build(), mixed, tmp_path, engine=engine, ticks=16)
+    assert found.ticks == 100
+    check(tmp_path, 100, engine)
+
+
+def test_a_run_goes_on_within_a_piece(tmp_path):
+    given = inputs(60)
+    simulate_to_parquet(two.build(), {n: s[s.time < 25e6] for n, s in given.items()}, tmp_path)
+    again = {"x": pieces(given["x"], 20, 20), "y": pieces(given["y"], 19)}
+    assert simulate_to_parquet(two.build(), again, tmp_path, resume=True, ticks=7).ticks == 60
+    check(tmp_path, 60, "python")
+
+
+def test_simulate_takes_series_one_after_the_other_too():
+    given = inputs(30)
+    whole = simulate(two.build(), given)
+    found = simulate(two.build(), {"x": pieces(given["x"], 7, 5), "y": pieces(given["y"], 3)})
+    for name in ("total", "held"):
+        assert found[name]["value"].tolist() == whole[name]["value"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ([(0, 1.0), (2_000_000, 1.0), (1_000_000, 1.0)], "time goes backwards"),
+        ([(0, 1.0), (1_000_000, np.nan)], "not finite"),
+        ([(0, 1.0), (1.5, 1.0)], "integer nanoseconds"),
+        ([(0, 1.0), 3], "an event is not a pair"),
+        ([scalars([0, 1]), scalars([1, 2])], "two events at one time"),
+        ([scalars([0, 1]), (2, np.ones(2))], "shape"),
+    ],
+)
+def test_what_is_wrong_with_a_source_is_said_as_of_single_events(tmp_path, given, words):
+    for run in (
+        lambda data: simulate_to_parquet(two.build(), data, tmp_path),
+        lambda data: simulate(two.build(), data),
+    ):
+        with pytest.raises(FlowgraphError) as error:
+            run({"x": iter(given), "y": scalars([])})
+        assert words in str(error.value)
+
+
+def test_masked_and_nested_values_are_taken_one_by_one(tmp_path):
+    masked: list[Any] = [(0, np.ma.array(1.0, mask=True))]
+    with pytest.raises(DataError, match="not finite"):
+        simulate_to_parquet(two.build(), {"x": masked, "y": scalars([])}, tmp_path)
+    whole: list[Any] = [(0, 1), (1_000_000, True), (2_000_000, np.float32(0.5))]
+    with pytest.raises(FlowgraphError):  # no truth value is a number, and is none among many either
+        simulate_to_parquet(two.build(), {"x": whole, "y": scalars([])}, tmp_path)
+    found = simulate_to_parquet(two.build(), {"x": whole[::2], "y": scalars([])}, tmp_path / "b")
+    assert found.state["registers"]["scan.state"] == 1.0
+
+
+def test_a_recording_is_read_by_pieces(tmp_path):
+    pytest.importorskip("pandas")
+    time = np.arange(1000) * 1_000_000
+    series = scalars(time, np.sin(time * 1e-6))
+    write_parquet({"x": series}, tmp_path)
+    np.savetxt(
+        tmp_path / "x.csv", np.c_[time * 1e-9, series["value"]], delimiter=",", header="t,v", comments=""
+    )
+    for read_, exact in (
+        (read_pieces(tmp_path / "x.parquet", rows=300), True),
+        (read_pieces(tmp_path / "x.csv", time="t", unit="s", rows=300), False),
+    ):
+        some = list(read_)
+        assert all(len(s) <= 300 for s in some) or not exact
+        assert np.array_equal(np.concatenate([s.time for s in some]), time)
+        np.testing.assert_allclose(
+            np.concatenate([s["value"] for s in some]), series["value"], rtol=0 if exact else 1e-12
+        )
+    with pytest.raises(DataError, match="no table to read by pieces"):
+        read_pieces(tmp_path / "none.parquet")
+    with pytest.raises(UnknownNameError, match="column"):
+        list(read_pieces(tmp_path / "x.parquet", time="t"))
+    with pytest.raises(UnknownNameError, match="column"):
+        list(read_pieces(tmp_path / "x.parquet", stamp="s"))
+
+
+def test_much_that_is_collected_becomes_arrays(monkeypatch):
+    """A run that packs what it has collected gives what one that never does gives."""
+    given = inputs(100)
+    whole = simulate(two.build(), given)
+    monkeypatch.setattr(run_module, "_PACKED", 7)
+    found = simulate(two.build(), given)
+    run = Run(two.build(), {"x": events(given["x"]), "y": given["y"]}).to_end(most=50)
+    some = run.drain().series["total"]
+    rest = run.to_end().result().series["total"]
+    for name in ("total", "held"):
+        assert np.array_equal(found[name].time, whole[name].time)
+        assert found[name]["value"].tolist() == whole[name]["value"].tolist()
+    assert [*some["value"], *rest["value"]] == whole["total"]["value"].tolist()
+
+
+CHILD = """
+import sys
+from pathlib import Path
+from tests.engines.test_streaming import long_run
+print(long_run(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))
+"""
+
+
+def long_run(engine: str, count: int, folder: Path) -> int:
+    """The bytes that a streamed run takes at most, beside what its process held before."""
+
+    def made(step: int) -> Iterator[Series]:
+        for first in range(0, count, 5000):
+            time = np.arange(first, min(first + 5000, count), step, dtype=np.int64) * 1000
+            yield Series(time, np.sin(time * 1e-9))
+
+    def run(name: str) -> None:
+        simulate_to_parquet(
+            two.build(), {"x": made(1), "y": made(4)}, folder / name, engine=engine, ticks=8192
+        )
+
+    whole, count = count, 20_000
+    run("first")
+    count = whole
+    forget_peak()
+    before = memory()
+    run("run")
+    return peak() - before
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell the peak")
+@pytest.mark.parametrize("engine", ["python", "numpy", "c", "xla"])
+def test_a_process_stays_small_however_long_the_run(tmp_path, engine):
+    """A million ticks would be 16 MB of results alone; what is left is the allocator's."""
+
+    def most(count: int) -> int:
+        words = [sys.executable, "-c", CHILD, engine, str(count), str(tmp_path / str(count))]
+        return int(subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()[-1])
+
+    few, many = (50_000, 200_000) if engine == "numpy" else (100_000, 2_000_000)
+    assert most(many) < most(few) + 8_000_000

@@ -7,12 +7,12 @@ memory with two ports. What is only a part of another value lies in that one's a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from flowgraph.engines.c.syntax import identifier
 from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.places import (
     KNOWN,
@@ -131,8 +131,3 @@ def kind_of(array: str, dtype: str, width: int) -> str:
     if array in (SMALL, KNOWN_SMALL):
         return "ap_uint<1>" if dtype == "bool" else f"ap_int<{width}>"
     return "int64_t"
-
-
-def identifier(name: str) -> str:
-    """A name as a part of one in C++."""
-    return re.sub(r"\W", "_", name, flags=re.ASCII)

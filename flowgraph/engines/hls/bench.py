@@ -64,7 +64,7 @@ def _row(arrays: list[Any]) -> str:
 
 def bench_text(source: HlsSource) -> str:
     """The C++ of the bench."""
-    name = source.pipeline.name
+    name = source.names.module
     held = [a for row in source.inputs for a in row]
     made = [a for port in source.outputs for a in port.leaves]
     lines = [_ABOUT, f'#include "{name}_hls.h"', "#include <cstdio>", "#include <cstring>", ""]

@@ -49,24 +49,23 @@ def compiler() -> str:
     """The path of a C++ compiler.
 
     Raises:
-        MissingDependencyError: where there is none.
+        MissingDependencyError: where there is none, or no `make`.
     """
-    for name in ("g++", "clang++", "c++"):
-        found = shutil.which(name)
-        if found is not None:
-            return found
+    found = next(filter(None, map(shutil.which, ("g++", "clang++", "c++"))), None)
+    if found is not None and shutil.which("make") is not None:
+        return found
     raise MissingDependencyError(
         "C++ for high-level synthesis is compiled here",
         path='engine="hls"',
-        expected="g++, clang++ or c++ on the PATH",
-        got="none",
-        fix='install one (Debian: apt-get install g++), or use engine="fixed", which gives the same',
+        expected="g++, clang++ or c++, and make, on the PATH",
+        got=f"the compiler {found or 'none'}, and make {shutil.which('make') or 'none'}",
+        fix='install them (Debian: apt-get install g++ make), or use engine="fixed", which gives the same',
     )
 
 
 def texts(source: HlsSource) -> dict[str, str]:
     """The files by their names."""
-    name = source.pipeline.name
+    name = source.names.module
     return {
         f"{name}_hls.cpp": source.text,
         f"{name}_hls.h": source.header,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from time import perf_counter
 from typing import Any
@@ -18,8 +19,9 @@ from flowgraph.engines.stretches import gathered
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.types import DTYPES
 
-TICKS = 8192
-"""How many are done at once: what a value takes then stays within a processor's cache."""
+TICKS, NUMBERS = 8192, 1 << 21
+"""How many ticks are done at once at most, and how many numbers the largest value may have in them: what a
+small value takes then stays within a processor's cache, and a cloud takes no more memory in a longer run."""
 
 
 class _Prepared(Player):
@@ -28,6 +30,8 @@ class _Prepared(Player):
     ) -> None:
         self.pipeline, self.patterns, self.real = pipeline, patterns, real
         self.plan = planned(pipeline, patterns, real, passes)
+        largest = max((math.prod(spec.shape) for spec in self.plan.program.specs.values()), default=1)
+        self.most = max(NUMBERS // max(largest, 1), 1)
 
     def play(self, tape: Tape, cells: list[Any], seed: np.ndarray, progress: Meter | None) -> Outcome:
         program = self.plan.program
@@ -39,8 +43,9 @@ class _Prepared(Player):
             which = np.searchsorted(self.patterns, tape.key)
             inputs = [[np.moveaxis(x, 0, -1) for x in real_leaves(s, self.real)] for s in tape.series]
             rows = [0] * len(inputs)
-            for first in range(0, len(tape.time), TICKS):
-                span = slice(first, first + TICKS)
+            size = min(self.most, TICKS)
+            for first in range(0, len(tape.time), size):
+                span = slice(first, first + size)
                 ticks = Stretch(tape.time[span], which[span], self.plan.every, held, fixed, seed)
                 self._give(ticks, inputs, rows)
                 for step, done in zip(self.plan.steps, self.plan.done, strict=True):

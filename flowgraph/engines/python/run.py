@@ -22,7 +22,7 @@ import numpy as np
 from flowgraph.data.arrival import stamp_events
 from flowgraph.data.inputs import Inputs, prepare
 from flowgraph.data.result import Result, statistics
-from flowgraph.data.series import Series
+from flowgraph.data.series import Series, chained
 from flowgraph.data.tape import Tape, batches, joined, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
@@ -36,6 +36,8 @@ from flowgraph.recorder.random import NumpyDraw, seed_words
 from flowgraph.types import leaves_of
 
 _BATCH = 2048
+_PACKED = 65_536
+"""Values of a stream that are kept as objects, each with a place of its own; more become arrays."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -96,6 +98,7 @@ class Run:
         self._broken: list[int | None] = []  # the time of the tick that failed
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
+        self._packed: list[dict[str, Series]] = []  # what was collected before, as arrays
         self._pushed: list[deque[Any]] | None = None
         if inputs is None:
             self._pushed = [deque() for _ in graph.sources]
@@ -217,17 +220,29 @@ class Run:
             left = len(self._tape.time) - self._played
             left = left if most is None else min(left, most)
             while left > 0:
-                count = left if meter is None else min(left, _BATCH)
+                count = min(left, _PACKED if meter is None else _BATCH)
                 self._go_on(count)
+                self._pack()
                 left -= count
                 if meter is not None:
                     meter.update(self.ticks, self.time)
             return self
         for batch in batches(itertools.islice(self._ticks, most), _BATCH if self._recorded else 1):
             self._advance(batch)
+            self._pack()
             if meter is not None:
                 meter.update(self.ticks, self.time)
         return self
+
+    def _pack(self) -> None:
+        """Make arrays of what was collected, once it is much."""
+        if max(map(len, self._times), default=0) >= _PACKED:
+            self._packed.append(self._collected())
+            self._forget()
+
+    def _forget(self) -> None:
+        for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
+            kept.clear()
 
     @contextmanager
     def _entered(self, what: str) -> Iterator[None]:
@@ -383,6 +398,12 @@ class Run:
     def result(self) -> Result:
         """The collected streams so far."""
         self._refuse_others("result")
+        parts = [*self._packed, self._collected()]
+        series = {name: chained([p[name] for p in parts]) for name in parts[0]} if self._packed else parts[0]
+        return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
+
+    def _collected(self) -> dict[str, Series]:
+        """The collected streams since they were last packed or drained."""
         series = {}
         for k, collected in enumerate(self.graph.collected):
             type_, name, times = self.graph.port(collected.wire).type, collected.name, self._times[k]
@@ -390,15 +411,15 @@ class Run:
             series[name] = (joined if by_leaf else stack)(
                 times, self._columns[k] if by_leaf else self._values[k], type_, name
             )
-        return Result(self.graph.name, self.engine, series, self.state, self.stats, self.ticks, self.wall_s)
+        return series
 
     def drain(self) -> Result:
         """The collected streams since the last call; the run forgets them, and its memory stays flat."""
         found = self.result()
         found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
         self._drained = self.ticks, self.wall_s
-        for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
-            kept.clear()
+        self._packed.clear()
+        self._forget()
         return found
 
 

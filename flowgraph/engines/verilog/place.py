@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,14 +39,14 @@ class Figures:
 
     Args:
         lut, ff, dsp, bram: 4-input tables, registers, multipliers of 18 bits, memories of 18 kbit.
-        fmax_hz: the highest clock.
+        fmax_hz: the highest clock; None where it was not routed.
     """
 
     lut: int
     ff: int
     dsp: int
     bram: int
-    fmax_hz: float
+    fmax_hz: float | None
 
 
 def need_tools() -> None:
@@ -65,6 +66,27 @@ def need_tools() -> None:
             )
 
 
+def synthesise(folder: Path, name: str) -> Figures:
+    """Synthesise a machine alone; its netlist is left in the folder.
+
+    What it takes is counted in the netlist: a router adds some tables, to get signals through.
+
+    Args:
+        folder: where `flowgraph lower --target verilog` has written.
+        name: of the filter.
+
+    Raises:
+        MissingDependencyError: where a tool is not installed.
+    """
+    need_tools()
+    sources = " ".join(sorted(p.name for p in folder.glob("*.v")))
+    _run(folder, "synthesis.log", ["-c", _SYNTHESIS.format(sources=sources, name=name)])
+    netlist = json.loads((folder / f"{name}.json").read_text())
+    cells = Counter(c["type"] for c in netlist["modules"][name]["cells"].values())
+    lut = cells["LUT4"] + 2 * cells["CCU2C"] + 4 * cells["TRELLIS_DPR16X4"]
+    return Figures(lut, cells["TRELLIS_FF"], cells["MULT18X18D"], cells["DP16KD"], None)
+
+
 def route(folder: Path, name: str, *, clock: float = TARGET_HZ, seed: int = 1) -> Figures:
     """Synthesise, place and route a machine; its netlist, report and configuration are left in the folder.
 
@@ -77,9 +99,7 @@ def route(folder: Path, name: str, *, clock: float = TARGET_HZ, seed: int = 1) -
     Raises:
         MissingDependencyError: where a tool is not installed.
     """
-    need_tools()
-    sources = " ".join(sorted(p.name for p in folder.glob("*.v")))
-    _run(folder, "synthesis.log", ["-c", _SYNTHESIS.format(sources=sources, name=name)])
+    synthesise(folder, name)
     options = [
         "--85k", "--package", "CABGA756", "--speed", "6", "--json", f"{name}.json", "--textcfg",
         f"{name}.config", "--report", f"{name}_report.json", "--freq", f"{clock / 1e6:g}",

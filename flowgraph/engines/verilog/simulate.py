@@ -67,17 +67,18 @@ def build(image: Image) -> Built:
     at = Path(folder.name)
     for name, text in texts(image).items():
         put(at / name, text)
-    _make(at, "lint")
-    _make(at, f"obj/V{image.pipeline.name}")
+    made(at, "lint")
+    made(at, f"obj/V{image.pipeline.name}")
     return Built(image, folder, at / "obj" / f"V{image.pipeline.name}")
 
 
-def _make(at: Path, target: str) -> None:
+def made(at: Path, target: str, command: str | None = None) -> None:
+    """Make something in a folder that a machine was written into, with Verilator or this command for it."""
     environment = {k: v for k, v in os.environ.items() if k not in ("VERILATOR_ROOT", "MAKEFLAGS", "MFLAGS")}
-    command = ["make", "-s", target, f"VERILATOR={verilator()}"]
-    done = subprocess.run(command, cwd=at, capture_output=True, text=True, env=environment, check=False)
+    line = ["make", "-s", target, f"VERILATOR={command or verilator()}"]
+    done = subprocess.run(line, cwd=at, capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
-        raise RuntimeError(f"{' '.join(command)} in {at}:\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
+        raise RuntimeError(f"{' '.join(line)} in {at}:\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
 
 
 class Simulated(Player):

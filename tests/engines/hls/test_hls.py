@@ -10,12 +10,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowgraph import LoweringError, MissingDependencyError, Scalar, Stream, block, graph, simulate
+from flowgraph import (
+    LoweringError,
+    MissingDependencyError,
+    Scalar,
+    Stream,
+    block,
+    graph,
+    latest,
+    simulate,
+)
 from flowgraph.engines.fixed.files import patterns_with_formats
 from flowgraph.engines.hls import play
+from flowgraph.engines.hls.arrays import Array
 from flowgraph.engines.hls.engine import ENGINE
 from flowgraph.engines.hls.play import PlayedHls
-from flowgraph.engines.hls.source import HlsSource, _pipelined, _wider
+from flowgraph.engines.hls.source import HlsSource, _pipelined, _wider, declared
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.graphs.benches.fixed import flown
@@ -24,7 +34,7 @@ from flowgraph.pipeline.format_files import with_formats
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import RELATIVE, quantise
 from tests.engines.fixed.test_fixed import sizes_of
-from tests.engines.verilog.test_verilog import everything, flight
+from tests.engines.verilog.test_verilog import Three, everything, flight
 
 
 def need_compiler():
@@ -116,6 +126,37 @@ def test_an_output_has_the_type_that_holds_its_words_in_every_pattern():
 
 
 @block
+def summed(x: Three, *, xp) -> Scalar:
+    """Of any three."""
+    return xp.sum(x)
+
+
+@graph
+def alike(double: Stream[Three], there: Stream[Scalar]):
+    """Names that are words of C++, that are one identifier, and that the text itself has."""
+    return {"a.b": summed(double), "a_b": there, "count": latest(there, init=0.0, at=double), "switch": there}
+
+
+def test_names_of_a_user_are_no_names_of_the_text():
+    need_compiler()
+    built = alike.build()
+    inputs = {"double": flight()["x"], "there": flight()["y"]}
+    subject = LoweredGraph(built)
+    pipeline = with_formats(subject.pipeline, sizes_of(built, inputs).formats(24, 2.0))
+    pipeline = replace(pipeline, name="switch")
+    tape = subject.tape(inputs)
+    player = PlayedHls(pipeline, tape.patterns, check=True)
+    player.play(tape, subject.start(RunOptions()).cells, seed_words(0), None)
+    assert player.compared > 100
+    assert player.differing == 0
+
+
+def test_a_large_array_is_a_memory():
+    assert declared(Array("v1", "ap_int<24>", 65), "") == ["static ap_int<24> v1[65];"]
+    assert declared(Array("v1", "ap_int<24>", 1), "") == ["ap_int<24> v1[1];"]
+
+
+@block
 def turned_(x: Scalar, *, xp) -> Scalar:
     """An operation that fixed point does not have."""
     return xp.tan(x)
@@ -142,6 +183,10 @@ def test_without_the_headers_or_a_compiler_the_engine_says_what_to_install(made,
     with pytest.raises(MissingDependencyError, match="headers of ap_int") as caught:
         simulate(built, flight(), engine="hls", formats=formats)
     assert "flowgraph-filters[hardware]" in str(caught.value.fix)
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "make" else f"/usr/bin/{name}")
+    with pytest.raises(MissingDependencyError, match="is compiled here") as caught:
+        simulate(built, flight(), engine="hls", formats=formats)
+    assert "make none" in str(caught.value.got)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(MissingDependencyError, match="is compiled here") as caught:
         simulate(built, flight(), engine="hls", formats=formats)

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from flowgraph import DeclarationError
+from flowgraph import DeclarationError, UnknownNameError
 from flowgraph.graphs.benches import growth as module
-from flowgraph.graphs.benches.growth import growth
+from flowgraph.graphs.benches.growth import exponent, growth
 
 
 def test_exponents_are_those_of_what_grew(monkeypatch, tmp_path):
-    """Times that are quadratic, memory that is linear; nothing is run."""
+    """Times that are quadratic beside what each run costs, memory that is linear; nothing is run."""
 
     def apart(of, mode, engine, number, duration):
-        found = {"seconds": 1e-6 * number**2, "memory_bytes": 0 if mode == "streamed" else 10_000 * number}
+        found = {
+            "seconds": 0.5 + 1e-6 * number**2,
+            "memory_bytes": 0 if mode == "streamed" else 10_000 * number,
+        }
         return {"engine": engine, "of": of, "mode": mode, "number": number, **found}
 
     monkeypatch.setattr(module, "_apart", apart)
-    report = growth(engines="c", least=1000, most=100_000, most_particles=1000)
+    report = growth(engines="c", least=1000, most=1_000_000, most_particles=10_000)
     fits = {(r["of"], r["mode"]): r for r in report.rows if r["number"] is None}
     assert set(fits) == {("ticks", "whole"), ("ticks", "streamed"), ("particles", "whole")}
-    assert all(fit["time_exponent"] == pytest.approx(2.0) for fit in fits.values())
+    assert all(fit["time_exponent"] == pytest.approx(2.0, abs=0.006) for fit in fits.values())
     assert fits["ticks", "whole"]["memory_exponent"] == pytest.approx(1.0)
     assert fits["ticks", "streamed"]["memory_exponent"] is None
-    assert [r["number"] for r in report.rows if r["of"] == "particles" and r["number"]] == [10, 100, 1000]
-    report.figures["growth.svg"](tmp_path / "growth.svg")
+    assert [r["number"] for r in report.rows if r["of"] == "particles" and r["number"]] == [
+        10, 100, 1000, 10_000
+    ]  # fmt: skip
+    for name in ("growth.svg", "growth.md"):
+        report.figures[name](tmp_path / name)
     assert (tmp_path / "growth.svg").stat().st_size > 5000
+    table = (tmp_path / "growth.md").read_text().splitlines()
+    assert table[2].startswith("| `c` | ticks | whole | 1,000 | 1,000,000 | 1.5 to 1000000 s | 2.00 |")
+    assert len(table) == 5
 
 
+def test_a_constant_is_no_growth():
+    number = np.array([10.0, 100.0, 1000.0, 10_000.0])
+    assert exponent(number, 3.0 + 0.01 * number) == pytest.approx(1.0, abs=0.006)
+    assert exponent(number, 2e-6 * number**1.2) == pytest.approx(1.2, abs=0.006)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell the peak")
 def test_a_run_in_a_process_of_its_own_is_timed_and_weighed():
     """A recording of 300,000 ticks and its results take 4.8 MB and more; the run is not free."""
     row = module._apart("ticks", "whole", "python", 300_000, 0.0)
@@ -35,6 +54,24 @@ def test_a_run_in_a_process_of_its_own_is_timed_and_weighed():
     assert 0.001 < row["seconds"] < 60.0
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell the peak")
+def test_no_engine_grows_faster_than_its_recording():
+    """The bench in short: time and memory are linear or better, and streamed memory stays small."""
+    report = growth(least=1000, most=1_000_000, least_particles=100, most_particles=10_000)
+    for fit in (r for r in report.rows if r["number"] is None):
+        assert fit["time_exponent"] < 1.3, fit  # of machines that do other work as well
+        assert fit["memory_exponent"] is None or fit["memory_exponent"] < 1.15, fit
+    streamed = [r for r in report.rows if r["mode"] == "streamed" and r["number"] == 1_000_000]
+    assert len(streamed) == 4
+    assert all(r["memory_bytes"] < 100e6 for r in streamed)
+
+
 def test_numbers_that_leave_nothing_are_refused():
     with pytest.raises(DeclarationError, match="no number between"):
         growth(least=100, most=10)
+
+
+def test_an_engine_without_ranges_is_refused():
+    with pytest.raises(UnknownNameError, match="fortran"):
+        growth(engines="c,fortran")

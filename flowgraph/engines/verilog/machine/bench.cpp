@@ -10,6 +10,9 @@
 #include <cstring>
 #include "TOP.h"
 #include "verilated.h"
+#if VM_COVERAGE
+#include "verilated_cov.h"
+#endif
 
 static TOP *top;
 
@@ -70,6 +73,9 @@ int main(int argc, char **argv) {
   }
   fprintf(stderr, "values_compared %llu\nvalues_differing %llu\nticks %llu\ncycles %llu\ncut %u\n", compared, differing, ticks,
           longest, (unsigned)top->cut);
+#if VM_COVERAGE
+  Verilated::threadContextp()->coveragep()->write("coverage.dat");  // how often each bit has changed
+#endif
   delete top;
   return differing != 0;
 }

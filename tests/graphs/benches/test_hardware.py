@@ -1,0 +1,96 @@
+"""The bench of hardware: what it compares, what it weighs, and the front of its machines."""
+
+from __future__ import annotations
+
+import pytest
+
+from flowgraph import DeclarationError, MissingDependencyError, UnknownNameError
+from flowgraph.engines.hls.engine import ENGINE as HLS
+from flowgraph.engines.verilog import place
+from flowgraph.engines.verilog.toggles import counted
+from flowgraph.graphs.benches.hardware import hardware
+from flowgraph.graphs.benches.hardware_space import draw, fronted, numbers
+from flowgraph.study.quantise import RELATIVE
+from tests.engines.verilog.test_verilog import need_verilator
+
+
+def row(width, error, time, lut, lanes=1):
+    return {
+        "graph": "kalman", "width": width, "lanes": lanes, RELATIVE: error, "us_per_tick": time, "lut": lut,
+        "area": "synthesised", "front": False,
+    }  # fmt: skip
+
+
+def test_the_front_is_what_no_other_betters(tmp_path):
+    rows = [
+        row(16, 1e-2, 20.0, 3000),
+        row(24, 1e-4, 20.0, 3900),
+        row(20, 1e-2, 21.0, 3100),  # less exact than none, slower and larger than the first
+        row(24, 1e-4, 11.0, 5000, lanes=2),
+        row(28, None, None, None),  # no machine
+    ]
+    fronted(rows)
+    assert [r["front"] for r in rows] == [True, True, False, True, False]
+    draw(rows, tmp_path / "space.png")
+    assert (tmp_path / "space.png").stat().st_size > 10_000
+    draw(rows[-1:], tmp_path / "none.png")  # a graph without any machine
+    assert (tmp_path / "none.png").exists()
+
+
+def test_widths_are_whole_numbers():
+    assert numbers("24,16,24", "space") == [16, 24]
+    for text in ("", "16,", "x", "0"):
+        with pytest.raises(DeclarationError, match="these are no whole numbers"):
+            numbers(text, "space")
+
+
+def test_settings_that_fit_nothing_are_refused():
+    with pytest.raises(DeclarationError, match="the machines of one graph are compared"):
+        hardware(space="16,24")
+    with pytest.raises(UnknownNameError, match="text to play"):
+        hardware(played="vhdl")
+
+
+def test_toggles_are_the_sum_of_what_verilator_counted():
+    lines = [
+        "# SystemC::Coverage-3",
+        "C 'page\x02v_toggle/a' 12",
+        "C 'page\x02v_line/a' 5",
+        "C 'v_toggle b' 3",
+    ]
+    assert counted("\n".join(lines)) == 15
+
+
+@pytest.mark.slow
+def test_a_filter_is_compared_and_weighed():
+    need_verilator()
+    given = dict(graphs="gyro_integration", flights=1, duration=1.0, compared=0.1, bound=1.0)
+    (found,) = hardware(**given, energy=True).rows
+    assert found["values_compared"] > 100
+    assert found["values_differing"] == 0
+    assert 100 < found["energy_estimate_operations"] < found["cycles_all_aids"]
+    assert found["energy_estimate_toggles"] > 100_000
+    try:
+        HLS.need()
+    except MissingDependencyError as error:
+        pytest.skip(str(error.fix))
+    (found,) = hardware(**given, played="hls").rows
+    assert found["values_compared"] > 100
+    assert found["values_differing"] == 0
+    assert found["cycles"] is None
+
+
+@pytest.mark.slow
+def test_a_row_for_each_width_with_what_it_takes():
+    try:
+        place.need_tools()
+    except MissingDependencyError as error:
+        pytest.skip(str(error.fix))
+    report = hardware(graphs="gyro_integration", flights=1, duration=1.0, space="16,24")
+    narrow, wide = report.rows
+    assert (narrow["width"], wide["width"]) == (16, 24)
+    assert narrow[RELATIVE] > 10 * wide[RELATIVE]
+    assert narrow["lut"] < wide["lut"]
+    assert narrow["area"] == "synthesised"
+    assert narrow["front"]
+    assert "space.png" in report.figures
