@@ -41,7 +41,7 @@ def proven_sizes(pipeline: Pipeline, varying: Collection[int] = ()) -> dict[int,
         for c in cells:
             low, high = tries[c.read][0]
             least, most = found[c.write]
-            if not ((least >= low).all() and (most <= high).all()):
+            if len(tries[c.read]) > 1 and not ((least >= low).all() and (most <= high).all()):
                 tries[c.read].pop(0)
                 kept = False
         if kept:
