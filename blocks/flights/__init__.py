@@ -1,8 +1,8 @@
 """Simulated flights: a world, sensors in it, and a `Flight` of what they read.
 
-`simulated` is the maker that `sim` stands for, `load(argument, *, seed=0, settings={}) -> Flight`: a smooth
-figure of a quadrotor with an IMU and a motion capture, or one of the others. `worlds` has the flights through
-the simulated world with sensors of choice, `plane` a point in the plane, and `figure` the figure as a graph.
+`simulated` is the maker that `sim` stands for, `load(argument, *, seed=0, settings={}) -> Flight`. Its flight
+without an argument is `figure`, a graph: a smooth figure of a quadrotor with an IMU and a motion capture.
+`worlds` has the flights through the simulated world with sensors of choice, `plane` a point in the plane.
 Recorded flights are in `datasets`.
 """
 

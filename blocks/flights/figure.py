@@ -1,8 +1,8 @@
-"""`sim:figure`: the smooth figure, flown in a graph: world and sensors are blocks, a flight is a run of them.
+"""`sim`: a smooth figure, flown in a graph: world and sensors are blocks, a flight is a run of them.
 
-The motion is that of `sim`; its waves and all noise are drawn in the graph, by the counter-based generator,
-from the seed. So this flight is the same whether it is written down first, as `load` does by a run of the
-graph, or made tick by tick in front of a filter, as a study of many seeds does; see `Experiment`.
+Its waves and all noise are drawn in the graph, by the counter-based generator, from the seed. So a flight is
+the same whether it is written down first, as `load_figure` does by a run of the graph, or made tick by tick
+in front of a filter, as a study of many seeds does; see `Experiment`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Flight, Graph, Stream, Tick, graph, latest, simulate, ticks
+from flowgraph.blocks.flights import worlds
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.sensors import bias_at_start, drift, read_imu, read_pose, true_state
 from flowgraph.blocks.signals import FigureShape, Vector
@@ -22,8 +23,25 @@ from flowgraph.blocks.world import AT_REST, figure_motion, figure_shape
 from flowgraph.data.experiment import Experiment
 from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
+from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["figure", "load_figure"]
+__all__ = ["DEFAULTS", "figure", "load_figure"]
+
+DEFAULTS: Mapping[str, float] = {
+    "duration": 20.0,
+    "imu.rate": 200.0,
+    "vicon.rate": 4.0,
+    "gyro.noise": 1e-3,
+    "accelerometer.noise": 1e-2,
+    "gyro.walk": 2e-5,
+    "accelerometer.walk": 3e-4,
+    "gyro.bias": 0.01,
+    "accelerometer.bias": 0.1,
+    "position.noise": 0.01,
+    "attitude.noise": 0.01,
+}
+"""Settings: seconds, Hz, continuous densities, standard deviations of the constant biases, and of the motion
+capture in m and rad."""
 
 
 @graph
@@ -64,29 +82,36 @@ _NO_SHAPE = FigureShape(
 )
 
 
-def load_figure(*, seed: int, settings: Mapping[str, float]) -> Flight:
+def load_figure(*, seed: int = 0, settings: Mapping[str, str | float] | None = None) -> Flight:
     """Make a flight by a run of the graph, all its ticks at once.
 
     Args:
-        seed: of the figure and of all noise.
-        settings: those of `simulated.DEFAULTS`.
+        seed: of the figure and of all noise. Each noise has a random stream of its own name, so that a
+            change of one setting does not change the draws of another.
+        settings: any of `DEFAULTS`.
 
     Returns:
-        A `Flight` as of `sim`, with its `experiment`.
+        A `Flight` with the streams `imu` (`Imu`) and `vicon` (`Pose`), and its `experiment`. truth is a
+        `NavigationState` at the times of both; info has `still` (s), `imu_noise` (`ImuNoise`),
+        `position_noise` (m), `attitude_noise` (rad), `imu_period_ns` and `vicon_period_ns`.
+
+    Raises:
+        UnknownNameError: for an unknown setting; DeclarationError: for one that is no number in its range.
     """
-    world = _world(tuple(settings.items()))
+    s = _numbers(settings or {})
+    world = _world(tuple(s.items()))
     told = world.settings
-    flown = simulate(_built(tuple(settings.items())), world.ticks, engine="numpy", seed=seed)
+    flown = simulate(_built(tuple(s.items())), world.ticks, engine="numpy", seed=seed)
     return Flight(
-        name=f"sim-figure-{seed}",
+        name=f"sim-{seed}",
         streams={name: flown[name] for name in ("imu", "vicon")},
         truth=flown["truth"],
         info={
             "imu_noise": told["noise"],
             "position_noise": told["position_noise"],
             "attitude_noise": told["attitude_noise"],
-            "imu_period_ns": round(1e9 / settings["imu.rate"]),
-            "vicon_period_ns": round(1e9 / settings["vicon.rate"]),
+            "imu_period_ns": round(1e9 / s["imu.rate"]),
+            "vicon_period_ns": round(1e9 / s["vicon.rate"]),
             "still": AT_REST,
         },
         notes=(note("info", f"simulated with seed {seed}: 1 s at rest, then a smooth figure"),),
@@ -114,3 +139,26 @@ def _world(settings: tuple[tuple[str, float], ...]) -> Experiment:
 def _built(settings: tuple[tuple[str, float], ...]) -> Graph:
     world = _world(settings)
     return figure.build(**clocks_of(world.ticks), **world.settings)
+
+
+def _numbers(given: Mapping[str, str | float]) -> dict[str, float]:
+    known = dict(DEFAULTS)
+    for name, text in given.items():
+        if name not in known:
+            raise UnknownNameError("setting", name, known, path="sim")
+        positive = name in ("duration", "imu.rate", "vicon.rate")
+        try:
+            number = float(text)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number) or number < 0.0 or (positive and number == 0.0):
+            raise DeclarationError(
+                f"setting {name!r} is not usable",
+                path="sim",
+                expected="a positive number" if positive else "a number that is not negative",
+                got=repr(text),
+                fix=f"for example {name}={DEFAULTS[name]:g}",
+            )
+        known[name] = number
+    worlds.check_samples(known, ("imu.rate", "vicon.rate"), "sim")
+    return known

@@ -2,7 +2,7 @@
 
 A `World` answers for any times with a `Motion`: position and its derivatives, attitude and body rate, all
 exact. `thesis_flight` draws a random quadrotor flight, `Quadrotor` follows given key points, `RoundTrip`
-turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`, and a block of a graph too.
+turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`, two blocks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flowgraph.blocks.world.motion import Motion, World, world_motion
 from flowgraph.blocks.world.plane import plane_motion, plane_shape
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
-from flowgraph.blocks.world.smooth import AT_REST, figure_motion, figure_shape, shaped, smooth_motion
+from flowgraph.blocks.world.smooth import AT_REST, figure_motion, figure_shape
 from flowgraph.blocks.world.thesis import thesis_flight
 
 __all__ = [
@@ -43,8 +43,6 @@ __all__ = [
     "AT_REST",
     "figure_motion",
     "figure_shape",
-    "shaped",
     "plane_motion",
     "plane_shape",
-    "smooth_motion",
 ]

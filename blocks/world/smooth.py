@@ -5,8 +5,8 @@ must carry gravity and the acceleration, which fixes the body's z axis; with the
 and the jerk fixes the body rate (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control
 for quadrotors", ICRA 2011, eqs. 5-9 and sec. III).
 
-The maths is written once, in the array API: `sim` takes it at all times of a recording, and the block
-`figure_motion` at the time of a tick. `figure_shape` draws the waves of a flight, once, where it fires.
+`figure_shape` draws the waves of a flight, once, where it fires; `figure_motion` is where the body is at a
+tick.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from flowgraph import Array, block
 from flowgraph.blocks.signals import GRAVITY, BodyMotion, FigureShape
 
-__all__ = ["AT_REST", "figure_motion", "figure_shape", "shaped", "smooth_motion"]
+__all__ = ["AT_REST", "figure_motion", "figure_shape"]
 
 AT_REST, _RAMP = 1.0, 2.0  # seconds
 _FREQUENCIES = np.array([0.75, 1.5, 2.2])
@@ -26,11 +26,13 @@ _SIZES = np.array([[1.6], [1.6], [0.6]]) * np.array([1.0, 0.5, 0.25])
 _YAW = np.array([0.9, 0.3]), np.array([0.35, 0.9])  # rad, rad/s
 
 
-def shaped(uniform: Any, *, xp: Any) -> FigureShape:
-    """The figure of random numbers: `uniform(name, low, high, shape)` draws those of a name."""
-    frequencies = _FREQUENCIES * uniform("frequencies", 0.85, 1.15, (3, 3))
-    sizes = _SIZES * uniform("sizes", 0.7, 1.3, (3, 3))
-    phases, yaw = uniform("phases", 0.0, 2.0 * np.pi, (3, 3)), uniform("yaw", 0.0, 2.0 * np.pi, (2,))
+@block
+def figure_shape(*, draw: Any, xp: Any) -> FigureShape:
+    """Draw the figure of a flight. Give it a clock that ticks once: `figure_shape(at=start)`."""
+    between = lambda name, low, high, shape: low + (high - low) * draw.uniform(name, shape)
+    frequencies = _FREQUENCIES * between("frequencies", 0.85, 1.15, (3, 3))
+    sizes = _SIZES * between("sizes", 0.7, 1.3, (3, 3))
+    phases, yaw = between("phases", 0.0, 2.0 * np.pi, (3, 3)), between("yaw", 0.0, 2.0 * np.pi, (2,))
     return FigureShape(
         sizes=sizes,
         frequencies=frequencies,
@@ -42,44 +44,19 @@ def shaped(uniform: Any, *, xp: Any) -> FigureShape:
 
 
 @block
-def figure_shape(*, draw: Any, xp: Any) -> FigureShape:
-    """Draw the figure of a flight. Give it a clock that ticks once: `figure_shape(at=start)`."""
-    return shaped(lambda name, low, high, shape: low + (high - low) * draw.uniform(name, shape), xp=xp)
-
-
-@block
 def figure_motion(shape: FigureShape, *, t: Any, xp: Any) -> BodyMotion:
-    """Where the body is at this tick, and how it moves; time counts from 0."""
-    seconds = xp.astype(t, shape.sizes.dtype) * 1e-9
-    motion = smooth_motion(seconds, shape, xp=xp)
-    return BodyMotion(
-        position=motion["position"],
-        velocity=motion["velocity"],
-        acceleration=motion["acceleration"],
-        attitude=_upright(motion["axes"], xp),
-        rate=motion["rate"],
-    )
-
-
-def smooth_motion(t: Array, shape: FigureShape, *, xp: Any) -> dict[str, Any]:
-    """The exact motion at times t (...) in s.
-
-    Returns:
-        position, velocity, acceleration (..., 3; m, m/s, m/s^2, world); axes, the body's x, y and z (..., 3)
-        in the world; rate (rad/s) and force (specific force, m/s^2), both (..., 3) in the body.
-    """
-    clock = _phase(t, xp)
+    """Where the body is at this tick, and how it moves; time counts from 0, and every derivative is exact."""
+    clock = _phase(xp.astype(t, shape.sizes.dtype) * 1e-9, xp)
     waves = _waves(clock[0], shape.sizes, shape.frequencies, shape.phases, shape.origin, xp)
-    found = [xp.stack([f[k] for k in range(3)], axis=-1) for f in _through(waves, clock, xp)]
-    position, velocity, acceleration, jerk = found
+    position, velocity, acceleration, jerk = _through(waves, clock, xp)
     yaw, yaw_rate = _through(_waves(clock[0], *_YAW, shape.yaw_phases, shape.yaw_origin, xp), clock, xp)[:2]
 
     thrust = acceleration - xp.asarray(np.array(GRAVITY), dtype=acceleration.dtype)
     strength = xp.sqrt(_dot(thrust, thrust, xp))
     z = thrust / strength
     dz = (jerk - z * _dot(z, jerk, xp)) / strength
-    ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0.0 * yaw], axis=-1)
-    turning = xp.stack([-xp.sin(yaw), xp.cos(yaw), 0.0 * yaw], axis=-1) * yaw_rate[..., None]
+    ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0.0 * yaw])
+    turning = xp.stack([-xp.sin(yaw), xp.cos(yaw), 0.0 * yaw]) * yaw_rate
     side = xp.linalg.cross(z, ahead)
     width = xp.sqrt(_dot(side, side, xp))
     y = side / width
@@ -87,25 +64,22 @@ def smooth_motion(t: Array, shape: FigureShape, *, xp: Any) -> dict[str, Any]:
     dy = (d_side - y * _dot(y, d_side, xp)) / width
     x = xp.linalg.cross(y, z)
     dx = xp.linalg.cross(dy, z) + xp.linalg.cross(y, dz)
-    return {
-        "position": position,
-        "velocity": velocity,
-        "acceleration": acceleration,
-        "axes": (x, y, z),
-        "rate": xp.concat(
-            [_dot(z, dy, xp), _dot(x, dz, xp), _dot(y, dx, xp)], axis=-1
-        ),  # R^T R' = skew(rate)
-        "force": xp.concat([_dot(x, thrust, xp), _dot(y, thrust, xp), _dot(z, thrust, xp)], axis=-1),
-    }
+    return BodyMotion(
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        attitude=_upright((x, y, z), xp),
+        rate=xp.concat([_dot(z, dy, xp), _dot(x, dz, xp), _dot(y, dx, xp)]),  # R^T R' = skew(rate)
+    )
 
 
 def _upright(axes: tuple[Array, Array, Array], xp: Any) -> Array:
-    """The quaternion (..., 4) of a body's axes, where its scalar part is positive: turned by less than half a
+    """The quaternion (4) of a body's axes, where its scalar part is positive: turned by less than half a
     turn, as these figures are, whose yaw stays within 2.4 rad."""
     x, y, z = axes
-    w = 0.5 * xp.sqrt(xp.maximum(1.0 + x[..., 0] + y[..., 1] + z[..., 2], 1e-12))
-    parts = xp.stack([y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]], axis=-1)
-    return xp.concat([w[..., None], 0.25 / w[..., None] * parts], axis=-1)
+    w = 0.5 * xp.sqrt(xp.maximum(1.0 + x[0] + y[1] + z[2], 1e-12))
+    parts = xp.stack([y[2] - z[1], z[0] - x[2], x[1] - y[0]])
+    return xp.concat([w[None], 0.25 / w * parts])
 
 
 def _phase(t: Array, xp: Any) -> tuple[Array, ...]:
@@ -123,18 +97,14 @@ def _phase(t: Array, xp: Any) -> tuple[Array, ...]:
 def _waves(
     phase: Array, sizes: Array, frequencies: Array, phases: Array, origin: Array, xp: Any
 ) -> tuple[Array, ...]:
-    """Sums of sinusoids (..., waves) that start at 0, and three derivatives with respect to `phase` (n...);
-    each is (..., n...)."""
-    behind = (..., *(None,) * phase.ndim)  # the times last, for speed
-    w, start, sizes = frequencies[behind], phases[behind], sizes[behind]
-    along = -1 - phase.ndim
-    angle = w * phase + start
+    """Sums of sinusoids (..., waves) that start at 0, and three derivatives in `phase`; each is (...)."""
+    w, angle = frequencies, frequencies * phase + phases
     sine, cosine = sizes * xp.sin(angle), sizes * xp.cos(angle)
     return (
-        xp.sum(sine - origin[behind], axis=along),
-        xp.sum(cosine * w, axis=along),
-        xp.sum(-sine * (w * w), axis=along),
-        xp.sum(-cosine * xp.pow(w, 3.0), axis=along),
+        xp.sum(sine - origin, axis=-1),
+        xp.sum(cosine * w, axis=-1),
+        xp.sum(-sine * (w * w), axis=-1),
+        xp.sum(-cosine * xp.pow(w, 3.0), axis=-1),
     )
 
 

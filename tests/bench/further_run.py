@@ -42,8 +42,7 @@ def further(graph: str, duration: float, more: Mapping[str, Any], runs: int, rep
 
     def specs(whole: bool) -> tuple[tasks.RunSpec, ...]:
         return tuple(
-            tasks.RunSpec(graph, "sim:figure", seed, parameters, f"{seed}", whole=whole)
-            for seed in range(runs)
+            tasks.RunSpec(graph, "sim", seed, parameters, f"{seed}", whole=whole) for seed in range(runs)
         )
 
     task = tasks.Task("study", specs(True), options, None, False)

@@ -147,13 +147,13 @@ def recorded(runs: int, sample: int, duration: float, chunk: int, repeats: int) 
 def whole(runs: int, sample: int, duration: float, chunk: int) -> Row:
     """A study from nothing to its table, in C; what either spends on making flights is in it.
 
-    Ours flies `sim:figure`, where world, filter and score are one graph and start alike, in the process that
-    leads and as many threads as there are processors; the peer's flights are the same figures by the loader
-    of `sim`, whose share of a run is `peer_load_share`.
+    Ours flies `sim`, where world, filter and score are one graph and start alike, in the process that leads
+    and as many threads as there are processors; the peer's flights are the same, written down by the loader,
+    whose share of a run is `peer_load_share`.
     """
     parameters = {"duration": duration, "start": "truth"}
     study = Study(
-        graphs=["ekf"], data=["sim:figure"], seeds=runs, engine="c", chunk=8 * chunk, parameters=parameters
+        graphs=["ekf"], data=["sim"], seeds=runs, engine="c", chunk=8 * chunk, parameters=parameters
     )
     before = _pool(sample, duration)
     with tempfile.TemporaryDirectory() as folder:

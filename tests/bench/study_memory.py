@@ -30,7 +30,7 @@ _LOOK_S = 0.5
 def study(runs: int, duration: float) -> dict[str, float]:
     """One study from nothing to its table."""
     parameters = {"particles": PARTICLES, "duration": duration}
-    made = Study(graphs=["rbpf_indoor"], data=["sim:figure"], seeds=runs, engine="c", parameters=parameters)
+    made = Study(graphs=["rbpf_indoor"], data=["sim"], seeds=runs, engine="c", parameters=parameters)
     with tempfile.TemporaryDirectory() as folder:
         start = perf_counter()
         done = run_study(made, folder, workers=WORKERS)

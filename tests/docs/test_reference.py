@@ -13,7 +13,7 @@ import pytest
 
 import flowgraph
 from flowgraph import Block, FlowgraphError, Signal, errors, find_graph
-from flowgraph.blocks.flights import simulated
+from flowgraph.blocks.flights import figure
 from flowgraph.data.registry import flight_names, flight_settings, graph_names
 from flowgraph.language.graph import CallNode
 from flowgraph.pipeline.optimise import PASSES
@@ -199,7 +199,7 @@ def test_every_flight_setting_is_listed() -> None:
             s for s in flight_settings(name) if s not in words and f"STREAM.{s.split('.')[-1]}" not in words
         }
         assert not missing, name
-    assert set(simulated.DEFAULTS) <= words
+    assert set(figure.DEFAULTS) <= words
 
 
 def test_every_error_is_listed() -> None:

@@ -23,7 +23,7 @@ def study(**more: Any) -> Study:
     return Study(
         **{
             "graphs": ["ekf"],
-            "data": ["sim:figure"],
+            "data": ["sim"],
             "seeds": 4,
             "engine": "c",
             "parameters": parameters,
@@ -70,10 +70,8 @@ def cases_of(name: str, settings: dict[str, str], more: dict[str, Any]) -> list[
     """Those of two seeds, and their flights."""
     found = []
     for seed in (0, 1):
-        flight = load_flight(
-            "sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings}
-        )
-        case, _ = tasks.prepared(name, "sim:figure", seed, more, flight)
+        flight = load_flight("sim", seed=seed, settings={"duration": "1.5", "imu.rate": "50", **settings})
+        case, _ = tasks.prepared(name, "sim", seed, more, flight)
         found.append((case, flight))
     return found
 
@@ -132,7 +130,7 @@ def test_a_start_in_the_graph_that_is_not_the_case_s_is_not_taken() -> None:
 def test_a_whole_experiment_is_the_same_in_every_engine() -> None:
     found = []
     for seed in (0, 1):
-        flight = load_flight("sim:figure", seed=seed, settings={"duration": "1.5", "imu.rate": "50"})
+        flight = load_flight("sim", seed=seed, settings={"duration": "1.5", "imu.rate": "50"})
         found.append((find_graph("ekf").case(flight, start="truth"), flight))
     experiment = found[0][1].experiment
     assert experiment is not None

@@ -43,7 +43,7 @@ def test_a_clock_that_is_off_makes_a_filter_worse_and_is_found_again():
     assert off > 3.0 * fine.score(simulate(fine.graph, fine.inputs))["position_rmse_m"]
 
 
-@pytest.mark.parametrize("data", ["sim", "sim:figure", "sim:thesis", "sim:drive"])
+@pytest.mark.parametrize("data", ["sim", "sim:thesis", "sim:drive"])
 def test_every_kind_has_them(data):
     flight = load_flight(data, settings={"duration": "2", "imu.time_offset": "0.5"})
     assert flight.streams["imu"].time[0] >= 500_000_000

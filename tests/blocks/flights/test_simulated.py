@@ -5,19 +5,37 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowgraph import load_flight
-from flowgraph.blocks.flights.simulated import DEFAULTS, SETTINGS, load, trajectory
+from flowgraph import load_flight, simulate
+from flowgraph.blocks.flights.figure import DEFAULTS
+from flowgraph.blocks.flights.simulated import SETTINGS, load
 from flowgraph.blocks.flights.worlds import OF_STEPS, SENSORS, TRIP
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.metrics import pose_errors
 from flowgraph.blocks.sensors import as_position
+from flowgraph.data.inputs import clocks_of
 from flowgraph.errors import DeclarationError, UnknownNameError
+
+QUIET: dict[str, str | float] = {
+    f"{sensor}.{part}": 0.0 for sensor in ("gyro", "accelerometer") for part in ("noise", "walk", "bias")
+}
+
+
+def motion_of(seed: int, rate: float, duration: float = 20.0) -> dict[str, np.ndarray]:
+    """The exact motion: what perfect sensors read, and the truth."""
+    flight = load(seed=seed, settings={**QUIET, "imu.rate": rate, "duration": duration})
+    imu, truth = flight.streams["imu"], flight.truth
+    assert truth is not None
+    assert not truth.gyro_bias.any()
+    assert not truth.accelerometer_bias.any()
+    parts = {name: truth[name] for name in ("position", "velocity", "attitude")}
+    return {"seconds": imu.seconds, **parts, "rate": imu.gyro, "force": imu.specific_force}
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_trajectory_derivatives_belong_together(seed):
-    t, h = np.linspace(0.01, 20.0, 1500), 1e-4  # beside 1 s and 3 s, where the snap jumps
-    now, before, after = (trajectory(t + d, seed=seed) for d in (0.0, -h, h))
+def test_derivatives_of_the_figure_belong_together(seed):
+    h, motion = 1e-4, motion_of(seed, 1e4)
+    now, before, after = ({n: x[k::50][:3990] for n, x in motion.items()} for k in (8, 7, 9))
+    assert np.abs(now["seconds"][:, None] - [1.0, 3.0]).min() > 2 * h, "the snap jumps there"
     slope = lambda name: (after[name] - before[name]) / (2 * h)
     np.testing.assert_allclose(now["velocity"], slope("position"), atol=1e-6)
     world_force = g.rotate(now["attitude"], now["force"], xp=np)
@@ -28,7 +46,7 @@ def test_trajectory_derivatives_belong_together(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_it_starts_at_rest_and_then_moves_briskly_but_upright(seed):
-    motion = trajectory(np.arange(0.0, 20.0, 0.01), seed=seed)
+    motion = motion_of(seed, 100.0)
     assert np.abs(motion["velocity"][:100]).max() == 0.0
     assert np.abs(motion["rate"][:100]).max() == 0.0
     np.testing.assert_allclose(motion["position"][0], 0.0, atol=1e-12)
@@ -37,6 +55,22 @@ def test_it_starts_at_rest_and_then_moves_briskly_but_upright(seed):
     assert g.to_matrix(motion["attitude"], xp=np)[:, 2, 2].min() > 0.3
     steps = np.einsum("ni,ni->n", motion["attitude"][1:], motion["attitude"][:-1])
     assert steps.min() > 0.9  # the sign of the quaternion does not jump
+
+
+def test_a_flight_is_a_run_of_its_graph_whatever_it_is_called():
+    flight = load(seed=4, settings={"duration": 2.0, "vicon.rate": 3.0})
+    world = flight.experiment
+    assert world is not None
+    built = world.world.build(**clocks_of(world.ticks), **world.settings)
+    run = simulate(built, world.ticks, engine="reference", seed=4)
+    for name in ("", "quadrotor", "figure"):
+        same = load(name, seed=4, settings={"duration": 2.0, "vicon.rate": 3.0})
+        assert same.name == "sim-4"
+        for stream, series in {**same.streams, "truth": same.truth}.items():
+            assert series is not None
+            np.testing.assert_array_equal(series.time, run[stream].time)
+            for leaf, values in series.leaves.items():
+                np.testing.assert_allclose(values, run[stream][leaf], rtol=1e-9, atol=1e-9)
 
 
 def test_streams_have_their_rates_and_integer_times():
@@ -54,7 +88,7 @@ def test_noise_is_what_the_settings_say():
     flight = load(seed=5, settings={"duration": 100.0})
     imu, truth = flight.streams["imu"], flight.truth
     assert truth is not None
-    motion = trajectory(imu.seconds, seed=5)
+    motion = motion_of(5, 200.0, 100.0)
     white = imu.gyro - motion["rate"] - truth.gyro_bias
     np.testing.assert_allclose(white.std() / np.sqrt(200.0), DEFAULTS["gyro.noise"], rtol=0.02)
     steps = np.diff(truth.accelerometer_bias, axis=0)

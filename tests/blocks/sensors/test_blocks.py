@@ -22,7 +22,7 @@ from flowgraph.blocks.sensors import (
     read_position,
 )
 from flowgraph.blocks.signals import FigureShape, Vector
-from flowgraph.blocks.world import figure_motion, figure_shape, shaped, smooth_motion
+from flowgraph.blocks.world import figure_motion, figure_shape
 from tests.support import MS, all_engines, both_quick
 
 QUIET: dict[str, Any] = {
@@ -86,22 +86,11 @@ def test_perfect_sensors_read_the_motion() -> None:
     np.testing.assert_allclose(seen["position"], truth["position"][held], atol=1e-12)
 
 
-def test_the_motion_of_a_tick_is_that_of_all_times_at_once() -> None:
-    rng = np.random.default_rng(3)
-    shape = shaped(lambda name, low, high, size: rng.uniform(low, high, size), xp=np)
-    seconds = np.array([0.0, 0.7, 1.8, 4.2])
-    whole = smooth_motion(seconds, shape, xp=np)
-    for k, t in enumerate(seconds):
-        one = figure_motion.step(shape, t=np.int64(round(t * 1e9)), xp=np)
-        for name in ("position", "velocity", "acceleration", "rate"):
-            np.testing.assert_allclose(getattr(one, name), whole[name][k], rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.slow
 def test_biases_and_noise_are_as_large_as_told() -> None:
     flights = [
         load_flight(
-            "sim:figure",
+            "sim",
             seed=seed,
             settings={"duration": "4", "gyro.bias": "0.02", "gyro.walk": "0.01", "gyro.noise": "0"},
         )
@@ -112,7 +101,7 @@ def test_biases_and_noise_are_as_large_as_told() -> None:
     walked = bias[:, -1] - bias[:, 0]
     assert walked.std() == pytest.approx(0.01 * math.sqrt(4.0), rel=0.35)
     own = {"duration": "4", "gyro.bias": "0.02", "gyro.walk": "0.01", "gyro.noise": "0.01"}
-    quiet, noisy = flights[1], load_flight("sim:figure", seed=1, settings=own)
+    quiet, noisy = flights[1], load_flight("sim", seed=1, settings=own)
     white = noisy.streams["imu"]["gyro"] - quiet.streams["imu"]["gyro"]
     assert white.std() == pytest.approx(0.01 * math.sqrt(200.0), rel=0.1)
     np.testing.assert_array_equal(truth_of(noisy)["gyro_bias"], truth_of(quiet)["gyro_bias"])
