@@ -65,7 +65,8 @@ class ManyRuns:
         started: the register cells from which all runs start; None where each has its own.
         tape: the ticks of the n-th run, checked.
         cells: the register cells from which the n-th run starts.
-        finish: to be called with the place of a run that has ended and its cells, for what lies in them.
+        finish: to be called with the place of a run that has ended and its cells, for what lies in them;
+            but where the pipeline has no faults and all reals in the cells are finite, nothing does.
     """
 
     name: str

@@ -25,6 +25,7 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -277,18 +278,42 @@ def as_table(rows: Sequence[Row], first: Iterable[str] = ()) -> Any:
         values = [row.get(name) for row in rows]
         kinds = {type(v) for v in values if v is not None}
         if name == "seed":
-            columns[name] = pyarrow.array(values, pyarrow.uint64())
+            columns[name] = _column(values, np.uint64)
         elif name in ("graph", "data", "error", "key") or kinds & {str} or (bool in kinds and len(kinds) > 1):
-            texts = [None if v is None else str(v) for v in values]
-            columns[name] = pyarrow.array(texts, pyarrow.string())
-        elif kinds == {bool}:
-            columns[name] = pyarrow.array(values, pyarrow.bool_())
-        elif kinds == {int}:
-            columns[name] = pyarrow.array(values, pyarrow.int64())
+            columns[name] = _text_column([None if v is None else str(v) for v in values])
+        elif kinds <= {bool} and kinds:
+            columns[name] = _column(values, np.bool_)
         else:
-            numbers = [None if v is None else float(v) for v in values]
-            columns[name] = pyarrow.array(numbers, pyarrow.float64())
+            columns[name] = _column(values, np.int64 if kinds == {int} else np.float64)
     return pyarrow.table(columns)
+
+
+def _column(values: Sequence[Any], kind: Any) -> Any:
+    """Numbers or truths, with gaps for None, put together by hand: `pyarrow.array` would load pandas, which
+    takes as long as some hundred runs."""
+    pyarrow = import_pyarrow()
+    array = np.array([0 if v is None else v for v in values], kind)
+    held = _bits(array) if array.dtype == np.bool_ else array
+    type_ = pyarrow.from_numpy_dtype(array.dtype)
+    return pyarrow.Array.from_buffers(type_, len(array), [_there(values), pyarrow.py_buffer(held)])
+
+
+def _text_column(values: Sequence[str | None]) -> Any:
+    pyarrow = import_pyarrow()
+    texts = [b"" if v is None else v.encode() for v in values]
+    ends = np.array([0, *accumulate(map(len, texts))], np.int32)  # raises where it is more than 2 GiB
+    held = [_there(values), pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]
+    return pyarrow.Array.from_buffers(pyarrow.string(), len(texts), held)
+
+
+def _there(values: Sequence[Any]) -> Any:
+    """Which of the values are no gaps; None where all are."""
+    there = np.array([v is not None for v in values], bool)
+    return None if there.all() else import_pyarrow().py_buffer(_bits(there))
+
+
+def _bits(truths: np.ndarray) -> np.ndarray:
+    return np.packbits(truths, bitorder="little")
 
 
 def pack_trajectory(series: Mapping[str, Series]) -> bytes:

@@ -282,17 +282,20 @@ def _read(case: Case) -> tuple[str, ...] | None:
 def grouped(cases: Sequence[Case]) -> list[tuple[Any, list[int]]]:
     """The places of cases that can go together, with the program that they share."""
     groups: list[tuple[Any, list[np.ndarray], list[int]]] = []
+    places: list[int] = []
     for k, case in enumerate(cases):
+        if k and case is cases[k - 1]:  # of a whole experiment
+            places.append(k)
+            continue
         pipeline = _lowered.lower(case.graph)
         program = pipeline.__dict__.setdefault("_structure", None) or structure(pipeline)
         pipeline.__dict__["_structure"] = program
         ticks = _ticks(case)
-        for other, when, places in groups:
-            if other == program and _same(when, ticks):
-                places.append(k)
-                break
-        else:
-            groups.append((program, ticks, [k]))
+        found = [where for other, when, where in groups if other == program and _same(when, ticks)]
+        places = found[0] if found else []
+        places.append(k)
+        if not found:
+            groups.append((program, ticks, places))
     return [(program, places) for program, _, places in groups]
 
 

@@ -178,7 +178,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         panel.set_yscale("log")
         panel.set_xlabel(label)
         panel.grid(alpha=0.3)
-        panel.margins(x=0.12, y=0.12)
+        panel.margins(y=0.12)
+        panel.set_xlim(0.0, 1.2 * max((r[column] for r in whole), default=1.0))
     panels[0].set_ylabel("difference to float64, relative")
     if whole:
         handles = panels[0].get_legend_handles_labels()

@@ -160,6 +160,35 @@ def test_what_a_table_says_is_text_in_the_page(tmp_path, change, harm):
     assert "<a " not in page
 
 
+def test_a_table_is_what_pyarrow_makes_of_its_columns():
+    rows = [
+        {**ROW, "seed": 2**64 - 1, "n": 2**63 - 1, "sure": True, "some": None, "mixed": 1, "error": None},
+        {**ROW, "seed": 0, "n": -(2**63), "sure": None, "some": float("nan"), "mixed": "ä€𝄞", "error": ""},
+        *({**ROW, "seed": k, "n": None, "sure": k % 3 == 0, "some": -0.0, "mixed": True} for k in range(9)),
+    ]
+    made = as_table([{**row, "nothing": None} for row in rows])
+    made.validate(full=True)
+    kinds = {"seed": "uint64", "n": "int64", "sure": "bool", "some": "double", "nothing": "double"}
+    assert {n: str(made.schema.field(n).type) for n in kinds} == kinds
+    text = lambda v: None if v is None else str(v)
+    for name in made.column_names:
+        wanted = [row.get(name) for row in rows]
+        wanted = [text(v) for v in wanted] if name == "mixed" else wanted
+        assert repr(made[name].to_pylist()) == repr(wanted)
+    assert as_table([]).num_rows == 0
+
+
+def test_writing_a_table_does_not_load_pandas(tmp_path):
+    code = f"""
+import sys
+from flowgraph.study.store import Store
+Store({str(tmp_path)!r}).write_table([{ROW!r}])
+assert "pyarrow" in sys.modules and "pandas" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert read_table(tmp_path) == [ROW]
+
+
 @pytest.mark.parametrize("damage", ["text", "cut", "other columns", "nested", "a pipe"])
 def test_a_table_that_is_none_is_refused(tmp_path, damage):
     import pyarrow.parquet

@@ -95,6 +95,7 @@ class _Abreast(_Singly):
         super().__init__(runs, passes, options, lanes)
         self.lanes = lanes
         self._shared = lanes.rows([self._leaves(runs.first)]) if runs.shared else None
+        self._begun = lanes.state([runs.started], [seed_words(0)]) if runs.started is not None else None
 
     def _leaves(self, events: Tape) -> list[list[np.ndarray]]:
         return [real_leaves(s, self.real) for s in events.series]
@@ -109,14 +110,18 @@ class _Abreast(_Singly):
 
     def _together(self, block: Sequence[int], tapes: Mapping[int, Tape]) -> None:
         lanes, first = self.lanes, self.many.first
-        memory = lanes.state(
-            [self.many.cells(n) for n in block], [seed_words(self.many.seeds[n]) for n in block]
-        )
+        seeds = [seed_words(self.many.seeds[n]) for n in block]
+        if self._begun is not None:
+            memory = lanes.begun(self._begun, seeds)
+        else:
+            memory = lanes.state([self.many.cells(n) for n in block], seeds)
         given = self._shared or lanes.rows([self._leaves(tapes[n]) for n in block])
         rooms = [[output.room(n, lanes, first) for output in self.outputs] for n in block]
         played = lanes.advance(memory, first.time, first.key, given, rooms)
+        quiet = not self.many.pipeline.faults and lanes.finite(memory)  # then the cells hold no trouble
         for lane, (n, room, (counts, made)) in enumerate(zip(block, rooms, played, strict=True)):
-            self.many.finish(n, lanes.after(memory, lane))
+            if not quiet:
+                self.many.finish(n, lanes.after(memory, lane))
             for output, arrays, count in zip(self.outputs, room, counts, strict=False):
                 output.came(n, first, arrays, count, made)
 

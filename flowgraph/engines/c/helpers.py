@@ -30,6 +30,7 @@ def _texts(real: str) -> dict[str, tuple[tuple[str, ...], str]]:
     even = number(1e-20 if real == "double" else 1e-8, "real", real)
     found: dict[str, tuple[tuple[str, ...], str]] = {
         **vector_texts(real),
+        **vector_texts("fg_real"),  # for lanes
         "fg_clip": (
             (),
             """static inline int32_t fg_clip(int64_t at, int32_t size) {

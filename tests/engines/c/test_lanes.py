@@ -29,6 +29,7 @@ from flowgraph.engines.c.lanes.library import lanes_of
 from flowgraph.engines.c.lanes.source import WIDTH, generate_lanes
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.pipeline.optimise import COMPILED, optimise
+from flowgraph.recorder.random import seed_words
 from tests.graphs.library import LIBRARY, library_case
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
@@ -217,3 +218,96 @@ def test_each_lane_draws_its_own_numbers_and_looks_up_its_own_places():
     for k, seed in enumerate(seeds):
         compare(batch, k, simulate(built, inputs[k], engine="c", seed=seed), tolerance=1e-12)
     assert (batch["out"].value[1] != batch["out"].value[0]).all()
+
+
+BASE = np.random.default_rng(1).normal(size=(18, 18))
+
+
+class Factors(Signal):
+    """Of matrices of several sizes, with and without loops, and whole powers."""
+
+    one: Array = real(1, 1)
+    nine: Array = real(9, 9)
+    most: Array = real(16, 16)
+    more: Array = real(18, 18)
+    powers: Array = real(9, 3)
+    found: Array = real(3)
+
+
+@block
+def factored(a: Three, *, xp) -> Factors:
+    """Matrices that are positive definite unless the first number is below 0, and places beyond a table."""
+    square = BASE @ BASE.T + np.eye(18)
+    of = lambda n: xp.linalg.cholesky(a.value[0] * xp.asarray(square[:n, :n]) + 0.0 * a.value[1])
+    table = xp.asarray(np.linspace(-1.0, 1.0, 11))
+    place = xp.astype(20.0 * a.value, xp.int32), xp.astype(40.0 * a.value, xp.int64)
+    return Factors(
+        one=of(1),
+        nine=of(9),
+        most=of(16),
+        more=of(18),
+        powers=xp.stack([a.value**k for k in range(1, 10)]),
+        found=xp.take(table, place[0]) + 3.0 * xp.take(table, place[1]),
+    )
+
+
+@graph
+def factoring(a: Stream[Three]):
+    """Factors tick by tick."""
+    return {"out": factored(a)}
+
+
+def test_factors_powers_and_places_of_a_lane_are_those_of_a_run():
+    built = factoring.build()
+    values = np.random.default_rng(2).normal(size=(WIDTH + 1, 20, 3))
+    values[:, ::2, 0] = np.abs(values[:, ::2, 0])
+    inputs = [{"a": Series(np.arange(20) * MS, Three(value=v))} for v in values]
+    subject = LoweredGraph(built, dtype="float64")
+    assert lanes_of(subject.pipeline, np.float64, subject.tape(inputs[0]).patterns, COMPILED) is not None
+    batch = many(built, inputs, range(WIDTH + 1), engine="c", diverged="count")
+    for k, given in enumerate(inputs):
+        compare(batch, k, simulate(built, given, engine="c", seed=k, diverged="count"), tolerance=1e-11)
+    assert np.isfinite(batch["out"].most[:, ::2]).all()
+    assert (np.isnan(batch["out"].nine).all(axis=(2, 3)) == (values[:, :, 0] < 0.0)).all()
+
+
+@block
+def counted(state: tuple[Any, Any], a: Three, *, xp) -> tuple[tuple[Any, Any], Scalar]:
+    """State: whether all were above 0 (a truth), and their sum."""
+    state = state[0] & xp.all(a.value > 0.0), state[1] + xp.sum(a.value)
+    return state, state[1]
+
+
+@counted.init
+def _(a: Any) -> tuple[Any, Any]:
+    return np.asarray(True), np.asarray(0.0)
+
+
+@graph
+def counting(a: Stream[Three]):
+    """The sum so far."""
+    return counted(a)
+
+
+def test_a_truth_is_no_number_that_is_not_finite():
+    """In lanes all bits of a true one are set, as in a NaN."""
+    subject = LoweredGraph(counting.build(), dtype="float64")
+    given = {"a": Series(np.arange(3) * MS, Three(value=np.ones((3, 3))))}
+    lanes = lanes_of(subject.pipeline, np.float64, subject.tape(given).patterns, COMPILED)
+    assert lanes is not None
+    cells, seeds = [np.asarray(True), np.asarray(0.0)], [seed_words(k) for k in range(WIDTH)]
+    memory = lanes.state([cells], seeds)
+    assert lanes.finite(memory)
+    for k in range(WIDTH):
+        astray = [*[cells] * k, [np.asarray(True), np.asarray(np.nan)]]
+        assert not lanes.finite(lanes.state([*astray, *[cells] * (WIDTH - 1 - k)], seeds))
+    apart = lanes.state([cells] * WIDTH, seeds)
+    np.testing.assert_array_equal(lanes.begun(memory, seeds).view(np.uint8), apart.view(np.uint8))
+
+
+def test_runs_that_start_alike_differ_by_their_seeds_alone():
+    built = drawing.build()
+    inputs = {"a": data(0)["a"]}
+    batch = many(built, inputs, [7, 8, 7, 9, 7, 8], engine="c")
+    for k, seed in enumerate(batch.seeds):
+        compare(batch, k, simulate(built, inputs, engine="c", seed=seed), tolerance=1e-12)

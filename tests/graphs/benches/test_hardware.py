@@ -90,7 +90,7 @@ def test_a_row_for_each_width_with_what_it_takes():
     narrow, wide = report.rows
     assert (narrow["width"], wide["width"]) == (16, 24)
     assert narrow[RELATIVE] > 10 * wide[RELATIVE]
-    assert narrow["lut"] < wide["lut"]
+    assert abs(narrow["lut"] - wide["lut"]) < 0.1 * wide["lut"]  # the memory has 36 bits in either
     assert narrow["area"] == "synthesised"
-    assert narrow["front"]
+    assert wide["front"]
     assert "space.png" in report.figures

@@ -28,6 +28,8 @@ _JOINED = {
     "bitwise_xor": "^",
 }
 _SHIFTS = {"bitwise_left_shift": "<<", "bitwise_right_shift": ">>"}
+_MOST_POWER = 8
+"""The largest whole power that is written as products: three roundings, as `pow` has less than one."""
 _EACH = (FUNCTIONS | {"floor", "ceil", "trunc"}) - {"remainder", "floor_divide", "pow"}
 
 
@@ -125,8 +127,10 @@ class LaneExpressions(Expressions):
             return self.each(op, self.helper("fg_float_bits"), dtype, node, args)
         if op == "sqrt":
             return f"fg_real_root({a})"
+        if op in IN_LANES and dtype == "real":
+            return f"{self.helper('fg_lanes_' + op)}({', '.join(args)})"
         if op in _EACH and dtype == "real":
-            return self.each(op, f"{self.helper('fg_' + op)}" if op in IN_LANES else op, dtype, node, args)
+            return self.each(op, op, dtype, node, args)
         if op == "round":
             return self.each(op, "rint", dtype, node, args)
         if op == "sign" and dtype == "real":
@@ -169,21 +173,22 @@ class LaneExpressions(Expressions):
     def gathered(self, buffer: Buffer, place: str, at: str, kind: str, step: int, size: int) -> str:
         """An element of a buffer that is another in each lane; `place` is where those begin, `at` which."""
         alike = buffer.kind == "const"
-        self.helper("fg_clip")
+        index, top = ("fg_int", 31) if kind == "int32" else ("fg_long", 63)
 
         def make(name: str) -> str:
             table = ctype(buffer.dtype, self.real) if alike else TYPES[buffer.dtype]
-            return f"""static FG_INLINE {TYPES[buffer.dtype]} {name}(const {table} *table, fg_long at) {{
+            return f"""static FG_INLINE {TYPES[buffer.dtype]} {name}(const {table} *table, {index} at) {{
     union {{ {TYPES[buffer.dtype]} all; {_element(buffer.dtype)} one[FG_LANES]; }} made;
-    for (int32_t l = 0; l < FG_LANES; l++)
-        made.one[l] = table[{step} * fg_clip(at[l], {size})]{"" if alike else "[l]"};
+    const {index} low = at & ~(at >> {top}), beyond = low > {size - 1};
+    const {index} in = ({size - 1} & beyond) | (low & ~beyond);
+    for (int32_t l = 0; l < FG_LANES; l++) made.one[l] = table[{step} * in[l]]{"" if alike else "[l]"};
     return made.all;
 }}
 """
 
-        name = self.function(("gather", alike, buffer.dtype, step, size), "gather", make)
-        long = at if kind == "int64" else f"__builtin_convertvector({at}, fg_long)"
-        return f"{name}({place}, {long})"
+        name = self.function(("gather", alike, buffer.dtype, step, size, index), "gather", make)
+        whole = at if kind in ("int32", "int64") else f"__builtin_convertvector({at}, fg_long)"
+        return f"{name}({place}, {whole})"
 
     def _sum(self, op: str, dtype: str, args: Sequence[str]) -> str:
         """Whole numbers wrap around, as in NumPy, so they go through unsigned ones."""
@@ -214,12 +219,26 @@ class LaneExpressions(Expressions):
         below = self.compared(dtype, f"{a} < {zero}")
         return self.pick(dtype, below, self._sum("subtract", dtype, (zero, a)), a)
 
+    def _power(self, power: int, a: str) -> str:
+        """A whole power as products, by squares."""
+
+        def make(name: str) -> str:
+            lines, made = [], ""
+            for k in range(power.bit_length()):
+                lines.append(f"    const fg_real s{k} = {f's{k - 1} * s{k - 1}' if k else 'x'};")
+                if power >> k & 1:
+                    made = f"{made} * s{k}" if made else f"s{k}"
+            body = "\n".join(lines)
+            return f"static FG_INLINE fg_real {name}(fg_real x) {{\n{body}\n    return {made};\n}}\n"
+
+        return f"{self.function(('power', power), f'power_{power}', make)}({a})"
+
     def _quotient(self, op: str, dtype: str, node: Node, args: Sequence[str]) -> str:
         a, _ = args
         power = node.args[1].extra[0] if op == "pow" and node.args[1].op == "const" else None
         if dtype == "real" and op == "pow":
-            if power == 2:
-                return f"{a} * {a}"
+            if power is not None and power in range(2, _MOST_POWER + 1):
+                return self._power(int(power), a)
             if power == 0.5:
                 return f"fg_real_root({a})"
             return self.each(op, "pow", dtype, node, args)

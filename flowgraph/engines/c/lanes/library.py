@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,7 @@ class Lanes(Outputs):
         self._held = [c for r in pipeline.registers for c in r.cells]
         cells = [n for r in names.registers for n in r]
         self._cells = self._lanes([*self._held, _SEED], [*cells, "fg_seed"])
+        self._reals = self._words_of_reals()
 
     def _lanes(self, leaves: Sequence[Leaf | Cell], names: Sequence[str]) -> np.dtype[Any]:
         """The struct that C lays out, as NumPy sees it: each number a lane for each run."""
@@ -78,6 +79,16 @@ class Lanes(Outputs):
             }
         )
 
+    def _words_of_reals(self) -> np.ndarray:
+        """Where among the words of 8 bytes of the register cells the reals are."""
+        words = np.zeros(self._cells.itemsize // 8, bool)
+        fields: Mapping[str, Any] = self._cells.fields or {}
+        for name, cell in zip(self._cells.names or (), self._held, strict=False):
+            kind, offset = fields[name][:2]
+            if cell.dtype == "real" and 0 not in cell.shape:
+                words[offset // 8 : (offset + kind.itemsize) // 8] = True
+        return np.flatnonzero(words)
+
     def rows(self, runs: Sequence[Sequence[Sequence[np.ndarray]]]) -> Structs:
         """For each input port its events as structs of lanes; `runs` has the leaves (n, ...) of each port.
 
@@ -97,20 +108,37 @@ class Lanes(Outputs):
 
     def state(self, cells: Sequence[Sequence[Any]], seeds: Sequence[np.ndarray]) -> np.ndarray:
         """What the runs remember, with the cells and (2,) uint32 seed of each; lanes without a run have the
-        last one's."""
+        last one's, and one run's cells alone are the same in all lanes."""
         memory = _aligned(1, np.dtype((np.void, self.size)))
-        seen = memory.view(np.uint8)[: self._cells.itemsize].view(self._cells)
-        for lane in range(WIDTH):
-            run = cells[min(lane, len(cells) - 1)]
-            seen["fg_seed"][0, :, lane] = seeds[min(lane, len(cells) - 1)]
+        seen = self._seen(memory)
+        for lane, run in enumerate(cells):
             for name, cell, value in zip(self._cells.names or (), self._held, run, strict=False):
                 if math.prod(cell.shape):
-                    seen[name][0, :, lane] = _signed(np.asarray(value)).ravel()
+                    seen[name][0, :, lane:] = _signed(np.asarray(value)).reshape(-1, 1)
+        return self._seeded(memory, seeds)
+
+    def begun(self, memory: np.ndarray, seeds: Sequence[np.ndarray]) -> np.ndarray:
+        """A copy of what runs remember that begins with other seeds."""
+        copy = _aligned(1, memory.dtype)
+        copy[:] = memory
+        return self._seeded(copy, seeds)
+
+    def _seeded(self, memory: np.ndarray, seeds: Sequence[np.ndarray]) -> np.ndarray:
+        lanes = np.array([seeds[min(lane, len(seeds) - 1)] for lane in range(WIDTH)], np.uint32)
+        self._seen(memory)["fg_seed"][0] = lanes.T
         return memory
+
+    def _seen(self, memory: np.ndarray) -> np.ndarray:
+        return memory.view(np.uint8)[: self._cells.itemsize].view(self._cells)
+
+    def finite(self, memory: np.ndarray) -> bool:
+        """Whether all reals among the register cells of all lanes are."""
+        words = memory.view(np.uint8)[: self._cells.itemsize].view(np.float64)
+        return bool(np.isfinite(words[self._reals]).all())
 
     def after(self, memory: np.ndarray, lane: int) -> list[np.ndarray]:
         """Copies of the register cells of one run as they are now."""
-        seen = memory.view(np.uint8)[: self._cells.itemsize].view(self._cells)
+        seen = self._seen(memory)
         return [
             np.array(seen[name][0, : math.prod(cell.shape), lane], self.kind(cell.dtype)).reshape(cell.shape)
             for name, cell in zip(self._cells.names or (), self._held, strict=False)

@@ -66,6 +66,9 @@ def _entry(kind: str, place: str) -> str:
 
 def _cholesky(w: Lines, m: Macro) -> None:
     kinds = _types(w, m)
+    if m.output.shape[-1] <= _WRITTEN_OUT:
+        call(w, "cholesky", m, lambda name, a, out: _written_out(name, kinds[0], a, out), *kinds)
+        return
     factorize = w.write.function(("factorize",), "cholesky", lambda name: CHOLESKY.replace("NAME", name))
 
     def text(name: str, a: View, out: View) -> str:
@@ -85,6 +88,43 @@ static FG_APART void {name}(const {kinds[0]} *restrict a, fg_real *restrict out)
 """
 
     call(w, "cholesky", m, text, *kinds)
+
+
+_WRITTEN_OUT = 16
+"""Rows of a matrix whose factorization has no loop."""
+
+
+def _written_out(name: str, kind: str, a: View, out: View) -> str:
+    """L D L^T, of which only the pivots' inverses wait for one another; the roots of D come at the end."""
+    n, at, to = out.shape[-1], a.strides[-2:], out.strides[-2:]
+    below = [(i, j) for i in range(n) for j in range(i + 1)]
+    lines = [f"fg_real a{i}_{j} = {_entry(kind, f'a[{at[0] * i + at[1] * j}]')};" for i, j in below]
+    for j in range(n):
+        lines.append(f"const fg_real inverse{j} = 1.0 / a{j}_{j};")
+        for i in range(j + 1, n):
+            lines.append(f"const fg_real f{i}_{j} = a{i}_{j} * inverse{j};")
+            lines += [f"a{i}_{k} -= f{i}_{j} * a{k}_{j};" for k in range(j + 1, i + 1)]
+    good = " & ".join(f"(fg_mask)(a{j}_{j} > 0.0)" for j in range(n))
+    lines.append(f"const fg_mask good = {good};")
+    lines += [
+        f"const fg_real root{j} = fg_real_pick(good, fg_real_root(a{j}_{j}), fg_real_of(NAN));"
+        for j in range(n)
+    ]
+    lines.append("const fg_real none = fg_real_pick(good, fg_real_of(0.0), fg_real_of(NAN));")
+    for i in range(n):
+        for j in range(n):
+            value = f"f{i}_{j} * root{j}" if j < i else f"root{j}" if j == i else "none"
+            lines.append(f"out[{to[0] * i + to[1] * j}] = {value};")
+    return "\n".join(
+        [
+            f"/* lower factor of ({n} x {n}); NaN in lanes where that is not positive definite */",
+            f"static FG_APART void {name}(const {kind} *restrict a, fg_real *restrict out)",
+            "{",
+            *(f"    {line}" for line in lines),
+            "}",
+            "",
+        ]
+    )
 
 
 def _solve(w: Lines, m: Macro) -> None:
