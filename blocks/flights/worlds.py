@@ -11,16 +11,21 @@ Rates of `sim:thesis` are of the step since the last reading: see `OF_STEPS`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
-from flowgraph import Flight, Series
-from flowgraph.blocks import sensors as s
+from flowgraph import Flight, Graph, Series, aperiodic, simulate, ticks
+from flowgraph.blocks.flights.sensed import begins, late, period, sensed
 from flowgraph.blocks.geometry.rotations import geodesic_angle
-from flowgraph.blocks.signals import NavigationState
-from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis_flight
+from flowgraph.blocks.inertial.imu import ImuNoise
+from flowgraph.blocks.sensors import earth_field
+from flowgraph.blocks.signals import Drawn
+from flowgraph.blocks.world import Hover, Limits, RoundTrip, World, figures, thesis, thesis_flight
+from flowgraph.data.experiment import Experiment
+from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
@@ -97,6 +102,9 @@ SETTINGS: Mapping[str, str | float] = {
 _POSITIVE = ("duration", "least_thrust", "most_thrust", "most_rate", "trip", "rate", "strength", "most_tilt")
 _SIGNED = ("angle", "declination", "dip", "latitude", "longitude", "height", *_LEVER)
 _SWITCHES = ("geodetic", "turn")
+_MOST_LOOKS = 1000
+"""The most looks that make one reading."""
+
 _PARTS_OF_IMU = ("gyro", "accelerometer")
 _OWN = {"roundtrip": TRIP, "thesis": OF_STEPS}
 
@@ -137,44 +145,83 @@ def load_world(kind: str, *, seed: int = 0, settings: Mapping[str, str | float] 
     steps = numbers["gyro.step"] * math.sqrt(numbers["imu.rate" if "imu" in chosen else "gyro.rate"])
     numbers["gyro.walk"] = math.hypot(numbers["gyro.walk"], steps) if steps else numbers["gyro.walk"]
     check_samples(numbers, [f"{name}.rate" for name in chosen], path)
-    world, still = _world(kind, numbers, seed, path)
-    end = round(numbers["duration"] * 1e9)
+    made_by = _made_by(kind, tuple(chosen), tuple(numbers.items()))
+    inputs, end = {**made_by.ticks, **made_by.given(seed)}, round(numbers["duration"] * 1e9)
+    world, sensors = made_by.settings["world"], made_by.settings["sensors"]
+    flown = simulate(_built(kind, tuple(chosen), tuple(numbers.items())), inputs, engine="numpy", seed=seed)
+    if world.numbers:
+        world = world.shaped(flown["shape"]["numbers"][0])
 
     streams: dict[str, Series] = {}
     stamps: dict[str, np.ndarray] = {}
-    made: dict[str, s.Sensor] = {}
+    still = _still(kind, numbers)
     info: dict[str, Any] = {"world": world, "still": still, "noise": {}, "stamps": stamps}
     for name in chosen:
-        made[name] = sensor = _sensor(name, numbers)
-        recording = sensor.record(world, seed=seed, until=end)
-        streams[name] = recording.series
-        info["noise"][name] = _of(name, numbers)
-        info[f"{name}_period_ns"] = sensor.period
-        if sensor.latency or sensor.jitter:
-            stamps[name] = recording.stamp
-        info.update(_calibration(sensor))
-        if info["noise"][name].get("geodetic"):
-            n = info["noise"][name]
-            origin = n["latitude"], n["longitude"], n["height"]
-            streams[name], info[f"{name}_origin"] = s.as_geodetic(recording.series, origin), origin
+        n = sensors[name]
+        streams[name] = flown[name]
+        info["noise"][name] = dict(n)
+        info[f"{name}_period_ns"] = period(n)
+        if n["jitter"]:
+            streams[name], stamps[name] = _delivered(flown[name], flown[f"{name}_lateness"], n, end)
+        elif n["latency"]:
+            stamps[name] = flown[name].time - round(n["latency"] * 1e9)
+        info.update(_calibration(name, sensors))
     for part in _PARTS_OF_IMU if "imu" in chosen else ():
-        info["noise"][part] = _of(part, numbers)
-
-    time = np.arange(0, end + 1, min(sensor.period for sensor in made.values()), dtype=np.int64)
-    motion = world.at(time / 1e9)
-    truth = NavigationState(
-        position=motion.position,
-        velocity=motion.velocity,
-        attitude=motion.attitude,
-        gyro_bias=_bias("gyro", made, time, numbers, seed),
-        accelerometer_bias=_bias("accelerometer", made, time, numbers, seed),
-    )
+        info["noise"][part] = dict(sensors[part])
     if kind == "roundtrip" and "imu" in chosen and steps:
         info["orientation_noise"] = _orientation_noise(numbers)
-    info["across"] = float(np.sqrt(np.mean(np.square(motion.specific_force[:, :2]).sum(-1))))
+    truth = flown["truth"]
+    across = world.at(truth.time / 1e9).specific_force[:, :2]
+    info["across"] = float(np.sqrt(np.mean(np.square(across).sum(-1))))
     notes = [note("info", f"simulated with seed {seed}: {figures(world)}")]
     notes += [_late(name, streams[name], stamp, world) for name, stamp in stamps.items() if len(stamp)]
-    return Flight(f"sim-{kind}-{seed}", streams, Series(time, truth, name="truth"), info, tuple(notes))
+    experiment = None if any(sensors[name]["jitter"] for name in chosen) else made_by
+    return Flight(f"sim-{kind}-{seed}", streams, truth, info, tuple(notes), experiment=experiment)
+
+
+@lru_cache(maxsize=8)
+def _made_by(kind: str, chosen: tuple[str, ...], numbers: tuple[tuple[str, float], ...]) -> Experiment:
+    n = dict(numbers)
+    end = round(n["duration"] * 1e9)
+    used = (*chosen, *(_PARTS_OF_IMU if "imu" in chosen else ()))
+    sensors = {name: _of(name, n) for name in used}
+    world = _world(kind, n)
+    clocks = {"truth": (0, min(period(sensors[name]) for name in chosen))}
+    if begins(world, sensors, planned=kind == "thesis"):
+        clocks["start"] = 0, end + 1
+    for name in chosen:
+        first = round(sensors[name]["phase"] * 1e9) + round(late(sensors[name]) * 1e9)
+        clocks[name] = first, period(sensors[name])
+    made = {
+        name: ticks(step, start=first, until=max(end + 1 - first, 0), name=name)
+        for name, (first, step) in clocks.items()
+    }
+    told = {"world": world, "sensors": sensors}
+    if kind == "thesis":
+        return Experiment(sensed, made, told, partial(_planned, numbers=n))
+    return Experiment(sensed, made, told)
+
+
+@lru_cache(maxsize=8)
+def _built(kind: str, chosen: tuple[str, ...], numbers: tuple[tuple[str, float], ...]) -> Graph:
+    made_by = _made_by(kind, chosen, numbers)
+    world, clocks = made_by.settings["world"], clocks_of(made_by.ticks)
+    planned: dict[str, Any] = {"plan": aperiodic()} if kind == "thesis" else {}
+    return sensed.build(**clocks, **planned, **made_by.settings, sizes={"n": world.numbers})
+
+
+def _delivered(series: Series, lateness: Series, n: Numbers, end: int) -> tuple[Series, np.ndarray]:
+    """Readings by time of arrival, and when each was true: one may overtake another, and two that would
+    arrive at one nanosecond are set one apart. What arrives after the end is not in the recording."""
+    stamp = series.time
+    spread = lateness["value"][np.searchsorted(lateness.time, stamp)] * n["jitter"]
+    arrival = stamp + np.rint(np.maximum(n["latency"] + spread, 0.0) * 1e9).astype(np.int64)
+    order = np.argsort(arrival, kind="stable")
+    place = np.arange(len(order))
+    arrival = np.maximum.accumulate(arrival[order] - place) + place
+    order, arrival = order[arrival <= end], arrival[arrival <= end]
+    values = series[order].values
+    return Series(arrival, values, type=series.type, name=series.name), stamp[order]
 
 
 def _orientation_noise(n: Numbers) -> dict[str, float]:
@@ -213,97 +260,59 @@ def check_samples(numbers: Numbers, rates: Iterable[str], path: str) -> None:
             )
 
 
-def _world(kind: str, n: Numbers, seed: int, path: str) -> tuple[World, float]:
-    """The world, and for how many seconds the body is at rest at first."""
+def _world(kind: str, n: Numbers) -> World:
+    """The world, but for what is drawn."""
     if kind == "roundtrip":
-        shape = RoundTrip(n["duration"], angle=n["angle"], trip=n["trip"], rest=n["rest"])
-        return shape, min(n["rest"], n["duration"])
+        return RoundTrip(n["duration"], angle=n["angle"], trip=n["trip"], rest=n["rest"])
     if kind == "hover":
-        at_rest = n["drift"] == 0.0
-        return Hover(n["duration"], drift=n["drift"], seed=seed), n["duration"] if at_rest else 0.0
-    flight = thesis_flight(seed, limits=Limits(n["least_thrust"], n["most_thrust"], n["most_rate"]))
-    if n["duration"] > flight.duration:
+        return Hover(n["duration"], drift=n["drift"])
+    if n["duration"] > thesis.AVERAGE.duration:
         raise DeclarationError(
             "the thesis's flights are shorter",
-            path=path,
-            expected=f"duration at most {flight.duration:g} s",
+            path="sim:thesis",
+            expected=f"duration at most {thesis.AVERAGE.duration:g} s",
             got=f"{n['duration']:g}",
             fix="leave duration out, or use sim:roundtrip or sim:hover",
         )
-    return flight, 0.0
+    return thesis.AVERAGE
 
 
-def _noise(n: Numbers, *, density: bool = False, white: str = "noise") -> s.Noise:
-    kind = {"density" if density else "deviation": n[white]}
-    kind["bias"], kind["walk"] = (n.get(white.replace("noise", part), 0.0) for part in ("bias", "walk"))
-    return s.Noise(**kind)
+def _still(kind: str, n: Numbers) -> float:
+    """For how many seconds the body is at rest at first."""
+    if kind == "roundtrip":
+        return min(n["rest"], n["duration"])
+    return n["duration"] if kind == "hover" and n["drift"] == 0.0 else 0.0
 
 
-def _sensor(name: str, numbers: Numbers) -> s.Sensor:
-    n = _of(name, numbers)
-    common: dict[str, Any] = {"name": name, "rate": n["rate"], **{k: n[k] for k in _CLOCK}}
-    if "oversample" in n:
-        common["oversample"] = int(n["oversample"])
-    if "turn" in n:
-        common["turn"] = bool(n["turn"])
-    if name == "imu":
-        gyro, push = (_noise(_of(part, numbers), density=True) for part in _PARTS_OF_IMU)
-        return s.InertialUnit(**common, gyro=gyro, accelerometer=push)
-    common["noise"] = _noise(n, density=name in ("gyro", "accelerometer", "coordinate_acceleration"))
-    if name in ("vicon", "optical_flow"):
-        common["attitude_noise"] = _noise(n, white="attitude_noise")
-    if "lever_x" in n:
-        common["lever"] = tuple(n[k] for k in _LEVER)
-    common.update({k: n[k] for k in ("declination", "dip", "strength", "most_tilt") if k in n})
-    return _MAKERS[name](**common)
+def _planned(seed: int, *, numbers: Numbers) -> dict[str, Series]:
+    """The way of a flight of the thesis, told once, at 0."""
+    n = numbers
+    flight = thesis_flight(seed, limits=Limits(n["least_thrust"], n["most_thrust"], n["most_rate"]))
+    drawn = Drawn(numbers=flight.primitives.coefficients.reshape(1, -1))
+    return {"plan": Series(np.zeros(1, dtype=np.int64), drawn, name="plan")}
 
 
-_MAKERS: Mapping[str, Callable[..., s.Sensor]] = {
-    "gyro": s.Gyroscope,
-    "accelerometer": s.Accelerometer,
-    "coordinate_acceleration": s.CoordinateAccelerometer,
-    "position": s.PositionSensor,
-    "attitude": s.AttitudeSensor,
-    "vicon": s.Vicon,
-    "gps": s.Gps,
-    "gps2": s.Gps,
-    "magnetometer": s.Magnetometer,
-    "magnetic_attitude": s.MagneticAttitude,
-    "altimeter": s.Altimeter,
-    "optical_flow": s.OpticalFlowSensor,
-    "thrust": s.ThrustInput,
-    "body_rate": s.BodyRateInput,
-}
-
-
-def _calibration(sensor: s.Sensor) -> dict[str, Any]:
+def _calibration(name: str, sensors: Mapping[str, Numbers]) -> dict[str, Any]:
     """What a filter may know of a sensor, under the names that recorded flights use too."""
-    if isinstance(sensor, s.InertialUnit):
-        return {"imu_noise": sensor.densities, "imu_oversample": sensor.oversample}
-    if isinstance(sensor, s.RateSensor):
-        return {f"{sensor.name}_oversample": sensor.oversample, f"{sensor.name}_turn": sensor.turn}
-    if isinstance(sensor, s.InertialSensor):
-        return {f"{sensor.name}_oversample": sensor.oversample}
-    if isinstance(sensor, s.Vicon):
-        noise = {"position_noise": sensor.noise.deviation, "attitude_noise": sensor.attitude_noise.deviation}
-        return {**noise, "vicon_lever": (0.0, 0.0, 0.0)}
-    if isinstance(sensor, s.Magnetometer):
-        return {"magnetic_field": s.earth_field(sensor.declination, sensor.dip, sensor.strength)}
-    if isinstance(sensor, s.PositionSensor):
-        return {f"{sensor.name}_lever": sensor.lever}
-    return {}
-
-
-def _bias(
-    part: str, made: Mapping[str, s.Sensor], time: np.ndarray, numbers: Numbers, seed: int
-) -> np.ndarray:
-    """The bias (n, 3) that a reading at or before each time had; zero without such a sensor."""
-    reader = made.get("imu") or made.get(part)
-    if reader is None:
-        return np.zeros((len(time), 3))
-    stamp = np.arange(round(reader.phase * 1e9), int(time[-1]) + reader.period, reader.period)
-    drift = _noise(_of(part, numbers), density=True).drift(part, seed, stamp / 1e9, 3)
-    return drift[np.maximum(np.searchsorted(stamp, time, side="right") - 1, 0)]
+    n = sensors[name]
+    found: dict[str, Any] = {}
+    if name == "imu":
+        densities = [sensors[part][kind] for kind in ("noise", "walk") for part in _PARTS_OF_IMU]
+        found["imu_noise"] = ImuNoise(*densities)
+    if "oversample" in n or "turn" in n:
+        found[f"{name}_oversample"] = int(n.get("oversample", 1))
+    if "turn" in n:
+        found[f"{name}_turn"] = bool(n["turn"])
+    if name == "vicon":
+        found |= {"position_noise": n["noise"], "attitude_noise": n["attitude_noise"]}
+        found["vicon_lever"] = (0.0, 0.0, 0.0)
+    if name == "magnetometer":
+        found["magnetic_field"] = earth_field(n["declination"], n["dip"], n["strength"])
+    if "lever_x" in n:
+        found[f"{name}_lever"] = tuple(n[k] for k in _LEVER)
+    if n.get("geodetic"):
+        found[f"{name}_origin"] = n["latitude"], n["longitude"], n["height"]
+    return found
 
 
 def _of(name: str, numbers: Numbers) -> dict[str, float]:
@@ -357,7 +366,7 @@ def _number(name: str, part: str, text: str | float, otherwise: float, path: str
     if part in _SWITCHES:
         wrong, kind = number not in (0.0, 1.0), "0 or 1"
     elif part in _LOOKS:
-        wrong, kind = number not in range(1, s.MOST_LOOKS + 1), f"a whole number from 1 to {s.MOST_LOOKS}"
+        wrong, kind = number not in range(1, _MOST_LOOKS + 1), f"a whole number from 1 to {_MOST_LOOKS}"
     else:
         kind = "a positive number" if part in _POSITIVE else "a number that is not negative"
     if wrong:

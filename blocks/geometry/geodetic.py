@@ -10,9 +10,11 @@ Review 1976.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from flowgraph import Series
+from flowgraph import Array, Series
 from flowgraph.blocks.signals import GeodeticPosition, Position
 
 __all__ = ["SEMI_MAJOR_AXIS", "FLATTENING", "as_geodetic", "as_position", "from_enu", "to_earth", "to_enu"]
@@ -33,27 +35,28 @@ def to_enu(geodetic: np.ndarray, origin: tuple[float, float, float]) -> np.ndarr
     return np.asarray((to_earth(np.asarray(geodetic, dtype=float)) - start) @ _axes(origin).T)
 
 
-def from_enu(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+def from_enu(enu: Array, origin: tuple[float, float, float], *, xp: Any = np) -> Array:
     """Latitude (rad), longitude (rad), height (m) (..., 3), from east, north, up (..., 3) in m and the
     origin's.
 
     Exact to the precision of the numbers (below a micrometre) from 50 km under the ellipsoid upwards.
     """
-    x, y, z = np.moveaxis(to_earth(np.array(origin, dtype=float)) + np.asarray(enu) @ _axes(origin), -1, 0)
-    across = np.hypot(x, y)
+    earth = to_earth(np.array(origin, dtype=float)) + xp.asarray(enu) @ _axes(origin)
+    x, y, z = (earth[..., k] for k in range(3))
+    across = xp.hypot(x, y)
     b = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
     sine, cosine = SEMI_MAJOR_AXIS * z, b * across  # of the reduced latitude
     for _ in range(4):  # each step gains six digits
-        size = np.hypot(sine, cosine)
+        size = xp.hypot(sine, cosine)
         s, c = sine / size, cosine / size
         up = z + _E2 / (1.0 - _E2) * b * s**3
         out = across - _E2 * SEMI_MAJOR_AXIS * c**3
         sine, cosine = (1.0 - FLATTENING) * up, out
-    latitude = np.arctan2(up, out)
-    s, c = np.sin(latitude), np.cos(latitude)
+    latitude = xp.atan2(up, out)
+    s, c = xp.sin(latitude), xp.cos(latitude)
     # free of singularities: along the normal, less the distance of the ellipsoid there
-    height = across * c + z * s - SEMI_MAJOR_AXIS * np.sqrt(1.0 - _E2 * s**2)
-    return np.stack([latitude, np.arctan2(y, x), height], axis=-1)
+    height = across * c + z * s - SEMI_MAJOR_AXIS * xp.sqrt(1.0 - _E2 * s**2)
+    return xp.stack([latitude, xp.atan2(y, x), height], axis=-1)
 
 
 def as_geodetic(position: Series, origin: tuple[float, float, float]) -> Series:

@@ -36,7 +36,7 @@ from flowgraph.blocks.signals.calibration import (
     Window,
 )
 from flowgraph.blocks.signals.control import Controller, FlightCommand
-from flowgraph.blocks.signals.experiment import BodyMotion, FigureShape, PlaneShape, Vector
+from flowgraph.blocks.signals.experiment import BodyMotion, Drawn, FigureShape, PlaneShape, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
     Attitude,
@@ -122,6 +122,7 @@ __all__ = [
     "Controller",
     "FlightCommand",
     "BodyMotion",
+    "Drawn",
     "FigureShape",
     "PlaneShape",
     "Vector",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flowgraph import Array, Signal, real
 
-__all__ = ["BodyMotion", "FigureShape", "PlaneShape", "Vector"]
+__all__ = ["BodyMotion", "Drawn", "FigureShape", "PlaneShape", "Vector"]
 
 
 class BodyMotion(Signal):
@@ -19,6 +19,12 @@ class BodyMotion(Signal):
     acceleration: Array = real(3, unit="m/s^2", frame="world")
     attitude: Array = real(4, unit="1", frame="world<-body")
     rate: Array = real(3, unit="rad/s", frame="body")
+
+
+class Drawn(Signal):
+    """What is drawn once for a flight, as its world reads it: see `World.shaped`."""
+
+    numbers: Array = real("n")
 
 
 class FigureShape(Signal):

@@ -11,9 +11,9 @@ from flowgraph.blocks.world import thesis
 from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
-from flowgraph.blocks.world.hover import Hover
+from flowgraph.blocks.world.hover import Hover, hover_waves
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Primitives, join, primitive
-from flowgraph.blocks.world.motion import Motion, World, world_motion
+from flowgraph.blocks.world.motion import Motion, World, motion_over, world_motion
 from flowgraph.blocks.world.plane import plane_motion, plane_shape
 from flowgraph.blocks.world.quadrotor import Quadrotor, carried_by_thrust
 from flowgraph.blocks.world.roundtrip import RoundTrip
@@ -24,6 +24,7 @@ __all__ = [
     "World",
     "Motion",
     "world_motion",
+    "motion_over",
     "KeyPoint",
     "Primitives",
     "join",
@@ -37,6 +38,7 @@ __all__ = [
     "thesis",
     "RoundTrip",
     "Hover",
+    "hover_waves",
     "Figures",
     "figures",
     "generator",

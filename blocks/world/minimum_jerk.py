@@ -95,7 +95,7 @@ class Primitives:
     def within(self, which: Array, s: Array, *, xp: Any = np) -> tuple[Array, Array, Array, Array]:
         """The same, at `s` (...) seconds into the primitives `which` (...)."""
         rows = xp.take(xp.asarray(self.coefficients, dtype=s.dtype), which, axis=0)
-        derivative = [rows[..., k, :] for k in range(self.coefficients.shape[1])]
+        derivative = [rows[..., k, :] for k in range(6)]
         found = []
         for _ in range(4):
             found.append(_horner(derivative, s[..., None]))

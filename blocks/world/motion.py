@@ -1,6 +1,8 @@
 """What a world tells: where a body is, how it is turned, and all exact derivatives of both, at any time.
 
-A `World` is immutable and answers for many times at once. Sensors read it; nothing else in a simulation does.
+A `World` is immutable and answers for many times at once. What differs from flight to flight are `numbers`
+that are drawn once: in a graph they are a value, which the blocks `world_motion` and `motion_over` hand to
+their world at each tick.
 """
 
 from __future__ import annotations
@@ -13,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph import Array, block
-from flowgraph.blocks.geometry.rotations import to_matrix
+from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate, to_matrix, to_rotation_vector
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.signals import BodyMotion
+from flowgraph.blocks.signals import BodyMotion, Drawn
 from flowgraph.errors import DataError
 
-__all__ = ["Motion", "World", "world_motion"]
+__all__ = ["Motion", "World", "motion_over", "world_motion"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +82,15 @@ class World(abc.ABC):
     def duration(self) -> float:
         """s: the world answers for 0 to this."""
 
+    @property
+    @abc.abstractmethod
+    def numbers(self) -> int:
+        """How many numbers make a flight of this world; 0 where all are the same."""
+
+    @abc.abstractmethod
+    def shaped(self, numbers: Array) -> World:
+        """The flight of these `numbers` (n)."""
+
     @abc.abstractmethod
     def motion(self, seconds: Array, *, xp: Any) -> Motion:
         """The motion at (...) seconds, all within 0 and `duration`, written in the array API."""
@@ -104,11 +115,50 @@ class World(abc.ABC):
 
 
 @block
-def world_motion(*, world: World, t: Any, xp: Any) -> BodyMotion:
+def world_motion(
+    shape: Drawn | None = None, *, world: World, late: float = 0.0, t: Any, xp: Any
+) -> BodyMotion:
     """Where the body of a world is at this tick, and how it moves; time counts from 0, and the world stands
-    before that and after its `duration`. Give it a clock: `world_motion(world=Hover(20.0), at=imu)`."""
-    seconds = xp.minimum(xp.maximum(xp.astype(t, xp.float64) * 1e-9, 0.0), world.duration)
-    moved = world.motion(seconds, xp=xp)
+    before that and after its `duration`. Give it a clock: `world_motion(world=Hover(20.0), at=imu)`.
+
+    shape: of the flight, where some of it is drawn. late: s, how long ago it was what is told."""
+    return _told(_moves(shape, world, t, late, np.zeros(()), xp))
+
+
+@block
+def motion_over(
+    shape: Drawn | None = None, *, world: World, seconds: float, looks: int = 1, turn: bool = False,
+    gravity: tuple[float, float, float] = GRAVITY, late: float = 0.0, t: Any, xp: Any,
+) -> BodyMotion:  # fmt: skip
+    """The motion as an inertial sensor takes it that reads the `seconds` up to now, not the instant.
+
+    Position, velocity and attitude are those of now. rate: the mean over `looks`, evenly spaced; with `turn`
+    that of the whole turn, log(R(t - T)^T R(t)) / T, so R(t) = R(t - T) Exp(rate T). acceleration: what at
+    the attitude of now gives the mean specific force, R mean(R_k^T (a_k - gravity)) + gravity; with no
+    gravity, the mean of R_k^T a_k. Before it begins the world stands still."""
+    ago = (np.arange(looks)[::-1] + 0.5) / looks * seconds if looks > 1 else np.zeros(1)
+    seen = _moves(shape, world, t, late, np.concatenate([ago, [seconds, 0.0]]), xp)
+    down = xp.asarray(gravity, dtype=seen.acceleration.dtype)
+    now, before = seen.attitude[-1], seen.attitude[-2]
+    force = rotate(conjugate(seen.attitude[:looks], xp=xp), seen.acceleration[:looks] - down, xp=xp)
+    turned = to_rotation_vector(multiply(conjugate(before, xp=xp), now, xp=xp), xp=xp) / seconds
+    return BodyMotion(
+        position=seen.position[-1],
+        velocity=seen.velocity[-1],
+        acceleration=rotate(now, xp.mean(force, axis=0), xp=xp) + down,
+        attitude=now,
+        rate=turned if turn else xp.mean(seen.rate[:looks], axis=0),
+    )
+
+
+def _moves(shape: Drawn | None, world: World, t: Any, late: float, ago: np.ndarray, xp: Any) -> Motion:
+    """The motion at times `ago` (...) s before this tick less what it is `late`."""
+    flight = world if shape is None else world.shaped(shape.numbers)
+    now = xp.astype(t - round(late * 1e9), xp.float64) * 1e-9
+    return flight.motion(xp.minimum(xp.maximum(now - ago, 0.0), world.duration), xp=xp)
+
+
+def _told(moved: Motion) -> BodyMotion:
     return BodyMotion(
         position=moved.position,
         velocity=moved.velocity,

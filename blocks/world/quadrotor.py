@@ -14,7 +14,7 @@ generation.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -46,6 +46,16 @@ class Quadrotor(World):
     @property
     def duration(self) -> float:
         return self.primitives.duration
+
+    @property
+    def numbers(self) -> int:
+        return int(np.prod(np.shape(self.primitives.coefficients)))
+
+    def shaped(self, numbers: Array) -> Quadrotor:
+        """The flight with these coefficients of its primitives (n 6 3,) and their times."""
+        shape = np.shape(self.primitives.coefficients)
+        rows = numbers.__array_namespace__().reshape(numbers, shape)
+        return replace(self, primitives=replace(self.primitives, coefficients=rows))
 
     def feasible(self, limits: Limits = LIMITS) -> bool:
         """Whether thrust and body rate stay within the limits."""

@@ -40,6 +40,13 @@ class RoundTrip(World):
     rest: float = 1.0
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @property
+    def numbers(self) -> int:
+        return 0
+
+    def shaped(self, numbers: Array) -> RoundTrip:
+        return self
+
     def motion(self, seconds: Array, *, xp: Any) -> Motion:
         number, into = seconds // (self.rest + self.trip), seconds % (self.rest + self.trip)
         phase = 2.0 * np.pi * xp.maximum(into - self.rest, 0.0) / self.trip

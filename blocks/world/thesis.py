@@ -2,7 +2,9 @@
 
 A round is [position, velocity and acceleration given, 1 s; position only, 1 s; position and velocity, 2 s].
 All that is given is drawn: mean plus the square root of a variance times a standard normal number on each
-axis. A flight that the vehicle cannot fly is thrown away as a whole, and another drawn.
+axis. A flight that the vehicle cannot fly is thrown away as a whole, and another drawn. The numbers are those
+of the generator of graphs, the first try at time 0 ns, the next at 1 ns and so on. To try hundreds of whole
+flights is nothing for a reaction of fixed size: a graph is handed the flight that was found.
 
 The text leaves the limits open; they are those of its program, thrust 5 to 20 m/s^2 and body rate 20 rad/s,
 and let one draw in six hundred pass. Over 200 seeds the root mean squares are 6.4 m/s^2 of acceleration, 30
@@ -21,13 +23,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from flowgraph.blocks.inertial.imu import GRAVITY
-from flowgraph.blocks.world.draws import generator
 from flowgraph.blocks.world.feasibility import LIMITS, Limits
 from flowgraph.blocks.world.minimum_jerk import KeyPoint, Vector, primitive
 from flowgraph.blocks.world.quadrotor import Quadrotor
 from flowgraph.errors import DataError
+from flowgraph.recorder.random import Site, seed_words
 
-__all__ = ["ROUND", "ROUNDS", "VARIANCES", "random_key_points", "thesis_flight"]
+__all__ = ["AVERAGE", "ROUND", "ROUNDS", "VARIANCES", "random_key_points", "thesis_flight"]
 
 ROUNDS = 5
 
@@ -37,6 +39,9 @@ ROUND: tuple[KeyPoint, ...] = (
     KeyPoint(2.0, position=(-1.0, -1.0, 1.0), velocity=(0.0, 0.0, 0.0)),
 )
 """The means of one round."""
+
+AVERAGE = Quadrotor.along(ROUND * ROUNDS)
+"""The flight of the means, whose times are those of all."""
 
 VARIANCES = (0.6, 0.2, 0.1)
 """Of position (m^2), velocity (m^2/s^2) and acceleration (m^2/s^4), on each axis."""
@@ -51,9 +56,9 @@ _LOOKS = np.linspace(0.0, 1.0, 9)
 """Where on each primitive."""
 
 
-def random_key_points(random: np.random.Generator) -> list[KeyPoint]:
-    """The fifteen key points of one draw."""
-    return _key_points(random.standard_normal(_NUMBERS))
+def random_key_points(seed: int, *, tried: int = 0) -> list[KeyPoint]:
+    """The fifteen key points of one draw of a seed, after so many others."""
+    return _key_points(_draws(seed, tried, 1)[0])
 
 
 def thesis_flight(seed: int = 0, *, limits: Limits = LIMITS, attempts: int = 20_000) -> Quadrotor:
@@ -67,9 +72,8 @@ def thesis_flight(seed: int = 0, *, limits: Limits = LIMITS, attempts: int = 20_
 
 @functools.lru_cache(maxsize=1024)
 def _first_feasible(seed: int, limits: Limits, attempts: int) -> Quadrotor:
-    random = generator(seed, "thesis")
     for tried in range(0, attempts, _AT_ONCE):
-        draws = random.standard_normal((min(_AT_ONCE, attempts - tried), _NUMBERS))
+        draws = _draws(seed, tried, min(_AT_ONCE, attempts - tried))
         for draw in draws[_may_be_feasible(draws, limits)]:
             flight = Quadrotor.along(_key_points(draw))
             if flight.feasible(limits):
@@ -81,6 +85,15 @@ def _first_feasible(seed: int, limits: Limits, attempts: int) -> Quadrotor:
         got="none",
         fix="widen the limits (least_thrust 5, most_thrust 20, rate 20 do), or allow more attempts",
     )
+
+
+_SITE = Site("thesis/key_points", "normal", (_NUMBERS,))
+
+
+def _draws(seed: int, first: int, count: int) -> np.ndarray:
+    """(count, 90)."""
+    numbers = _SITE.at(np.arange(first, first + count), seed_words(seed))
+    return np.ascontiguousarray(numbers.T)
 
 
 def _goals(draws: np.ndarray) -> Iterator[tuple[KeyPoint, tuple[bool, bool, bool], np.ndarray]]:

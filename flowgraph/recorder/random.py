@@ -139,6 +139,10 @@ class Site:
         made = {"normal": normal_from, "uniform": uniform_from}[self.kind](bits, xp=xp)
         return xp.reshape(made, self.shape)
 
+    def at(self, times: np.ndarray, seed: np.ndarray) -> Any:
+        """The draws (*shape, n) at n times (int64 ns)."""
+        return numbers_at(self.kind, self.shape, self.hash, times, seed)
+
 
 def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.ndarray) -> Any:
     """The same numbers as in any namespace, with fewer passes over them."""

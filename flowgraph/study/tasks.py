@@ -11,13 +11,14 @@ import inspect
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from flowgraph.data.batch import Batch
+from flowgraph.data.experiment import Experiment
 from flowgraph.data.flight import Flight
 from flowgraph.data.notes import note
 from flowgraph.data.registry import Case, find_graph, flight_settings, load_flight
@@ -128,7 +129,7 @@ def flight_part(data: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
 _flights: OrderedDict[Any, Flight] = OrderedDict()
 _steps: OrderedDict[Any, Any] = OrderedDict()
 _lowered = Lowered()
-_wholes: OrderedDict[Any, Case | None] = OrderedDict()
+_wholes: OrderedDict[Any, tuple[Case, Experiment] | None] = OrderedDict()
 
 
 def _flight(run: RunSpec) -> Flight:
@@ -187,7 +188,7 @@ def _alone(task: Task, lane: _Lane) -> Done:
 
 
 def _whole(run: RunSpec) -> Case | None:
-    """The experiment of a run's filter as one case for all seeds, where there is one; found once."""
+    """The experiment of a run's filter as one case, where there is one; found once for all seeds."""
     which = (run.graph, run.data, tuple(sorted(run.parameters.items())))
     if which not in _wholes:
         found = []
@@ -196,11 +197,17 @@ def _whole(run: RunSpec) -> Case | None:
             with remembering(_steps):
                 found.append((prepared(run.graph, run.data, seed, run.parameters, flight)[0], flight))
         made_by = found[0][1].experiment
-        _wholes[which] = None if made_by is None else whole_case(made_by, *found)
+        case = None if made_by is None else whole_case(made_by, *found)
+        _wholes[which] = None if made_by is None or case is None else (case, made_by)
         while len(_wholes) > _PROGRAMS_KEPT:
             _wholes.popitem(last=False)
     _wholes.move_to_end(which)
-    return _wholes[which]
+    kept = _wholes[which]
+    if kept is None:
+        return None
+    case, own = kept[0], kept[1].given(run.seed)
+    assert not isinstance(case.inputs, Flight)
+    return replace(case, inputs={**case.inputs, **own}) if own else case
 
 
 _programs: OrderedDict[str, list[tuple[Any, Graph]]] = OrderedDict()
@@ -266,7 +273,7 @@ def _played(cases: Sequence[Case], seeds: Sequence[int], program: Any, options: 
     graph = _program(cases[0].graph.name, program, cases[0].graph)
     streams: Any = [_streams(case, graph) for case in cases]
     start: Any = None
-    whole = any(cases[0] is one for one in _wholes.values())
+    whole = any(one is not None and cases[0] is one[0] for one in _wholes.values())
     if whole and all(case is cases[0] for case in cases):  # but for the seeds they are one run
         streams, start = streams[0], start_of(cases[0].graph)
     starts = start or [start_of(case.graph) for case in cases]

@@ -43,7 +43,7 @@ def whole_case(experiment: Experiment, one: tuple[Case, Flight], other: tuple[Ca
     """The experiment of a filter as one case for all seeds; None where there is none.
 
     Args:
-        experiment: what made the flights.
+        experiment: what made the flights. What it is given for a seed is in the case that of seed 0.
         one, other: the filter's cases of two seeds, and the flights as they were made.
     """
     case, _ = one
@@ -104,14 +104,17 @@ def _begun(experiment: Experiment, case: Case) -> list[dict[str, Any]] | None:
     build = Builder(f"{case.graph.name}_start")
     with building(build):
         ticks = {**experiment.ticks, BEGIN: _once(BEGIN, first)}
-        sources = {name: _source(build, series) for name, series in ticks.items()}
+        sources = {name: _source(build, series) for name, series in {**ticks, **experiment.given(0)}.items()}
         made = _world(experiment, sources)
         starts = case.begin(_firsts(build, made), sources[BEGIN])
         for name, stream in starts.items():
             build.collect(name, stream)
         graph = build.freeze("", {})
     now = {name: series[series.time <= first] for name, series in ticks.items()}
-    runs = [run_graph(graph, now, RunOptions(engine="python", seed=seed)) for seed in (0, 1)]
+    runs = [
+        run_graph(graph, {**now, **experiment.given(seed)}, RunOptions(engine="python", seed=seed))
+        for seed in (0, 1)
+    ]
     return [{name: run[name][0] for name in starts} for run in runs]
 
 
@@ -125,7 +128,7 @@ def _composed(experiment: Experiment, case: Case, parts: dict[str, str], *, begi
     if in_graph is None:
         return None
     given = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
-    inputs = {**experiment.ticks}
+    inputs = {**experiment.ticks, **experiment.given(0)}
     inputs[END] = _once(END, max(int(series.time[-1]) for series in experiment.ticks.values()))
     if begin:
         inputs[BEGIN] = _once(BEGIN, min(int(series.time[0]) for series in experiment.ticks.values()))
@@ -153,7 +156,7 @@ def _composed(experiment: Experiment, case: Case, parts: dict[str, str], *, begi
 
 
 def _world(experiment: Experiment, sources: Mapping[str, Stream[Any]]) -> Any:
-    told: dict[str, Any] = {name: sources[name] for name in experiment.ticks}
+    told: dict[str, Any] = {name: sources[name] for name in (*experiment.ticks, *experiment.given(0))}
     return experiment.world(**told, **experiment.settings)
 
 

@@ -123,7 +123,7 @@ def others(start: Stream[Tick], imu: Stream[Tick]):
         "range": read_altimeter(motion, noise=0.0, most_tilt=0.2),
         "position": read_position(motion, noise=0.0, lever=(0.0, 0.0, 1.0)),
         "attitude": read_attitude(motion, noise=0.05),
-        "field": read_magnetometer(motion, field=FIELD, hard_iron=(1e-6, 0.0, 0.0), noise=0.0),
+        "field": read_magnetometer(motion, field=FIELD, noise=0.0),
         "flow": read_flow(motion, noise=0.0, turn_noise=0.0),
         "bias": drift(first, at=imu, walk=0.0),
     }

@@ -1,145 +1,186 @@
-"""The simulated sensors: what they read, how wrong it is, when it arrives, and that none disturbs another."""
+"""Sensors of the simulated worlds: what they read, how wrong, when it arrives; none disturbs another."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flowgraph import timing_of
+from flowgraph import Flight, Series, simulate, timing_of
 from flowgraph.blocks import sensors as s
+from flowgraph.blocks.flights.sensed import sensed
+from flowgraph.blocks.flights.worlds import SENSORS, load_world
 from flowgraph.blocks.geometry import FLATTENING, SEMI_MAJOR_AXIS
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.inertial import ImuNoise
-from flowgraph.blocks.world import Hover, RoundTrip, thesis_flight
-from flowgraph.errors import DeclarationError
-
-FLIGHT = thesis_flight(5)
-LONG = Hover(duration=500.0)
-
-SENSORS = [
-    s.Gyroscope(),
-    s.Accelerometer(),
-    s.CoordinateAccelerometer(),
-    s.InertialUnit(),
-    s.PositionSensor(lever=(0.1, 0.2, 0.3)),
-    s.AttitudeSensor(),
-    s.Vicon(),
-    s.Gps(),
-    s.Magnetometer(),
-    s.MagneticAttitude(),
-    s.Altimeter(),
-    s.OpticalFlowSensor(),
-    s.ThrustInput(),
-    s.BodyRateInput(),
-]
+from flowgraph.blocks.world import Motion
+from flowgraph.data.inputs import clocks_of
 
 
-def noisy(sensor, noise):
-    """The sensor with this noise in all its parts."""
-    parts = [k for k in ("noise", "attitude_noise", "gyro", "accelerometer") if hasattr(sensor, k)]
-    return replace(sensor, **dict.fromkeys(parts, noise))
+def fly(sensors: str, *, world: str = "thesis", seed: int = 5, noisy: bool = False, **given: Any) -> Flight:
+    """A flight with sensors that are perfect, but for what is given; NAME__PART stands for NAME.PART."""
+    parts = {
+        name: SENSORS[name]
+        for name in (*sensors.split(","), *(("gyro", "accelerometer") if "imu" in sensors else ()))
+    }
+    quiet: dict[str, Any] = {
+        f"{name}.{part}": 0.0 for name, own in parts.items() for part in own if part.endswith("noise")
+    }
+    instant = {
+        f"{n}.{part}": v for n in parts for part, v in (("turn", 0), ("oversample", 1)) if part in SENSORS[n]
+    }
+    biased = {"gyro.bias": 0.0} if world == "roundtrip" and "gyro" in parts else {}
+    told: dict[str, Any] = {name.replace("__", "."): value for name, value in given.items()}
+    start = {} if noisy else quiet
+    return load_world(world, seed=seed, settings={"sensors": sensors, **start, **instant, **biased, **told})
 
 
-def same(a, b):
+def motion_at(flight: Flight, time: np.ndarray) -> Motion:
+    return flight.info["world"].at(time / 1e9)  # type: ignore[no-any-return]
+
+
+def one(name: str, **given: Any) -> tuple[Series, Motion]:
+    """The readings of one sensor and the motion at their times."""
+    flight = fly(name, **given)
+    series = flight.streams[name]
+    return series, motion_at(flight, series.time)
+
+
+def same(a: Series, b: Series) -> bool:
     return all((a.leaves[name] == b.leaves[name]).all() for name in a.leaves)
 
 
-def test_without_noise_each_reads_the_truth():
-    at = lambda series: FLIGHT.at(series.time / 1e9)
-    gyro = s.Gyroscope().sample(FLIGHT)
-    np.testing.assert_array_equal(gyro.rate, at(gyro).rate)
-    force = s.Accelerometer().sample(FLIGHT)
-    world = g.rotate(at(force).attitude, force.force, xp=np)
-    np.testing.assert_allclose(world, at(force).acceleration + np.array([0.0, 0.0, 9.81]), atol=1e-10)
-    coordinate = s.CoordinateAccelerometer().sample(FLIGHT)
-    world = g.rotate(at(coordinate).attitude, coordinate.acceleration, xp=np)
-    np.testing.assert_allclose(world, at(coordinate).acceleration, atol=1e-10)
-    imu = s.InertialUnit().sample(FLIGHT)
-    assert (imu.gyro == gyro.rate).all()
-    assert (imu.specific_force == force.force).all()
-    vicon = s.Vicon().sample(FLIGHT)
-    np.testing.assert_array_equal(vicon.position, at(vicon).position)
-    np.testing.assert_allclose(vicon.attitude, at(vicon).attitude, atol=1e-15)
-    thrust = s.ThrustInput().sample(FLIGHT)
-    np.testing.assert_allclose(thrust.thrust, force.force[:, 2], atol=1e-12)
+def test_without_noise_each_reads_the_truth() -> None:
+    gyro, motion = one("gyro")
+    np.testing.assert_allclose(gyro["rate"], motion.rate, atol=1e-12)
+    force, motion = one("accelerometer")
+    world = g.rotate(motion.attitude, force["force"], xp=np)
+    np.testing.assert_allclose(world, motion.acceleration + np.array([0.0, 0.0, 9.81]), atol=1e-10)
+    coordinate, motion = one("coordinate_acceleration")
+    world = g.rotate(motion.attitude, coordinate["acceleration"], xp=np)
+    np.testing.assert_allclose(world, motion.acceleration, atol=1e-10)
+    imu, _ = one("imu")
+    np.testing.assert_allclose(imu["gyro"], gyro["rate"], atol=1e-12)
+    np.testing.assert_allclose(imu["specific_force"], force["force"], atol=1e-12)
+    vicon, motion = one("vicon")
+    np.testing.assert_allclose(vicon["position"], motion.position, atol=1e-12)
+    np.testing.assert_allclose(vicon["attitude"], motion.attitude, atol=1e-12)
+    thrust, motion = one("thrust")
+    np.testing.assert_allclose(thrust["thrust"], force["force"][:, 2], atol=1e-12)
     # the thesis's way to the vertical: thrust less the coordinate acceleration is gravity in the body
-    up = thrust.thrust[:, None] * [0.0, 0.0, 1.0] - coordinate.acceleration
-    vertical = g.rotate(at(thrust).attitude, up, xp=np)
+    up = thrust["thrust"][:, None] * [0.0, 0.0, 1.0] - coordinate["acceleration"]
+    vertical = g.rotate(motion.attitude, up, xp=np)
     np.testing.assert_allclose(vertical, [[0.0, 0.0, 9.81]] * len(up), atol=1e-9)
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: sensor.name)
-def test_a_seed_repeats_and_the_name_chooses_the_draws(sensor):
-    sensor = noisy(sensor, s.Noise(density=0.01, deviation=0.1, bias=0.1, walk=0.01))
-    first = sensor.sample(FLIGHT, seed=3)
-    assert first.name == sensor.name
-    assert same(first, sensor.sample(FLIGHT, seed=3))
-    assert not same(first, sensor.sample(FLIGHT, seed=4))
-    if not isinstance(sensor, s.InertialUnit):  # its noise is that of its parts
-        assert not same(first, replace(sensor, name="other").sample(FLIGHT, seed=3))
-    late = replace(sensor, latency=0.02, jitter=0.001).record(FLIGHT, seed=3)  # draws its latency apart
-    rows = np.searchsorted(first.time, late.stamp)
-    assert same(late.series, first[rows])
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_seed_repeats_and_the_name_chooses_the_draws(name: str) -> None:
+    wrong: dict[str, Any] = {
+        f"{name}__{part}": 0.1 for part in SENSORS[name] if part.endswith(("noise", "bias", "walk"))
+    }
+    wrong = wrong or {
+        f"{part}__{what}": 0.1 for part in ("gyro", "accelerometer") for what in ("noise", "bias", "walk")
+    }
+    common: dict[str, Any] = {"world": "hover", "noisy": True, "duration": 2, **wrong}
+    first = fly(name, seed=3, **common).streams[name]
+    assert first.name == name
+    assert same(first, fly(name, seed=3, **common).streams[name])
+    assert not same(first, fly(name, seed=4, **common).streams[name])
+    # one that trembles draws its latency apart
+    trembling: dict[str, Any] = {f"{name}__latency": 0.02, f"{name}__jitter": 0.001}
+    late = fly(name, seed=3, **common, **trembling)
+    rows = np.searchsorted(first.time, late.info["stamps"][name])
+    assert same(late.streams[name], first[rows])
+    pairs = {"gps": "gps2", "attitude": "magnetic_attitude"}
+    if name in pairs:
+        twin = pairs[name]
+        more: dict[str, Any] = {f"{twin}__rate": SENSORS[name]["rate"], f"{twin}__noise": 0.1}
+        both = fly(f"{name},{twin}", seed=3, **common, **more)
+        assert same(first, both.streams[name])
+        assert not same(first, both.streams[twin])
 
 
-def test_a_short_recording_is_the_beginning_of_a_long_one():
-    sensor = s.Gyroscope(noise=s.Noise(density=0.01, bias=0.1, walk=0.01))
-    long, short = sensor.sample(FLIGHT, seed=1), sensor.sample(FLIGHT, seed=1, until="5s")
+def test_a_short_recording_is_the_beginning_of_a_long_one() -> None:
+    wrong: dict[str, Any] = {"gyro__noise": 0.01, "gyro__bias": 0.1, "gyro__walk": 0.01}
+    long, short = (fly("gyro", duration=until, **wrong).streams["gyro"] for until in (20, 5))
     assert len(short) == 1001
     assert same(short, long[:1001])
 
 
-def test_white_noise_bias_and_walk_are_what_they_say():
-    noise = s.Noise(density=0.02, deviation=0.1)
-    white = s.Gyroscope(noise=noise).sample(LONG, seed=1).rate
-    np.testing.assert_allclose(white.std(0), math.sqrt(0.02**2 * 200.0 + 0.01), rtol=0.02)
+def test_white_noise_bias_and_walk_are_what_they_say() -> None:
+    still: dict[str, Any] = {"world": "hover", "duration": 500, "seed": 1}
+    white = one("gyro", gyro__noise=0.02, **still)[0]["rate"]
+    np.testing.assert_allclose(white.std(0), 0.02 * math.sqrt(200.0), rtol=0.02)
     assert np.abs(white.mean(0)).max() < 5 * white.std() / math.sqrt(len(white))
     whiteness = [np.corrcoef(white[1:, i], white[:-1, i])[0, 1] for i in range(3)]
     assert np.abs(whiteness).max() < 0.02
-    halved = s.Gyroscope(noise=replace(noise, deviation=0.0), rate=50.0).sample(LONG, seed=1).rate
-    np.testing.assert_allclose(halved.std(), 0.02 * math.sqrt(50.0), rtol=0.02)
-    walk = s.PositionSensor(noise=s.Noise(walk=0.3)).sample(LONG, seed=2).position
+    slow = one("gyro", gyro__noise=0.02, gyro__rate=50, **still)[0]["rate"]
+    np.testing.assert_allclose(slow.std(), 0.02 * math.sqrt(50.0), rtol=0.02)
+    walk = one("position", position__walk=0.3, position__rate=10, **still)[0]["position"]
     np.testing.assert_allclose(np.diff(walk, axis=0).std(), 0.3 * math.sqrt(0.1), rtol=0.03)
-    starts = [
-        s.PositionSensor(noise=s.Noise(bias=0.5)).sample(Hover(), seed=k).position[0] for k in range(300)
-    ]
+    short: dict[str, Any] = {"world": "hover", "duration": 0.1, "position__bias": 0.5}
+    starts = [one("position", seed=k, **short)[0]["position"][0] - [0.0, 0.0, 1.0] for k in range(300)]
     np.testing.assert_allclose(np.std(starts, axis=0), 0.5, rtol=0.15)
-    assert s.Noise.variance(0.25).deviation == 0.5
+    assert np.abs(np.mean(starts, axis=0)).max() < 4 * 0.5 / math.sqrt(300)
 
 
-def test_attitude_noise_turns_the_body():
-    read = s.AttitudeSensor(rate=50.0, noise=s.Noise(deviation=0.1)).sample(RoundTrip(duration=300.0), seed=1)
-    truth = RoundTrip(duration=300.0).at(read.time / 1e9).attitude
-    error = g.to_rotation_vector(g.multiply(g.conjugate(truth, xp=np), read.attitude, xp=np), xp=np)
+def test_attitude_noise_turns_the_body() -> None:
+    read, truth = one("attitude", world="roundtrip", duration=300, attitude__rate=50, attitude__noise=0.1)
+    error = g.to_rotation_vector(
+        g.multiply(g.conjugate(truth.attitude, xp=np), read["attitude"], xp=np), xp=np
+    )
     np.testing.assert_allclose(error.std(0), 0.1, rtol=0.03)
-    np.testing.assert_allclose(np.linalg.norm(read.attitude, axis=-1), 1.0)
+    np.testing.assert_allclose(np.linalg.norm(read["attitude"], axis=-1), 1.0)
 
 
-def test_an_inertial_unit_tells_its_densities():
-    thesis = s.InertialUnit(
-        gyro=s.Noise.variance(0.1, walk=1e-3), accelerometer=s.Noise(density=0.02, walk=1e-2)
-    ).densities
-    expected = ImuNoise.per_sample(200.0, gyro=0.1, accelerometer=0.08)
-    assert thesis.gyro == pytest.approx(expected.gyro)
-    assert thesis.accelerometer == pytest.approx(expected.accelerometer)
-    assert (thesis.gyro_bias, thesis.accelerometer_bias) == (1e-3, 1e-2)
+def test_an_inertial_unit_tells_its_densities() -> None:
+    given: dict[str, Any] = {
+        "gyro__noise": 0.02,
+        "gyro__walk": 1e-3,
+        "accelerometer__noise": 0.03,
+        "accelerometer__walk": 1e-2,
+    }
+    assert fly("imu", duration=0.1, **given).info["imu_noise"] == ImuNoise(0.02, 0.03, 1e-3, 1e-2)
 
 
-def test_antenna_is_where_the_lever_puts_it():
+@pytest.mark.parametrize("turn", [False, True])
+def test_readings_over_a_time_are_means_of_looks_and_turns(turn: bool) -> None:
+    """Against the motion at the looks; before it begins the world stands still."""
+    over: dict[str, Any] = {
+        "gyro__turn": float(turn),
+        "gyro__oversample": 4,
+        "coordinate_acceleration__oversample": 4,
+    }
+    sensors = "gyro,coordinate_acceleration,accelerometer"
+    flight = fly(sensors, accelerometer__oversample=4, **over)
+    time = flight.streams["gyro"].time
+    ago = (np.arange(4)[::-1] + 0.5) / 4 * 5e6
+    looks = motion_at(flight, np.maximum(time[:, None] - ago, 0.0).ravel())
+    mean = lambda x: x.reshape(-1, 4, 3).mean(1)
+    now, before = motion_at(flight, time), motion_at(flight, np.maximum(time - 5_000_000, 0))
+    turned = g.to_rotation_vector(g.multiply(g.conjugate(before.attitude, xp=np), now.attitude, xp=np), xp=np)
+    rate = turned / 0.005 if turn else mean(looks.rate)
+    np.testing.assert_allclose(flight.streams["gyro"]["rate"], rate, atol=1e-9)
+    np.testing.assert_allclose(
+        flight.streams["accelerometer"]["force"], mean(looks.specific_force), atol=1e-9
+    )
+    seen = flight.streams["coordinate_acceleration"]["acceleration"]
+    np.testing.assert_allclose(seen, mean(looks.coordinate_acceleration), atol=1e-9)
+
+
+def test_antenna_is_where_the_lever_puts_it() -> None:
     lever = (0.1, -0.2, 0.3)
-    read = s.Gps(rate=10.0, lever=lever).sample(FLIGHT)
-    motion = FLIGHT.at(read.time / 1e9)
+    arm: dict[str, Any] = {f"gps__lever_{axis}": value for axis, value in zip("xyz", lever, strict=True)}
+    read, motion = one("gps", gps__rate=10, **arm)
+    apart = read["position"] - motion.position
     np.testing.assert_allclose(
-        read.position - motion.position, g.rotate(motion.attitude, np.tile(lever, (len(motion), 1)), xp=np)
+        apart, g.rotate(motion.attitude, np.tile(lever, (len(motion), 1)), xp=np), atol=1e-12
     )
-    np.testing.assert_allclose(
-        np.linalg.norm(read.position - motion.position, axis=-1), np.linalg.norm(lever)
-    )
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=-1), np.linalg.norm(lever))
 
 
 degrees = lambda most: st.floats(-most, most).map(math.radians)
@@ -178,98 +219,145 @@ def test_geodetic_known_places():
     np.testing.assert_allclose(up, [0.0, 0.0, 5.0], atol=1e-8)
 
 
-def test_gps_as_a_receiver_gives_it():
-    read, origin = s.Gps(noise=s.Noise(deviation=1.0)).sample(FLIGHT), (0.8, 0.1, 400.0)
-    geodetic = s.as_geodetic(read, origin)
-    assert np.abs(geodetic.height - 400.0).max() < 10.0
-    np.testing.assert_allclose(s.as_position(geodetic, origin).position, read.position, atol=1e-6)
-    assert (geodetic.time == read.time).all()
+def test_gps_as_a_receiver_gives_it() -> None:
+    read, origin = one("gps", gps__noise=1.0)[0], (0.8, 0.1, 400.0)
+    earth: dict[str, Any] = {
+        "gps__latitude": 0.8,
+        "gps__longitude": 0.1,
+        "gps__height": 400.0,
+        "gps__geodetic": 1,
+    }
+    geodetic = one("gps", gps__noise=1.0, **earth)[0]
+    assert np.abs(geodetic["height"] - 400.0).max() < 10.0
+    np.testing.assert_allclose(s.as_position(geodetic, origin)["position"], read["position"], atol=1e-6)
+    for leaf, values in s.as_geodetic(read, origin).leaves.items():
+        np.testing.assert_allclose(geodetic[leaf], values, rtol=1e-12)
 
 
-def test_magnetometer_reads_the_field_in_the_body():
-    sensor = s.Magnetometer(declination=0.3, dip=1.0, strength=50e-6)
-    read = sensor.sample(FLIGHT)
+def test_magnetometer_reads_the_field_in_the_body() -> None:
+    given: dict[str, Any] = {
+        "magnetometer__declination": 0.3,
+        "magnetometer__dip": 1.0,
+        "magnetometer__strength": 50e-6,
+    }
+    read, motion = one("magnetometer", **given)
     field = s.earth_field(0.3, 1.0, 50e-6)
-    world = g.rotate(FLIGHT.at(read.time / 1e9).attitude, read.field, xp=np)
+    world = g.rotate(motion.attitude, read["field"], xp=np)
     np.testing.assert_allclose(world, np.tile(field, (len(world), 1)), atol=1e-18)
     assert math.atan2(field[0], field[1]) == pytest.approx(0.3)  # east of north
     assert math.asin(-field[2] / 50e-6) == pytest.approx(1.0)  # below the horizon
 
 
-def test_altimeter_sees_the_ground_along_the_body():
-    read = s.Altimeter().sample(FLIGHT)
-    motion = FLIGHT.at(read.time / 1e9)
-    foot = motion.position - g.rotate(motion.attitude, read.distance[:, None] * [0.0, 0.0, 1.0], xp=np)
+def test_altimeter_sees_the_ground_along_the_body() -> None:
+    read, motion = one("altimeter")
+    foot = motion.position - g.rotate(motion.attitude, read["distance"][:, None] * [0.0, 0.0, 1.0], xp=np)
     np.testing.assert_allclose(foot[:, 2], 0.0, atol=1e-9)
-    np.testing.assert_allclose(read.distance, motion.position[:, 2] / motion.rotation[:, 2, 2], atol=1e-9)
+    np.testing.assert_allclose(read["distance"], motion.position[:, 2] / motion.rotation[:, 2, 2], atol=1e-9)
 
 
-def test_altimeter_is_silent_when_tilted_too_far_and_that_moves_no_draws():
-    world = RoundTrip(angle=2.0)
-    sensor = s.Altimeter(noise=s.Noise(deviation=0.1))
-    read = sensor.sample(world)
-    tilt = world.at(np.arange(1001) / 50.0).tilt
+def test_altimeter_is_silent_when_tilted_too_far_and_that_moves_no_draws() -> None:
+    given: dict[str, Any] = {"world": "roundtrip", "angle": 2, "altimeter__noise": 0.1, "altimeter__rate": 50}
+    flight = fly("altimeter", **given)
+    read = flight.streams["altimeter"]
+    tilt = motion_at(flight, np.arange(1001) * 20_000_000).tilt
     assert len(read) == (tilt <= math.radians(75.0)).sum() < 1001
-    assert np.isfinite(read.distance).all()
-    wide = replace(sensor, most_tilt=math.pi).sample(world)
+    assert np.isfinite(read["distance"]).all()
+    wide = fly("altimeter", altimeter__most_tilt=math.pi, **given).streams["altimeter"]
     shared = np.searchsorted(wide.time, read.time)
     assert same(read, wide[shared])
     assert len(wide) == (tilt < math.radians(89.9)).sum()
 
 
-@pytest.mark.parametrize("world", [FLIGHT, RoundTrip()], ids=["flight", "turning"])
-def test_optical_flow_composes_to_the_pose(world):
-    read = s.OpticalFlowSensor().sample(world)
-    start = world.at(0.0)
+@pytest.mark.parametrize("world", ["thesis", "roundtrip"])
+def test_optical_flow_composes_to_the_pose(world: str) -> None:
+    flight = fly("optical_flow", world=world)
+    read = flight.streams["optical_flow"]
+    start, end = (motion_at(flight, np.array([t])) for t in (0, read.time[-1]))
     p, q = start.position[0], start.attitude[0]
     for step in read:
         p = p + g.rotate(q, step.displacement, xp=np)
         q = g.multiply(q, step.turn, xp=np)
-    end = world.at(read.time[-1:] / 1e9)
     np.testing.assert_allclose(p, end.position[0], atol=1e-9)
     np.testing.assert_allclose(q, end.attitude[0], atol=1e-9)
     assert read.time[0] == 50_000_000  # the first picture has none before it
-    np.testing.assert_array_equal(read.interval, 0.05)
+    np.testing.assert_allclose(read["interval"], 0.05, rtol=1e-12)
 
 
-def test_fixed_latency_moves_arrival_and_keeps_the_stamp():
-    sensor = s.PositionSensor(rate=10.0, phase=0.03, latency=0.25)
-    late = sensor.record(FLIGHT)
-    assert late.stamp[0] == 30_000_000
-    assert (late.series.time - late.stamp == 250_000_000).all()
-    np.testing.assert_array_equal(late.series.position, FLIGHT.at(late.stamp / 1e9).position)
-    assert late.series.time[-1] <= 20_000_000_000  # what comes later is not in the recording
-    assert len(late.stamp) == 198
-    assert timing_of(late.series).period == 100_000_000
+def test_fixed_latency_moves_arrival_and_keeps_the_stamp() -> None:
+    flight = fly("position", position__rate=10, position__phase=0.03, position__latency=0.25)
+    late, stamp = flight.streams["position"], flight.info["stamps"]["position"]
+    assert stamp[0] == 30_000_000
+    assert (late.time - stamp == 250_000_000).all()
+    np.testing.assert_allclose(late["position"], motion_at(flight, stamp).position, atol=1e-12)
+    assert late.time[-1] <= 20_000_000_000  # what comes later is not in the recording
+    assert len(stamp) == 198
+    assert timing_of(late).period == 100_000_000
 
 
-def test_gaussian_latency_arrives_in_order_of_arrival():
-    sensor = s.PositionSensor(rate=100.0, latency=0.05, jitter=0.02)
-    late = sensor.record(LONG, seed=2)
-    assert (np.diff(late.series.time) > 0).all()
-    delay = (late.series.time - late.stamp) * 1e-9
+def test_a_late_inertial_unit_reads_what_was() -> None:
+    late = fly("imu", imu__latency=0.03, imu__oversample=5, gyro__noise=0.0)
+    fresh = fly("imu", imu__oversample=5)
+    a, b = late.streams["imu"], fresh.streams["imu"]
+    rows = np.searchsorted(b.time, late.info["stamps"]["imu"])
+    np.testing.assert_allclose(a["gyro"], b["gyro"][rows], atol=1e-9)
+    np.testing.assert_allclose(a["specific_force"], b["specific_force"][rows], atol=1e-9)
+
+
+def test_gaussian_latency_arrives_in_order_of_arrival() -> None:
+    trembles: dict[str, Any] = {"position__latency": 0.05, "position__jitter": 0.02, "position__rate": 100}
+    flight = fly("position", world="hover", duration=500, **trembles)
+    late, stamp = flight.streams["position"], flight.info["stamps"]["position"]
+    assert (np.diff(late.time) > 0).all()
+    delay = (late.time - stamp) * 1e-9
     assert delay.min() >= 0.0
     np.testing.assert_allclose([delay.mean(), delay.std()], [0.05, 0.02], rtol=0.05)
-    assert (np.diff(late.stamp) < 0).any()  # one overtakes another
-    assert len(set(late.stamp.tolist())) == len(late.stamp)
+    assert (np.diff(stamp) < 0).any()  # one overtakes another
+    assert len(set(stamp.tolist())) == len(stamp)
+    assert flight.experiment is None, "when its readings arrive no graph can draw"
 
 
-def test_arrivals_at_one_time_are_set_apart():
-    crowd = s.PositionSensor(rate=1e9, latency=1e-9, jitter=5e-9).record(LONG, until=300)
-    assert (np.diff(crowd.series.time) > 0).all()
+def test_arrivals_at_one_time_are_set_apart() -> None:
+    trembles: dict[str, Any] = {"position__latency": 1e-9, "position__jitter": 5e-9, "position__rate": 1e9}
+    crowd = fly("position", world="hover", duration=3e-7, **trembles).streams["position"]
+    assert len(crowd) > 200
+    assert (np.diff(crowd.time) > 0).all()
 
 
-@pytest.mark.parametrize("bad", [{"rate": 0.0}, {"latency": -1.0}, {"jitter": math.nan}, {"phase": -0.1}])
-def test_a_clock_that_cannot_be_is_refused(bad):
-    with pytest.raises(DeclarationError, match="this sensor has no such clock") as caught:
-        s.Vicon(**bad)
-    assert "vicon" in str(caught.value)
+def test_a_sensor_that_starts_after_the_end_reads_nothing() -> None:
+    flight = fly("vicon,imu", world="hover", duration=1, vicon__phase=5)
+    assert len(flight.streams["vicon"]) == 0
+    assert len(flight.streams["imu"]) == 201
 
 
-def test_negative_noise_is_refused():
-    with pytest.raises(DeclarationError, match="noise cannot be negative"):
-        s.Noise(density=-1.0)
+EVERYTHING: dict[str, Any] = {
+    "gyro__bias": 0.1, "gyro__walk": 0.01, "accelerometer__walk": 0.1, "vicon__latency": 0.0375,
+    "vicon__attitude_bias": 0.1, "gps__walk": 0.1, "gps2__geodetic": 1, "altimeter__bias": 0.1,
+    "magnetometer__bias": 1e-6, "optical_flow__walk": 0.1, "imu__oversample": 3, "body_rate__turn": 1,
+    "thrust__phase": 0.01, "duration": 1.5,
+}  # fmt: skip
 
 
-def test_a_sensor_that_starts_after_the_end_reads_nothing():
-    assert len(s.Vicon(phase=5.0).sample(Hover(), until="1s")) == 0
+@pytest.mark.parametrize("engine", ["numpy", "python", "c", pytest.param("xla", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("world", ["hover", "roundtrip", "thesis"])
+def test_a_flight_in_a_graph_is_what_was_recorded(world: str, engine: str) -> None:
+    more: dict[str, Any] = {"hover": {"drift": 0.2}, "roundtrip": {"rest": 0.1, "trip": 0.6}, "thesis": {}}[
+        world
+    ]
+    flight = fly(",".join(SENSORS), world=world, seed=7, noisy=True, **EVERYTHING, **more)
+    made_by = flight.experiment
+    assert made_by is not None
+    inputs = {**made_by.ticks, **made_by.given(7)}
+    if engine == "xla":
+        pytest.importorskip("jax")
+    sizes = {"n": made_by.settings["world"].numbers}
+    built = sensed.build(**clocks_of(inputs), **made_by.settings, sizes=sizes)
+    found = simulate(built, inputs, engine=engine, seed=7)
+    for name, series in {**flight.streams, "truth": flight.truth}.items():
+        assert series is not None
+        np.testing.assert_array_equal(found[name].time, series.time, err_msg=name)
+        for leaf, values in series.leaves.items():
+            if engine == "numpy":
+                np.testing.assert_array_equal(found[name][leaf], values, err_msg=f"{name}.{leaf}")
+            np.testing.assert_allclose(
+                found[name][leaf], values, rtol=1e-9, atol=1e-9, err_msg=f"{name}.{leaf}"
+            )

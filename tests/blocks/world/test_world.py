@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from flowgraph.blocks.flights.worlds import load_world
 from flowgraph.blocks.geometry import rotations as g
 from flowgraph.blocks.inertial import GRAVITY
 from flowgraph.blocks.world import (
@@ -19,16 +20,17 @@ from flowgraph.blocks.world import (
     RoundTrip,
     carried_by_thrust,
     figures,
-    generator,
     join,
     thesis_flight,
 )
 from flowgraph.blocks.world.thesis import ROUNDS, random_key_points
 from flowgraph.errors import DataError, DeclarationError
 
+WAVES = np.random.default_rng(2).uniform(0.6, 3.1, 18)  # rad/s, and as phases rad
+
 WORLDS = {
     "thesis": thesis_flight(0),
-    "hover": Hover(drift=0.3, seed=2),
+    "hover": Hover(drift=0.3).shaped(WAVES),
     "rest": Hover(),
     "roundtrip": RoundTrip(),
 }
@@ -127,7 +129,7 @@ def dense(flight):
 @example(70886)  # the thrust changes by a tenth in two milliseconds
 def test_feasible_is_what_a_dense_check_says(seed):
     """Never feasible where a sample breaks a limit; and feasible where all samples keep well within."""
-    flight = Quadrotor.along(random_key_points(generator(seed, "some")))
+    flight = Quadrotor.along(random_key_points(seed))
     loose, tight = Limits(4.0, 45.0, 60.0), Limits(4.0 * 0.9, 45.0 * 1.1, 60.0 * 1.1, resolution=2e-4)
     motion = dense(flight)
     rate = np.linalg.norm(motion.rate, axis=-1).max()
@@ -164,8 +166,7 @@ def test_thesis_flights_are_feasible_start_at_rest_and_repeat(seed):
 
 
 def test_key_points_are_drawn_as_the_thesis_says():
-    random = generator(0, "many")
-    draws = [random_key_points(random)[:3] for _ in range(2000)]
+    draws = [random_key_points(0, tried=k)[:3] for k in range(2000)]
     parts = lambda points: [
         x for p in points for x in (p.position, p.velocity, p.acceleration) if x is not None
     ]
@@ -174,7 +175,7 @@ def test_key_points_are_drawn_as_the_thesis_says():
     variances = np.repeat([0.6, 0.2, 0.1, 0.6, 0.6, 0.2], 3)
     np.testing.assert_allclose(rounds.mean(0), means, atol=5 * np.sqrt(0.6 / 2000))
     np.testing.assert_allclose(rounds.var(0), variances, rtol=0.15)
-    points = random_key_points(random)
+    points = random_key_points(1)
     assert [p.seconds for p in points] == [1.0, 1.0, 2.0] * ROUNDS
     assert points[1].velocity is None
     assert points[2].acceleration is None
@@ -200,8 +201,7 @@ def test_the_family_is_as_hard_as_its_chapter_says():
 def test_it_is_the_first_feasible_draw(limits, seeds):
     """Draws that are thrown away after a few looks are infeasible ones."""
     for seed in seeds:
-        random = generator(seed, "thesis")
-        draws = (Quadrotor.along(random_key_points(random)) for _ in range(20_000))
+        draws = (Quadrotor.along(random_key_points(seed, tried=k)) for k in range(20_000))
         first = next(flight for flight in draws if flight.feasible(limits))
         found = thesis_flight(seed, limits=limits)
         np.testing.assert_array_equal(found.primitives.coefficients, first.primitives.coefficients)
@@ -227,8 +227,13 @@ def test_hover_is_at_rest_or_drifts_as_much_as_it_says():
     np.testing.assert_array_equal(rest.position, [[1.0, 2.0, 3.0]] * len(rest))
     np.testing.assert_array_equal(rest.rate, 0.0)
     np.testing.assert_allclose(rest.thrust, 9.81)
-    drift = Hover(duration=2000.0, drift=0.2, seed=1).at(np.arange(0.0, 2000.0, 0.5))
+    flight = load_world("hover", seed=1, settings={"duration": 2000, "drift": 0.2, "sensors": "vicon"})
+    drift = flight.info["world"].at(np.arange(0.0, 2000.0, 0.5))
     np.testing.assert_allclose(drift.position.std(0), 0.2, rtol=0.05)
+    speeds = flight.info["world"].waves[:9] / (2.0 * np.pi)
+    assert 0.1 <= speeds.min() < speeds.max() <= 0.5
+    with pytest.raises(DeclarationError, match="nobody has drawn how this body drifts"):
+        Hover(drift=0.1).at(0.0)
 
 
 def test_times_outside_are_refused():

@@ -10,7 +10,7 @@ from flowgraph.blocks.world import Hover, RoundTrip, World, thesis_flight, world
 from tests.support import both_quick
 
 WORLDS = {
-    "hover": Hover(2.0, drift=0.3, seed=2),
+    "hover": Hover(2.0, drift=0.3).shaped(np.linspace(0.6, 3.1, 18)),
     "round trip": RoundTrip(2.0, trip=0.4, rest=0.1),
     "thesis": thesis_flight(3),
 }
@@ -35,6 +35,9 @@ def test_a_world_at_a_tick_is_that_of_all_times(name: str) -> None:
 
 
 def test_a_world_stands_at_its_end() -> None:
-    found = simulate(moving.build(world=Hover(1.0, drift=0.2)), {"clock": ticks("1s", until="4s")}).output
+    found = simulate(
+        moving.build(world=Hover(1.0, drift=0.2).shaped(np.linspace(0.6, 3.1, 18))),
+        {"clock": ticks("1s", until="4s")},
+    ).output
     assert (found["position"][2:] == found["position"][1]).all()
     assert (found["position"][0] != found["position"][1]).any()
