@@ -2,7 +2,8 @@
 
 A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included, but for
 those of registers and of what is added up in them, which may be wider: what is held gathers the rounding of
-many ticks, and an adder costs less than a multiplier. The fraction f is chosen for each element from the
+many ticks, and an adder costs less than a multiplier. A product takes no more than the upper 32 bits of one.
+The fraction f is chosen for each element from the
 largest size that the element takes, since the entries of one covariance differ by many powers of ten.
 Elements along an axis of particles share one. Values that are only moved (an element, a row, a transpose)
 keep the formats that they had.
@@ -21,6 +22,9 @@ from flowgraph.errors import DeclarationError
 
 NARROWEST, WIDEST = 8, 32
 """Bits of a word: two of the widest, multiplied, fit 64."""
+
+WIDEST_HELD = 48
+"""Bits of a word that is held: it is added and compared as it is, and multiplied by its upper `WIDEST`."""
 
 FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
@@ -46,6 +50,7 @@ class Formats:
         structure: a digest of the plain pipeline that they are for; empty where nobody asks.
         held: the inputs, registers and values that are kept in wider words.
         held_width: bits of those; 0 where there are none.
+        proven: the values whose size is proven; that of the others was seen on flights.
 
     Raises:
         DeclarationError: for a width that no word has.
@@ -58,17 +63,21 @@ class Formats:
     structure: str = ""
     held: frozenset[int] = frozenset()
     held_width: int = 0
+    proven: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         wide = self.held_width or self.width
-        for name, width, least in (("width", self.width, NARROWEST), ("held_width", wide, self.width)):
-            if not least <= width <= WIDEST:
+        for name, width, least, most in (
+            ("width", self.width, NARROWEST, WIDEST),
+            ("held_width", wide, self.width, WIDEST_HELD),
+        ):
+            if not least <= width <= most:
                 raise DeclarationError(
                     "no word has this width",
                     path=name,
-                    expected=f"{least} to {WIDEST} bits",
+                    expected=f"{least} to {most} bits",
                     got=str(width),
-                    fix=f"choose {WIDEST} or fewer: products of two words are kept in 64 bits",
+                    fix=f"choose {most} or fewer: products of two words of {WIDEST} bits are kept in 64",
                 )
 
     def width_of(self, value: int) -> int:
@@ -84,6 +93,7 @@ class Formats:
             "margin": self.margin,
             "absent": sorted(self.absent),
             "structure": self.structure,
+            **({"proven": sorted(self.proven)} if self.proven else {}),
             **({"held": {"width": self.held_width, "values": sorted(self.held)}} if self.held else {}),
             "fractions": [
                 {"value": n, "fraction": np.asarray(f).tolist()} for n, f in sorted(self.fractions.items())
@@ -115,6 +125,7 @@ class Formats:
             str(data["structure"]),
             frozenset(map(int, held["values"])),
             int(held["width"]),
+            frozenset(map(int, data.get("proven", ()))),
         )
 
 

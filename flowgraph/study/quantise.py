@@ -78,7 +78,8 @@ class Quantised:
     pipeline: Pipeline
 
     def values(self) -> list[dict[str, Any]]:
-        """For a person: each value with its line, bits, and the fractions of its elements."""
+        """For a person: each value with its line, bits, the fractions of its elements, and whether its size
+        is proven or was observed."""
         names = names_of(self.pipeline)
         return [
             {
@@ -86,6 +87,7 @@ class Quantised:
                 "name": names.get(n, f"v{n}"),
                 "bits": self.formats.width_of(n),
                 "fraction": [int(np.min(f)), int(np.max(f))],
+                "bound": "proven" if n in self.formats.proven else "observed",
             }
             for n, f in sorted(self.formats.fractions.items())
         ]
@@ -129,6 +131,15 @@ def quantise(
             expected="one flight at least of each",
             got=f"{len(flights)} and {len(held_out)} held out",
             fix="write --seeds 4 --held-out-seeds 3",
+        )
+    Formats(width, {}, held_width=held_width)  # refuses words that there are not
+    if not NARROWEST <= least <= width:
+        raise DeclarationError(
+            "no width can be tried",
+            path="--least",
+            expected=f"{NARROWEST} to {width} bits",
+            got=str(least),
+            fix="ask for fewer bits at least, or for more at most (--width)",
         )
     search = _Search(flights, held_out, margin, say, held_width)
     tried: list[Mapping[str, Any]] = []
@@ -187,11 +198,18 @@ class _Search:
             self.sizes.play(one.pipeline, one.tape, one.start.cells, one.seed)
 
     def at(self, bits: int) -> tuple[Formats, dict[str, Any]]:
-        """Formats of so many bits, and their figures on the flights that were held out."""
+        """Formats of so many bits, and their figures on the flights that were held out.
+
+        Each width begins with the sizes in floating point: what another had to widen says nothing of it.
+        """
+        self.sizes.forget()
+        self._more.clear()
         formats, player = self._settled(bits)
         figures = self._judge(formats, player)
         if figures["saturations"] and not self._joined:
             self._join(bits)
+            self.sizes.forget()
+            self._more.clear()
             formats, player = self._settled(bits)
             figures = self._judge(formats, player)
         for _ in range(_ROUNDS):
@@ -235,16 +253,22 @@ class _Search:
         return self._widen(counts, where, bits)
 
     def _widen(self, counts: Counts, where: str, bits: int) -> bool:
-        """Widen the formats of what saturated; tells whether anything did."""
-        for value, marks in counts.cut.items():
+        """Widen the formats of what saturated; tells whether anything was, and whether that may help.
+
+        A quotient by zero fits no word, nor does a filter that has gone astray: what was widened by all of
+        `_WIDEST` and saturates again always will.
+        """
+        cut = {n: marks for n, marks in counts.cut.items() if n not in counts.divisions_by_zero}
+        if not cut or any(self._more.get(n) == _WIDEST for n in cut):
+            return False
+        for value, marks in cut.items():
             more = self._more[value] = min(2 * self._more.get(value, _WIDER // 2), _WIDEST)
             self.sizes.widen(value, marks, 2.0**more)
-        if counts.cut:
-            names = names_of(self.pipeline)
-            some = ", ".join(names[v] for v in list(counts.cut)[:3])
-            self.notes.append(f"{len(counts.cut)} values widened at {bits} bits, after {where}: {some}")
-            self._say(self.notes[-1])
-        return bool(counts.cut)
+        names = names_of(self.pipeline)
+        some = ", ".join(names[v] for v in list(cut)[:3])
+        self.notes.append(f"{len(cut)} values widened at {bits} bits, after {where}: {some}")
+        self._say(self.notes[-1])
+        return True
 
     def _judge(self, formats: Formats, player: _Fleet) -> dict[str, Any]:
         self._worst = Counts()

@@ -6,6 +6,7 @@ many bits. No arithmetic in words that keeps its state in one word each can do b
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ from flowgraph.engines.reference import Interpreter
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.pipeline.formats import fraction_for
 from flowgraph.pipeline.pipeline import Pipeline
+from flowgraph.pipeline.program import Program
 from flowgraph.recorder.random import seed_words
 
-__all__ = ["registers"]
+__all__ = ["numbers", "played", "registers", "rounded"]
 
 MARGIN = 2.0
 """The sizes that occurred times this fit a word."""
@@ -48,14 +50,14 @@ def registers(
         DeclarationError: for a setting out of range.
     """
     rows: list[dict[str, Any]] = []
-    for n in _numbers(particles, "particles"):
+    for n in numbers(particles, "registers.particles"):
         flight = load_flight("sim", seed=seed, settings={"duration": str(duration)})
         case = find_graph("rbpf_indoor").case(flight, particles=n, seed=seed)
         subject = LoweredGraph(case.graph)
         start = subject.start(RunOptions(seed=seed))
         given = (subject.pipeline, subject.tape(case.inputs, start.last), start.cells, seed_words(seed))
         decided, sizes = _played(*given, None)
-        for width in _numbers(bits, "bits"):
+        for width in numbers(bits, "registers.bits"):
             fractions = [None if s is None else fraction_for(MARGIN * s, width) for s in sizes]
             found, _ = _played(*given, fractions)
             differs = [
@@ -69,15 +71,20 @@ def registers(
     return Report(rows, {}, (note,))
 
 
-def _numbers(text: str, name: str) -> list[int]:
+def numbers(text: str, name: str) -> list[int]:
+    """Whole numbers of a setting, between commas.
+
+    Raises:
+        DeclarationError: where they are none.
+    """
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if not parts or not all(part.isdigit() and int(part) for part in parts):
         raise DeclarationError(
             "these are no whole numbers",
-            path=f"registers.{name}",
+            path=name,
             expected="numbers from 1 on, between commas",
             got=repr(text),
-            fix=f"write --set {name}=10,100",
+            fix=f"write --set {name.split('.')[-1]}=10,100",
         )
     return [int(part) for part in parts]
 
@@ -87,30 +94,50 @@ def _played(
 ) -> tuple[list[np.ndarray], list[Any]]:
     """The decisions of each event, and the largest that each real register was; particles are taken
     together."""
-    player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
     kept = [c for r in pipeline.registers for c in r.cells]
-    rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
     out = next(k for k, port in enumerate(pipeline.outputs) if port.name == "ancestors")
     decided: list[np.ndarray] = []
     sizes: list[Any] = [None] * len(kept)
-    for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
-        values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
-        program, env = player.values(time, key, values)
-        player.cells = [env[n] for n in program.writes]
-        for k, (cell, x) in enumerate(zip(kept, player.cells, strict=True)):
-            if cell.dtype != "real":
-                continue
-            if fractions is not None:
-                player.cells[k] = _rounded(x, fractions[k])
-                continue
-            alike = tuple(a for a, name in enumerate(cell.axes) if name == "particles")
-            size = np.abs(x).max(axis=alike, keepdims=True) if alike else np.abs(x)
-            sizes[k] = size if sizes[k] is None else np.maximum(sizes[k], size)
+
+    def keep(k: int, x: Any) -> Any:
+        if fractions is not None:
+            return rounded(x, fractions[k])
+        alike = tuple(a for a, name in enumerate(kept[k].axes) if name == "particles")
+        size = np.abs(x).max(axis=alike, keepdims=True) if alike else np.abs(x)
+        sizes[k] = size if sizes[k] is None else np.maximum(sizes[k], size)
+        return x
+
+    for program, env in played(pipeline, tape, cells, seed, keep):
         flag, leaves = program.outputs[out]
         if flag is not None and env.get(flag, True):
             decided.append(np.concatenate([np.ravel(env[n]).astype(np.int64) for n in leaves]))
     return decided, sizes
 
 
-def _rounded(x: Any, fraction: np.ndarray) -> Any:
+def played(
+    pipeline: Pipeline,
+    tape: Tape,
+    cells: list[Any],
+    seed: np.ndarray,
+    keep: Callable[[int, Any], Any],
+) -> Iterator[tuple[Program, dict[int, Any]]]:
+    """Play a flight in float64: after each tick its program and values.
+
+    Args:
+        pipeline, tape, cells, seed: the flight.
+        keep: given the place of a real register cell and its value, what the next tick reads of it.
+    """
+    player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
+    real = [c.dtype == "real" for r in pipeline.registers for c in r.cells]
+    rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
+    for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
+        values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
+        program, env = player.values(time, key, values)
+        written = (env[n] for n in program.writes)
+        player.cells = [keep(k, x) if real[k] else x for k, x in enumerate(written)]
+        yield program, env
+
+
+def rounded(x: Any, fraction: np.ndarray) -> Any:
+    """Reals rounded to multiples of 2^-fraction."""
     return np.ldexp(np.floor(np.ldexp(x, fraction.astype(int)) + 0.5), -fraction.astype(int))

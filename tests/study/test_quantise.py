@@ -73,6 +73,9 @@ def test_the_narrowest_words_that_keep_the_bound():
     assert differences(real, ours.series, "y")[RELATIVE] == found.figures[RELATIVE]
     named = {row["value"]: row["name"] for row in found.values()}
     assert any("test_quantise" in name for name in named.values())
+    bound = {row["name"].split()[1].rstrip(","): row["bound"] for row in found.values()}
+    assert bound["sin"] == bound["cos"] == "proven"
+    assert bound["input"] == "observed"
 
 
 def test_decisions_that_differ_are_counted():
@@ -86,6 +89,37 @@ def test_a_flight_elsewhere_widens_what_saturates_and_says_so():
     found = quantise([flown(0)], [flown(1, scale=3.0)], width=24, least=24, bounds={RELATIVE: 1e-2})
     assert found.figures["saturations"] == 0
     assert any("flights held out" in note and "input x" in note for note in found.notes)
+
+
+def test_a_width_is_judged_by_itself_whatever_was_tried_before():
+    flights, judge = [flown(0), flown(1)], [flown(2, scale=1.5)]
+    searched = quantise(flights, judge, width=28, bounds={RELATIVE: 1e-4})
+    alone = quantise(
+        flights, judge, width=searched.formats.width, least=searched.formats.width, bounds={RELATIVE: 1e-4}
+    )
+    assert alone.figures == searched.figures
+    assert alone.formats.to_json() == searched.formats.to_json()
+
+
+@block
+def over(x: Scalar, *, xp) -> Scalar:
+    """A quotient by what words of few bits make zero."""
+    return 1.0 / (x * x * x)
+
+
+@graph
+def quotients(x: Stream[Scalar]):
+    """One block."""
+    return {"y": over(x)}
+
+
+def test_a_quotient_by_zero_is_not_widened_in_vain():
+    x = np.where(np.arange(50) == 7, 1e-4, 3.0)
+    flight = Flown(quotients.build(), {"x": (np.arange(50, dtype=np.int64) * MS, x)}, "y")
+    said: list[str] = []
+    with pytest.raises(LoweringError, match="(?s)cannot be trusted at 24 bits.*divide"):
+        quantise([flight], [flight], width=24, bounds={DECISIONS: 0}, say=said.append)
+    assert not any("widened" in words for words in said)
 
 
 @block
@@ -162,6 +196,11 @@ def test_what_is_asked_wrongly():
         quantise([flown(0)], [flown(1)], bounds={"error": 1.0})
     with pytest.raises(DeclarationError, match="found on some flights and judged on others"):
         quantise([flown(0)], [], bounds={RELATIVE: 1.0})
+    with pytest.raises(DeclarationError, match="(?s)no width can be tried.*8 to 20 bits.*24"):
+        quantise([flown(0)], [flown(1)], width=20, least=24, bounds={RELATIVE: 1.0})
+    for wrong in ({"width": 4}, {"width": 64}, {"width": 24, "held_width": 20}, {"held_width": 64}):
+        with pytest.raises(DeclarationError, match="no word has this width"):
+            quantise([flown(0)], [flown(1)], bounds={RELATIVE: 1.0}, **wrong)
 
 
 def test_the_command_writes_what_run_and_lower_read(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -14,12 +14,13 @@ from flowgraph.engines.contract import Outcome, PipelineEngine, Player
 from flowgraph.engines.fixed.absent import Run, keeping_nan, may_be_nan, passing_nan
 from flowgraph.engines.fixed.counts import Counts
 from flowgraph.engines.fixed.rules import bind, to
-from flowgraph.engines.fixed.shifts import MOVES, Site, moved
+from flowgraph.engines.fixed.shifts import MOVES, READ_WHOLE, Site, moved
 from flowgraph.engines.options import Meter
 from flowgraph.errors import DataError, DeclarationError, LoweringError
 from flowgraph.pipeline.formats import (
     FREE,
     NOT_A_NUMBER,
+    WIDEST,
     fraction_of_constant,
     real_numbers,
     whole_numbers,
@@ -27,6 +28,7 @@ from flowgraph.pipeline.formats import (
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, needed_of, specialise
 from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES
 
 LOSE: dict[str, Callable[..., Any]] = {
@@ -45,6 +47,7 @@ class _Step:
     out: int
     real: bool
     op: str
+    drop: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,8 @@ class Integers:
         by_zero: dict[int, Any] = {}
         for step in bound.steps:
             given = [env[a] for a in step.args]
+            if any(step.drop):
+                given = [_upper(x, n) if n else x for x, n in zip(given, step.drop, strict=True)]
             made = step.run(*given)
             if not step.real:
                 env[step.out] = made
@@ -248,18 +253,52 @@ class Integers:
             if real:
                 out = moved(i, given) if i.op in MOVES else self.fraction(i.out, i.spec.shape)
                 fractions[i.out] = np.broadcast_to(out, i.spec.shape)
-            taken = [widths[a] for a in i.args if a in widths]
             if real:
+                taken = [widths[a] for a in i.args if a in widths]
                 widths[i.out] = max(taken) if i.op in MOVES else self.formats.width_of(i.out)
-            run = bind(Site(i, given, out, specs, max(taken, default=width)))
+            site = site_of(i, fractions, widths, specs, width)
+            run = bind(site)
             if any(a in doubtful for a in i.args):
                 run = passing_nan(i, run)
-            steps.append(_Step(run, i.args, i.out, real, i.op))
+            steps.append(_Step(run, i.args, i.out, real, i.op, site.drop))
         writes = tuple(
             _moving(fractions[n], fractions[c.read], specs[n]) if c.dtype == "real" else None
             for c, n in zip(self._cells, program.writes, strict=True)
         )
         return Bound(program, tuple(steps), known, fractions, writes, widths)
+
+
+def site_of(
+    i: Instruction,
+    fractions: Mapping[int, np.ndarray],
+    widths: Mapping[int, int],
+    specs: Mapping[int, Spec],
+    width: int,
+) -> Site:
+    """An instruction with its formats: what multiplies reads the upper bits of words that are wider.
+
+    Args:
+        i: the instruction.
+        fractions, widths: of the real values so far, its result among them.
+        specs: of all values.
+        width: bits of a word that is not held.
+    """
+    taken = [widths[a] for a in i.args if a in widths]
+    whole = i.op in READ_WHOLE
+    drop = [0 if whole else max(widths.get(a, 0) - WIDEST, 0) for a in i.args]
+    given = [
+        f if f is None or not n else np.where(f == FREE, FREE, f - n)
+        for f, n in zip((fractions.get(a) for a in i.args), drop, strict=True)
+    ]
+    most = max(taken, default=width)
+    out = fractions[i.out] if i.spec.dtype == "real" else None
+    return Site(i, given, out, specs, most if whole else min(most, WIDEST), drop)
+
+
+def _upper(x: Any, n: int) -> Any:
+    """Words without their lowest n bits: rounded half upwards, but for what would not fit then."""
+    upper = np.minimum((x + (1 << (n - 1))) >> n, 2 ** (WIDEST - 1) - 1)
+    return np.where(x == NOT_A_NUMBER, NOT_A_NUMBER, upper)
 
 
 def _moving(have: np.ndarray, want: np.ndarray, spec: Spec) -> Run:

@@ -28,6 +28,12 @@ static inline int64_t fx_down(int64_t x, int n) { return x >= 0 ? x >> n : ~(~x 
 static inline int64_t fx_cut(int64_t x, int64_t most) { return x > most ? most : x < -most ? -most : x; }
 static inline int64_t fx_abs(int64_t x) { return x < 0 ? -x : x; }
 
+static inline int64_t fx_upper(int64_t x, int n) {
+  if (x == FX_NAN) return x;
+  x = fx_down(x + ((int64_t)1 << (n - 1)), n);
+  return x > INT32_MAX ? INT32_MAX : x;
+}
+
 static FX_CALL int64_t fx_shift(int64_t x, int64_t by) {
   if (by == 0) return x;
   if (by > 62) return 0;

@@ -15,6 +15,7 @@ import numpy as np
 
 from flowgraph.engines.fixed.absent import may_be_nan
 from flowgraph.engines.fixed.engine import Bound, Integers
+from flowgraph.pipeline.formats import WIDEST
 from flowgraph.pipeline.optimise.memory import plan
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.ops import Spec
@@ -85,10 +86,10 @@ class SharedPlaces:
         self.known: dict[str, list[int]] = {KNOWN: [], KNOWN_SMALL: []}
         self._held: dict[int, Place] = {}
         self._constants: dict[tuple[str, bytes], int] = {}
-        absent = holding_none(player, keys)
+        long = long_held(player, keys)
         for n, spec in held_values(pipeline):
             kept = n if n >= 0 else -1 - n
-            self._held[n] = self._next(self.held, array_of(spec.dtype, kept in absent), spec.shape)
+            self._held[n] = self._next(self.held, array_of(spec.dtype, kept in long), spec.shape)
         self.sizes = dict(self.held)
         self._at: dict[int, Place] = {}
         self.copies: dict[int, Place] = {}
@@ -103,12 +104,8 @@ class SharedPlaces:
         program = bound.program
         found = plan(program, ("reuse",), scalars=True)
         self._view = found.view
-        doubtful = may_be_nan(program.instructions, self._player.formats.absent)
-        wide = {
-            found.place[root_of(found.view, n)[0]]
-            for n in doubtful
-            if root_of(found.view, n)[0] in found.place
-        }
+        roots = {root_of(found.view, n)[0] for n in long_words(self._player, bound)}
+        wide = {found.place[n] for n in roots if n in found.place}
         sizes = dict(self.held)
         buffers = [
             self._next(sizes, array_of(b.dtype, k in wide), (b.size,)) for k, b in enumerate(found.buffers)
@@ -158,14 +155,21 @@ def held_values(pipeline: Pipeline) -> list[tuple[int, Spec]]:
     ]
 
 
-def holding_none(player: Integers, keys: Sequence[int]) -> set[int]:
-    """The inputs and registers that may hold a reading that is not there."""
+def long_held(player: Integers, keys: Sequence[int]) -> set[int]:
+    """The inputs and registers that take 64 bits: they may hold a reading that is not there, or are wide."""
+    wide = {n for n in player.formats.held if player.formats.held_width > WIDEST}
     cells = [c for r in player.pipeline.registers for c in r.cells]
     absent = set(player.formats.absent)
     for program in (player.bind(key).program for key in keys):
         doubtful = may_be_nan(program.instructions, absent)
         absent |= {c.read for c, n in zip(cells, program.writes, strict=True) if n in doubtful}
-    return absent
+    return absent | wide
+
+
+def long_words(player: Integers, bound: Bound) -> set[int]:
+    """The values of a tick that take 64 bits, for one or the other."""
+    doubtful = may_be_nan(bound.program.instructions, player.formats.absent)
+    return doubtful | {n for n, bits in bound.widths.items() if bits > WIDEST}
 
 
 def array_of(dtype: str, wide: bool) -> str:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.tape import Tape
-from flowgraph.engines.fixed.shifts import MOVES, Site, moved
+from flowgraph.engines.fixed.bounds import proven_sizes
+from flowgraph.engines.fixed.shifts import MOVES, READ_WHOLE, Site, moved
 from flowgraph.engines.reference import Interpreter
 from flowgraph.pipeline.format_files import structure_of
-from flowgraph.pipeline.formats import FREE, Formats, fraction_for, fraction_of_constant
+from flowgraph.pipeline.formats import FREE, WIDEST, Formats, fraction_for, fraction_of_constant
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import needed
 from flowgraph.recorder.ops import Spec
@@ -30,6 +31,9 @@ _HELD = 16.0
 
 _MOST = 256.0
 """Errors of a value at most, in units of its last place: a bound that is followed further only grows."""
+
+_ROUNDED = 1.0 / 64.0
+"""The part by which rounding may exceed what is proven of real numbers."""
 
 _ALIKE = frozenset(["particles", "members"])
 """Axes along which elements are alike and share a format; those of a state differ by powers of ten."""
@@ -68,6 +72,9 @@ class Sizes:
         self._waiting: dict[int, list[Any]] = {}
         self._idle: dict[int, list[Any]] = {}
         self._fits: dict[int, np.ndarray] = {}
+        self._wider: dict[int, np.ndarray] = {}
+        self._varying: set[int] = set()
+        self._proven: dict[int, np.ndarray] | None = None
 
     def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
         """Play one flight, and widen the sizes by what occurs in it.
@@ -78,6 +85,10 @@ class Sizes:
             cells: register cells at the start.
             seed: (2,) uint32.
         """
+        self._varying |= {
+            n for n, a in self.pipeline.constants.items() if not np.array_equal(a, pipeline.constants[n])
+        }
+        self._proven = None
         player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
         rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
         for cell, value in zip(self._cells, cells, strict=True):
@@ -135,15 +146,38 @@ class Sizes:
             return found
         return np.asarray(np.where(found > 0.0, found, self.untaken[value]))
 
+    def _bound(self, value: int, seen: np.ndarray) -> np.ndarray:
+        """What no element can exceed, with room for rounding; no bound where one did."""
+        if self._proven is None:
+            self._proven = proven_sizes(self.pipeline, self._varying)
+        size = self._proven.get(value)
+        if size is None:
+            return np.full(seen.shape, np.inf)
+        axes = tuple(a for a, n in enumerate(size.shape) if n in self._shared)
+        most = size.max(axis=axes, keepdims=True, initial=0.0)
+        return np.where((most > 0.0) & (seen <= most), most * (1.0 + _ROUNDED), np.inf)
+
+    def _fitting(self, value: int, seen: np.ndarray, margin: float) -> tuple[np.ndarray, bool]:
+        """The size that a format is for, and whether all of it is proven."""
+        size, bound = margin * _beside_its_diagonal(seen), self._bound(value, seen)
+        asked = margin * self._wider.get(value, np.zeros(()))
+        proven = bool((bound <= size).all()) and not (asked > bound).any()
+        return np.maximum(np.minimum(size, bound), asked), proven
+
     def widen(self, value: int, marks: np.ndarray, factor: float) -> None:
         """Make the elements that are marked larger than what the last formats were made for, by so much."""
         axes = tuple(a for a, n in enumerate(marks.shape) if n in self._shared)
         wider = marks.any(axis=axes, keepdims=True)
-        size = np.maximum(self.largest[value], np.where(wider, self._fits[value] * factor, 0.0))
-        self.largest[value] = size
+        size = np.where(wider, self._fits[value] * factor, 0.0)
+        self._wider[value] = np.maximum(self._wider.get(value, 0.0), size)
+
+    def forget(self) -> None:
+        """Take back what was made wider."""
+        self._wider.clear()
 
     def formats(self, width: int, margin: float = 2.0, held_width: int = 0) -> Formats:
-        """Formats in which numbers fit that are `margin` times as large as any that was seen.
+        """Formats in which numbers fit that are `margin` times as large as any that was seen, or as large as
+        any can be, where that is proven and less.
 
         Args:
             width: bits of a word.
@@ -151,12 +185,14 @@ class Sizes:
             held_width: bits of inputs, registers and what is added up in them; 0: those of `width`.
         """
         fractions: dict[int, np.ndarray] = {}
+        proven: set[int] = set()
         held = _held(self.pipeline) if held_width > width else frozenset()
         bits = {n: held_width for n in held}
-        errors = _Errors(self.pipeline, width)
-        for n, size in self.largest.items():
+        errors = _Errors(self.pipeline, width, {n: w - WIDEST for n, w in bits.items() if w > WIDEST})
+        for n in self.largest:
             if n in errors.given:
-                wide = margin * _beside_its_diagonal(size)
+                wide, sure = self._fitting(n, np.asarray(self._size(n)), margin)
+                proven |= {n} if sure else set()
                 fractions[n] = fraction_for(wide, bits.get(n, width))
                 errors.start(n, fractions[n], wide)
         for i in self.pipeline.instructions:
@@ -166,15 +202,17 @@ class Sizes:
             rounding = errors.of(i)
             axes = tuple(a for a, n in enumerate(i.spec.shape) if n in self._shared)
             rounding = rounding.max(axis=axes, keepdims=True, initial=0.0)
-            size = margin * _beside_its_diagonal(np.maximum(found, rounding))
+            size, sure = self._fitting(i.out, np.maximum(found, rounding), margin)
+            proven |= {i.out} if sure else set()
             fractions[i.out] = fraction_for(size, bits.get(i.out, width))
-            errors.add(i, fractions[i.out], size, rounding)
+            errors.add(i, fractions[i.out], size, rounding, np.where(rounding > found, rounding, 0.0))
         self._fits = {
             n: np.ldexp(0.5, bits.get(n, width) - 1 - f.astype(int)) / margin for n, f in fractions.items()
         }
         structure = structure_of(self.pipeline)
         most = held_width if held else 0
-        return Formats(width, fractions, margin, frozenset(self.absent), structure, held, most)
+        absent = frozenset(self.absent)
+        return Formats(width, fractions, margin, absent, structure, held, most, frozenset(proven))
 
 
 def _held(pipeline: Pipeline) -> frozenset[int]:
@@ -217,9 +255,10 @@ class _Errors:
         given: the inputs and registers.
     """
 
-    def __init__(self, pipeline: Pipeline, width: int) -> None:
+    def __init__(self, pipeline: Pipeline, width: int, drop: Mapping[int, int]) -> None:
         self._specs: Mapping[int, Spec] = pipeline.specs
         self._width = width
+        self._drop = dict(drop)
         self._size: dict[int, np.ndarray] = {}
         self._error: dict[int, np.ndarray] = {}
         self._fraction: dict[int, np.ndarray] = {}
@@ -230,27 +269,33 @@ class _Errors:
                 fraction = fraction_of_constant(array, width)
                 self._keep(n, fraction, np.abs(array), 0.0)
 
-    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any) -> None:
+    def _keep(self, n: int, fraction: np.ndarray, size: np.ndarray, error: Any, alone: Any = 0.0) -> None:
         shape = self._specs[n].shape
         last = np.where(fraction == FREE, 0.0, np.ldexp(1.0, -np.minimum(fraction, 1000).astype(int)))
         self._fraction[n] = np.broadcast_to(fraction, shape)
         self._size[n] = np.broadcast_to(size, shape)
-        self._error[n] = np.broadcast_to(np.minimum(error + last, _MOST * last), shape)
+        most = np.maximum(_MOST * last, alone)
+        self._error[n] = np.broadcast_to(np.minimum(error + last, most), shape)
 
     def start(self, n: int, fraction: np.ndarray, size: np.ndarray) -> None:
         """A value that is given."""
         last = np.ldexp(1.0, -fraction.astype(int))
         self._keep(n, fraction, size, (_HELD - 1.0) * last if n in self._registers else 0.0)
 
-    def add(self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray) -> None:
-        """A value that was computed; one that is only moved keeps its formats."""
+    def add(
+        self, i: Instruction, fraction: np.ndarray, size: np.ndarray, error: np.ndarray, alone: np.ndarray
+    ) -> None:
+        """A value that was computed, `alone` the error of what is nothing else; what is only moved keeps its
+        formats."""
         if i.op in MOVES and all(a in self._fraction for a in i.args[:1]):
             given = [self._fraction.get(a) for a in i.args]
             if all(f is not None for f in given) or i.op == "take":
+                self._drop[i.out] = max(self._drop.get(a, 0) for a in i.args)
                 fraction = moved(i, given)
-                self._keep(i.out, fraction, size, error - np.ldexp(1.0, -np.minimum(fraction, 1000)))
+                last = np.ldexp(1.0, -np.minimum(fraction, 1000))
+                self._keep(i.out, fraction, size, error - last, alone)
                 return
-        self._keep(i.out, fraction, size, error)
+        self._keep(i.out, fraction, size, error, alone)
 
     def of(self, i: Instruction) -> np.ndarray:
         """The error of a result from those of its arguments, of its shape; zero where none is known."""
@@ -260,8 +305,17 @@ class _Errors:
         if rule is None or any(a not in self._size for a in i.args):
             return np.zeros(i.spec.shape)
         site = Site(i, [], None, self._specs, self._width)
-        sizes, errors = [self._size[a] for a in i.args], [self._error[a] for a in i.args]
+        sizes, errors = [self._size[a] for a in i.args], [self._read(a, i.op) for a in i.args]
         return np.asarray(np.broadcast_to(rule(site, sizes, errors), i.spec.shape))
+
+    def _read(self, n: int, op: str) -> np.ndarray:
+        """The error of an argument as an operation reads it."""
+        drop = 0 if op in READ_WHOLE else self._drop.get(n, 0)
+        if not drop:
+            return self._error[n]
+        f = self._fraction[n]
+        upper = np.where(f == FREE, 0.0, np.ldexp(1.0, drop - np.minimum(f, 1000).astype(int)))
+        return np.asarray(np.maximum(self._error[n], upper))
 
 
 def _moved(s: Site, sizes: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:

@@ -32,6 +32,7 @@ class Site:
         out: the fraction of the result, of its shape; None where it is not real.
         specs: of all values.
         width: bits of a word.
+        drop: of each argument the low bits that are not read; `fractions` are without them.
     """
 
     def __init__(
@@ -41,8 +42,10 @@ class Site:
         out: np.ndarray | None,
         specs: Mapping[int, Spec],
         width: int,
+        drop: Sequence[int] = (),
     ) -> None:
         self.i, self.specs, self.width = i, specs, width
+        self.drop = tuple(drop) or (0,) * len(i.args)
         self.f = [None if f is None else np.asarray(f) for f in fractions]
         self.out = np.zeros((), np.int64) if out is None else np.asarray(out)
 
@@ -203,6 +206,13 @@ MOVES = frozenset(
     ]
 )
 """Operations that keep the formats of what they move."""
+
+READ_WHOLE = MOVES | {
+    "add", "subtract", "sum", "cumulative_sum", "where", "maximum", "minimum", "max", "min", "argmax",
+    "argmin", "sort", "argsort", "searchsorted", "copysign", "sign", "equal", "not_equal", "less",
+    "less_equal", "greater", "greater_equal", "isnan", "isfinite",
+}  # fmt: skip
+"""Operations that read all bits of a word; the others multiply, and read its upper 32."""
 
 
 def moved(i: Instruction, fractions: Sequence[np.ndarray | None]) -> np.ndarray:

@@ -40,6 +40,7 @@ class Text:
         self.lost: dict[int, int] = {}
         self.bound: Bound
         self.most: int | None = None
+        self.drop: dict[int, int] = {}
 
     # -- text ----------------------------------------------------------------------------------------
 
@@ -89,8 +90,9 @@ class Text:
             self.put("}")
 
     def word(self, value: int, index: Sequence[str]) -> str:
-        """The element of a value at an index of a shape that it broadcasts to, as 64 bits."""
-        return wide(self.to(value, index))
+        """The element of a value at an index of a shape that it broadcasts to: 64 bits that are read."""
+        found = wide(self.to(value, index))
+        return f"fx_upper({found}, {self.drop[value]})" if value in self.drop else found
 
     def to(self, value: int, index: Sequence[str]) -> str:
         """The same, as what is written."""

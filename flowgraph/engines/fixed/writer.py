@@ -8,6 +8,7 @@ import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
 from flowgraph.engines.fixed.elements import Elements
+from flowgraph.engines.fixed.engine import site_of
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.fixed.text import flat, narrow, plus, unless_none, wide
 from flowgraph.errors import LoweringError
@@ -32,14 +33,12 @@ class Writer(Elements):
         bodies = []
         for first in range(0, len(program.instructions), _TOGETHER):
             for i in program.instructions[first : first + _TOGETHER]:
-                given = [self.bound.fractions.get(a) for a in i.args]
-                out = self.bound.fractions.get(i.out) if i.spec.dtype == "real" else None
                 self.said(i)
-                taken = max((widths[a] for a in i.args if a in widths), default=width)
                 self.most = self.bound.most(i.out) if i.out in widths else None
-                self.instruction(
-                    Site(i, given, out, program.specs, taken), [a for a in i.args if a in doubtful]
-                )
+                site = site_of(i, self.bound.fractions, widths, program.specs, width)
+                self.drop = {a: n for a, n in zip(i.args, site.drop, strict=True) if n}
+                self.instruction(site, [a for a in i.args if a in doubtful])
+                self.drop = {}
             bodies.append(self.taken())
         self.writes()
         return bodies, self.taken()

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowgraph.engines.c.syntax import identifier
-from flowgraph.engines.fixed.absent import may_be_nan
 from flowgraph.engines.fixed.engine import Bound, Integers
 from flowgraph.engines.fixed.places import (
     KNOWN,
@@ -22,7 +21,8 @@ from flowgraph.engines.fixed.places import (
     Place,
     array_of,
     held_values,
-    holding_none,
+    long_held,
+    long_words,
     root_of,
 )
 from flowgraph.pipeline.optimise.memory import plan
@@ -57,11 +57,11 @@ class ValueArrays:
         names = {pipeline.time: "time", pipeline.seed: "seed"}
         names |= {c.read: f"{r.path}.{c.name}" for r in pipeline.registers for c in r.cells}
         names |= {x.value: f"{port.name}.{x.name}" for port in pipeline.inputs for x in port.leaves}
-        absent = holding_none(player, keys)
+        long = long_held(player, keys)
         self.held: dict[int, Array] = {}
         for n, spec in held_values(pipeline):
             kept = n if n >= 0 else -1 - n
-            array = array_of(spec.dtype, kept in absent)
+            array = array_of(spec.dtype, kept in long)
             name = f"{array}{kept}_{identifier(names[kept])}{'_next' if n < 0 else ''}"
             self.held[n] = self._array(name, spec, array, player.formats.width_of(kept))
         self.made: dict[int, Array] = {}
@@ -77,8 +77,7 @@ class ValueArrays:
     def begin(self, key: int, bound: Bound) -> None:
         program = bound.program
         self._view = plan(program, ("reuse",), scalars=True).view
-        doubtful = may_be_nan(program.instructions, self._player.formats.absent)
-        wide = {root_of(self._view, n)[0] for n in doubtful}
+        wide = {root_of(self._view, n)[0] for n in long_words(self._player, bound)}
         widths: dict[int, int] = {}
         for n, width in bound.widths.items():
             root, _ = root_of(self._view, n)
@@ -128,7 +127,7 @@ class ValueArrays:
 
 
 def kind_of(array: str, dtype: str, width: int) -> str:
-    """The type of an element: as many bits as a word has, and 64 where it may be a reading not there."""
+    """The type of an element: as many bits as a word has, and 64 where it is long."""
     if array in (SMALL, KNOWN_SMALL):
         return "ap_uint<1>" if dtype == "bool" else f"ap_int<{width}>"
     return "int64_t"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
-from flowgraph.engines.fixed.engine import Bound, Integers
+from flowgraph.engines.fixed.engine import Bound, Integers, site_of
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.verilog.lookup import Lookup
 from flowgraph.engines.verilog.nodes import Held, Term
@@ -16,7 +16,7 @@ from flowgraph.engines.verilog.real import COMPARE, WORD, no_form
 from flowgraph.engines.verilog.rows import root_of
 from flowgraph.engines.verilog.whole import stacked
 from flowgraph.errors import LoweringError
-from flowgraph.pipeline.formats import NOT_A_NUMBER
+from flowgraph.pipeline.formats import NOT_A_NUMBER, WIDEST
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.ops import OPS, Spec
@@ -51,6 +51,14 @@ class Tick(Lookup):
         super().__init__(player.formats.width, max(player.formats.width, player.formats.held_width))
         self.pipeline, self.key = player.pipeline, key
         self.formats = player.formats
+        if self.wide > WIDEST:
+            raise LoweringError(
+                "held words are wider than those of the machine",
+                path=self.pipeline.name,
+                expected=f"{WIDEST} bits or fewer",
+                got=str(self.wide),
+                fix="find formats with a smaller --held-width, or lower the graph to C",
+            )
         self.bound: Bound = player.bind(key)
         self.shortest = shortest_row(self.pipeline)
         self.values: dict[int, np.ndarray] = {}
@@ -59,8 +67,6 @@ class Tick(Lookup):
         doubtful = absent.may_be_nan(program.instructions, self.formats.absent)
         for i in program.instructions:
             self.here = f"v{i.out} {i.op}, {i.line}"
-            given = [self.bound.fractions.get(a) for a in i.args]
-            out = self.bound.fractions.get(i.out) if i.spec.dtype == "real" else None
             if any(a in doubtful for a in i.args) and i.op not in _MAY_BE_NONE:
                 raise LoweringError(
                     "this may meet a reading that is not there",
@@ -70,8 +76,7 @@ class Tick(Lookup):
                     fix="choose a number in its place first: xp.where(xp.isnan(z), 0.0, z)",
                 )
             widths = self.bound.widths
-            taken = [widths[a] for a in i.args if a in widths]
-            site = Site(i, given, out, program.specs, max(taken, default=self.width))
+            site = site_of(i, self.bound.fractions, widths, program.specs, self.width)
             self.now = widths.get(i.out, self.width)
             self.values[i.out] = made = self._made(site)
             if i.out not in doubtful:

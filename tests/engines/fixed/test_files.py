@@ -45,7 +45,7 @@ def _numbers(result, name):
     return [(int(t), np.concatenate(r)) for t, r in zip(series.time, rows, strict=True)]
 
 
-@pytest.mark.parametrize("held", [0, 30])
+@pytest.mark.parametrize("held", [0, 30, 44])
 def test_the_written_files_replay_what_the_interpreter_gives(held, tmp_path):
     case = library_case("kalman", 0.5)
     formats = sizes_of(case.graph, case.inputs).formats(24, 4.0, held) if held else formats_of("kalman", 24)
@@ -167,7 +167,7 @@ def test_wider_registers_are_nearer_and_equal_in_c():
     sizes = sizes_of(built_graph, inputs)
     real = simulate(built_graph, inputs, engine="reference").after.value
     apart = {}
-    for held in (0, 24):
+    for held in (0, 24, 40):
         formats = sizes.formats(14, 2.0, held)
         ours = simulate(built_graph, inputs, engine="fixed", formats=formats)
         same(ours, simulate(built_graph, inputs, engine="c", dtype="fixed", formats=formats))
@@ -176,9 +176,12 @@ def test_wider_registers_are_nearer_and_equal_in_c():
         assert formats.width_of(register.cells[0].read) == (held or 14)
         assert Formats.from_json(formats.to_json()).to_json() == formats.to_json()
     assert apart[24] < 0.05 * apart[0]
+    assert apart[40] <= apart[24]
 
 
 def test_held_words_are_no_narrower_than_the_others():
     with pytest.raises(DeclarationError, match="no word has this width") as refused:
         Formats(24, {}, held=frozenset([1]), held_width=20)
-    assert refused.value.expected == "24 to 32 bits"
+    assert refused.value.expected == "24 to 48 bits"
+    with pytest.raises(DeclarationError, match="no word has this width"):
+        Formats(24, {}, held=frozenset([1]), held_width=49)

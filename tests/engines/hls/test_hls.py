@@ -74,6 +74,18 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     assert _bench(tmp_path) == (1, player.compared, 1)
 
 
+def test_held_words_of_more_than_32_bits_are_those_of_the_interpreter():
+    need_compiler()
+    built = everything.build()
+    subject = LoweredGraph(built)
+    formats = sizes_of(built, flight()).formats(26, 2.0, 44)
+    pipeline, tape = with_formats(subject.pipeline, formats), subject.tape(flight())
+    player = PlayedHls(pipeline, tape.patterns, check=True)
+    player.play(tape, LoweredGraph(built).start(RunOptions()).cells, seed_words(0), None)
+    assert player.compared > 400
+    assert player.differing == 0
+
+
 def _bench(folder):
     done = subprocess.run(["./replay", "script"], cwd=folder, capture_output=True, text=True, check=False)
     said = dict(line.split() for line in done.stderr.splitlines() if line.startswith("values_"))

@@ -329,6 +329,13 @@ def test_an_operation_that_is_not_there_is_named_with_its_line():
     assert str(caught.value.path).startswith("tests.engines.verilog.test_verilog:")
 
 
+def test_held_words_that_are_wider_than_those_of_the_machine_are_refused():
+    pipeline = LoweredGraph(everything.build()).pipeline
+    formats = sizes_of(everything.build(), flight()).formats(24, 2.0, 44)
+    with pytest.raises(LoweringError, match="(?s)held words are wider.*32 bits or fewer.*44.*held-width"):
+        Image(with_formats(pipeline, formats), [1])
+
+
 def test_the_files_name_places_and_lines(made, tmp_path):
     _, _, pipeline, tape = made
     found = texts(Image(pipeline, tape.patterns))
