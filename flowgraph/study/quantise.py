@@ -44,7 +44,7 @@ MARGIN = 2.0
 """The sizes that occurred times this fit their formats, if nobody says otherwise."""
 
 _ROUNDS = 30
-_WIDER, _WIDEST = 2, 16
+_WIDER, _WIDEST, _HOPELESS = 2, 16, 128
 """Bits by which the format of what saturates is widened: twice as many each time that it happens again."""
 
 Say = Callable[[str], None]
@@ -255,15 +255,15 @@ class _Search:
     def _widen(self, counts: Counts, where: str, bits: int) -> bool:
         """Widen the formats of what saturated; tells whether anything was, and whether that may help.
 
-        A quotient by zero fits no word, nor does a filter that has gone astray: what was widened by all of
-        `_WIDEST` and saturates again always will.
+        A quotient by zero fits no word, nor does a filter that has gone astray: what was widened by
+        `_WIDEST` again and again will always saturate.
         """
         cut = {n: marks for n, marks in counts.cut.items() if n not in counts.divisions_by_zero}
-        if not cut or any(self._more.get(n) == _WIDEST for n in cut):
+        if not cut or any(self._more.get(n, 0) >= _HOPELESS for n in cut):
             return False
         for value, marks in cut.items():
-            more = self._more[value] = min(2 * self._more.get(value, _WIDER // 2), _WIDEST)
-            self.sizes.widen(value, marks, 2.0**more)
+            more = self._more[value] = 2 * self._more.get(value, _WIDER // 2)
+            self.sizes.widen(value, marks, 2.0 ** min(more, _WIDEST))
         names = names_of(self.pipeline)
         some = ", ".join(names[v] for v in list(cut)[:3])
         self.notes.append(f"{len(cut)} values widened at {bits} bits, after {where}: {some}")
