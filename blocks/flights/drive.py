@@ -1,11 +1,10 @@
 """A drive over hills and around corners, `sim:drive`: a car with an inertial unit of a stated grade and
 satellites.
 
-The road is a smooth curve through random places; the car goes along it, stops, and goes on. Readings of the
-unit
-are means over the time since the one before, made of the exact motion: what turned the body, and what
-changed its velocity but for gravity and the turning Earth. So the error of a filter is that of the unit, of
-its stated figures, and of the aids, and of nothing else.
+A flight is a run of the graph `drive`; its road is drawn on the host (`road_of`) and handed to it. Readings
+of the unit are means over the time since the one before, made of the exact motion: what turned the body, and
+what changed its velocity but for gravity and the turning Earth. So the error of a filter is that of the unit,
+of its stated figures, and of the aids, and of nothing else.
 
 Source of the figures of the grades: P. Groves, "Principles of GNSS, inertial, and multisensor integrated
 navigation systems", 2nd ed., 2013, tables 4.1-4.3.
@@ -15,31 +14,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts are loaded when they are used
 
-from flowgraph import Flight, Series
-from flowgraph.blocks.geometry.geodetic import from_enu
-from flowgraph.blocks.geometry.rotations import conjugate, multiply, rotate, to_matrix, to_rotation_vector
+from flowgraph import Flight, Graph, Series, Stream, Tick, aperiodic, graph, latest, simulate, ticks
+from flowgraph.blocks import sensors as s
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.inertial.navigation import earth_at, gravity_at
-from flowgraph.blocks.signals import (
-    GnssFix,
-    GnssHeading,
-    GnssVelocity,
-    Height,
-    Imu,
-    MagneticField,
-    NavigationState,
-    WheelSpeed,
-)
-from flowgraph.blocks.world import generator
+from flowgraph.blocks.signals import BodyMotion, RoadPiece, Vector
+from flowgraph.blocks.world import NO_ROAD, drive_motion, road_of
+from flowgraph.blocks.world.drive import REST
+from flowgraph.data.experiment import Experiment
+from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
 from flowgraph.errors import DeclarationError, UnknownNameError
 
-__all__ = ["DEFAULTS", "GRADES", "SENSORS", "Grade", "load_drive"]
+__all__ = ["DEFAULTS", "GRADES", "SENSORS", "Grade", "drive", "load_drive"]
 
 
 class Grade(NamedTuple):
@@ -79,7 +71,6 @@ satellites come together."""
 ORIGIN = (math.radians(47.4), math.radians(8.55), 430.0)
 _FIELD = (0.0, 2.15e-5, -4.3e-5)  # T, east, north, up
 _LEVEL = 12.0  # m, of the barometer
-_REST = 3.0  # s, at the start
 
 
 def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> Flight:
@@ -100,56 +91,121 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
         UnknownNameError: for a setting, a unit or a sensor that is not there; DeclarationError: for one out
             of range.
     """
-    values, grade, sensors = _settings(dict(settings or {}))
-    period = round(1e9 / values["imu.rate"])
-    time = np.arange(0, round(values["duration"] * 1e9) + 1, period, dtype=np.int64)
-    draw = lambda name, *shape: generator(seed, f"drive.{name}").standard_normal(shape)
-    road = _Road(seed if values["road"] < 0.0 else round(values["road"]), values["duration"])
-    p, v, q = road.at(time * 1e-9)
-    dt = period * 1e-9
-    n = len(time)
-    biases = {}
-    for sensor, start, walk in (
-        ("gyro", grade.gyro_bias, grade.noise.gyro_bias),
-        ("accelerometer", grade.accelerometer_bias, grade.noise.accelerometer_bias),
-    ):
-        steps = np.concatenate([np.zeros((1, 3)), draw(f"{sensor}.walk", n - 1, 3) * walk * math.sqrt(dt)])
-        biases[sensor] = draw(f"{sensor}.bias", 3) * start + np.cumsum(steps, axis=0)
-    rate, force = _read(p, v, q, dt)
-    imu = Imu(
-        gyro=rate + biases["gyro"] + draw("gyro.noise", n, 3) * grade.noise.gyro / math.sqrt(dt),
-        specific_force=force
-        + biases["accelerometer"]
-        + draw("accelerometer.noise", n, 3) * grade.noise.accelerometer / math.sqrt(dt),
-    )
-    streams = {"imu": Series(time, imu, name="imu")}
-    for name in sensors:
-        every = round(1e9 / values.get(f"{name}.rate", values["gps.rate"]) / period)
-        rows = np.arange(0, n, max(every, 1))
-        streams[name] = Series(time[rows], _sensed(name, p[rows], v[rows], q[rows], values, draw), name=name)
-    truth = NavigationState(
-        position=p,
-        velocity=v,
-        attitude=q,
-        gyro_bias=biases["gyro"],
-        accelerometer_bias=biases["accelerometer"],
-    )
+    values, sensors = _settings(dict(settings or {}))
+    grade = GRADES[values["unit"]]
+    told = tuple(values.items()), tuple(sensors)
+    made_by = _made_by(*told)
+    inputs = {**made_by.ticks, **made_by.given(seed)}
+    flown = simulate(_built(*told), inputs, engine="numpy", seed=seed)
     info = {
         "imu_noise": grade.noise,
-        "imu_period_ns": period,
+        "imu_period_ns": _period(values),
         "imu_oversample": 2,
         "origin": ORIGIN,
         "magnetic_field": _FIELD,
         "gps_lever": (0.0, 0.0, 0.0),
-        "still": _REST,
+        "still": REST,
         "noise": {"magnetometer": {"noise": values["magnetometer.noise"]}},
         "start_spread": (grade.gyro_bias, grade.accelerometer_bias),
     }
     said = note("info", f"simulated with seed {seed}: a drive with a unit of {values['unit']} grade")
-    return Flight(f"drive-{seed}", streams, truth=Series(time, truth, name="truth"), info=info, notes=(said,))
+    streams = {name: flown[name] for name in ("imu", *sensors)}
+    return Flight(f"drive-{seed}", streams, flown["truth"], info, (said,), experiment=made_by)
 
 
-def _settings(given: dict[str, Any]) -> tuple[dict[str, Any], Grade, list[str]]:
+@graph
+def drive(
+    start: Stream[Tick],
+    road: Stream[RoadPiece],
+    imu: Stream[Tick],
+    gps: Stream[Tick] | None = None,
+    gps_velocity: Stream[Tick] | None = None,
+    heading: Stream[Tick] | None = None,
+    magnetometer: Stream[Tick] | None = None,
+    barometer: Stream[Tick] | None = None,
+    wheels: Stream[Tick] | None = None,
+    *,
+    grade: Grade,
+    rate: float,
+    noise: Mapping[str, float],
+) -> dict[str, Stream[Any]]:
+    """A car on a `road` that comes piece by piece, with an inertial unit at `rate` Hz and the sensors that
+    have clocks; `noise` has the standard deviation of each.
+
+    `start` ticks once, at 0, where the constant biases are drawn. There is a truth at every reading of the
+    unit. All other clocks are multiples of its: between two of its readings the car is where it was.
+    """
+    motion = drive_motion(latest(road, init=NO_ROAD, name="piece"), at=imu)
+    now = {}
+    for part, deviation, walk in (
+        ("gyro", grade.gyro_bias, grade.noise.gyro_bias),
+        ("accelerometer", grade.accelerometer_bias, grade.noise.accelerometer_bias),
+    ):
+        first = s.bias_at_start(at=start, deviation=deviation, name=f"{part}_start", draws=f"{part}_start")
+        held = latest(first, init=Vector(vector=np.zeros(3)), name=f"{part}_bias")
+        now[part] = s.drift(held, at=imu, walk=walk, name=f"{part}_drift", draws=f"{part}_drift")
+    biases = now["gyro"], now["accelerometer"]
+    made: dict[str, Stream[Any]] = {
+        "imu": s.read_over_earth(
+            motion, *biases, at=imu, gravity=gravity_at(ORIGIN[0], ORIGIN[2]), earth=earth_at(ORIGIN[0]),
+            gyro=grade.noise.gyro * math.sqrt(rate), draws="imu", name="imu_reading",
+            accelerometer=grade.noise.accelerometer * math.sqrt(rate),
+        )
+    }  # fmt: skip
+    here = latest(motion, init=_NOWHERE, name="here")
+    for name, clock, read in (
+        ("gps", gps, partial(s.read_fix, origin=ORIGIN)),
+        ("gps_velocity", gps_velocity, s.read_velocity),
+        ("heading", heading, s.read_heading),
+        ("magnetometer", magnetometer, partial(s.read_magnetometer, field=_FIELD)),
+        ("barometer", barometer, partial(s.read_height, level=_LEVEL)),
+        ("wheels", wheels, s.read_wheels),
+    ):
+        if clock is not None:
+            made[name] = read(here, at=clock, noise=noise[name], name=f"{name}_reading", draws=name)
+    made["truth"] = s.true_state(motion, *biases)
+    return made
+
+
+_NOWHERE = BodyMotion(
+    **{name: np.zeros(3) for name in ("position", "velocity", "acceleration", "rate")},
+    attitude=np.array([1.0, 0.0, 0.0, 0.0]),
+)
+
+
+@lru_cache(maxsize=8)
+def _made_by(settings: tuple[tuple[str, Any], ...], sensors: tuple[str, ...]) -> Experiment:
+    n = dict(settings)
+    end, period = round(n["duration"] * 1e9), _period(n)
+    clocks = {"start": end + 1, "imu": period}
+    for name in sensors:
+        every = round(1e9 / n.get(f"{name}.rate", n["gps.rate"]) / period)
+        clocks[name] = max(every, 1) * period
+    told = {
+        "grade": GRADES[n["unit"]],
+        "rate": 1e9 / period,
+        "noise": {name: n[f"{name}.noise"] for name in sensors},
+    }
+    made = {name: ticks(each, until=end + 1, name=name) for name, each in clocks.items()}
+    return Experiment(drive, made, told, partial(_handed, duration=n["duration"], road=n["road"]))
+
+
+@lru_cache(maxsize=8)
+def _built(settings: tuple[tuple[str, Any], ...], sensors: tuple[str, ...]) -> Graph:
+    made_by = _made_by(settings, sensors)
+    return drive.build(**clocks_of(made_by.ticks), road=aperiodic(), **made_by.settings)
+
+
+def _handed(seed: int, *, duration: float, road: int) -> dict[str, Series]:
+    return {"road": road_of(duration, seed if road < 0 else road)}
+
+
+def _period(n: Mapping[str, Any]) -> int:
+    """ns, between the readings of the unit."""
+    return round(1e9 / float(n["imu.rate"]))
+
+
+def _settings(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     unit = str(given.pop("unit", "consumer"))
     if unit not in GRADES:
         raise UnknownNameError("unit", unit, GRADES, path="sim:drive")
@@ -175,7 +231,7 @@ def _settings(given: dict[str, Any]) -> tuple[dict[str, Any], Grade, list[str]]:
                 got=repr(value),
                 fix=f"for example {name}={DEFAULTS[name]:g}",
             )
-    return values, GRADES[unit], sensors
+    return values, list(dict.fromkeys(sensors))
 
 
 def _number_of(road: Any) -> int:
@@ -193,94 +249,3 @@ def _number_of(road: Any) -> int:
         got=repr(road),
         fix="for example road=0",
     )
-
-
-class _Road:
-    """A curve through random places, and how far along it the car is."""
-
-    def __init__(self, seed: int, duration: float) -> None:
-        draw = generator(seed, "drive.road")
-        count = max(6, int(duration * 15.0 / 80.0) + 6)
-        turns = np.cumsum(draw.normal(0.0, 0.7, count))
-        steps = 80.0 * np.stack([np.cos(turns), np.sin(turns), draw.normal(0.0, 0.03, count)], axis=-1)
-        places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self.curve = scipy.interpolate.make_interp_spline(np.arange(len(places)), places, k=5)
-        self.tangent = self.curve.derivative()
-        # how fast: at rest, away, around, and one stop on the way
-        knots = np.linspace(0.0, max(duration, 1.0), max(int(duration / 6.0), 2) + 1)
-        pace = np.clip(draw.normal(0.12, 0.04, len(knots)), 0.05, 0.2)
-        if len(pace) > 8:
-            pace[len(pace) // 2] = 0.0
-        self.knots, self.pace = knots, pace
-
-    def along(self, t: np.ndarray) -> np.ndarray:
-        """The parameter of the curve at times: the integral of a pace that begins smoothly after the rest."""
-        fine = np.linspace(0.0, max(float(t[-1]), 1e-3), max(int(t[-1] * 200), 2) + 1)
-        begun = np.clip((fine - _REST) / 4.0, 0.0, 1.0)
-        begun = begun**3 * (10.0 - 15.0 * begun + 6.0 * begun**2)
-        spline = scipy.interpolate.make_interp_spline(self.knots, self.pace, k=min(3, len(self.knots) - 1))
-        pace = begun * np.clip(spline(fine), 0.0, None)
-        whole = scipy.interpolate.make_interp_spline(fine, pace, k=3).antiderivative()
-        return np.asarray(whole(t) - whole(0.0))
-
-    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions, velocities and attitudes; the body's x axis along the road, no roll."""
-        s = self.along(t)
-        p = np.asarray(self.curve(s))
-        step = 1e-4
-        v = np.asarray(self.tangent(s)) * ((self.along(t + step) - s) / step)[:, None]
-        way = np.asarray(self.tangent(s))
-        yaw = np.arctan2(way[:, 1], way[:, 0])
-        pitch = np.arctan2(way[:, 2], np.hypot(way[:, 0], way[:, 1]))
-        zero = np.zeros_like(yaw)
-        about_z = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=-1)
-        about_y = np.stack([np.cos(pitch / 2), zero, -np.sin(pitch / 2), zero], axis=-1)
-        return p, v, np.asarray(multiply(about_z, about_y, xp=np))
-
-
-def _read(p: np.ndarray, v: np.ndarray, q: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """What an ideal unit reads over each step: rate (n, 3) and force (n, 3); the first stands for a step at
-    rest."""
-    earth, gravity = earth_at(ORIGIN[0]), np.asarray(gravity_at(ORIGIN[0], ORIGIN[2]))
-    turn = np.asarray(earth.turn)
-    R = to_matrix(q, xp=np)
-    body_turn = to_rotation_vector(multiply(conjugate(q[:-1], xp=np), q[1:], xp=np), xp=np) / dt
-    rate = body_turn + (R[:-1].transpose(0, 2, 1) @ turn[:, None])[..., 0]
-    half = np.asarray(multiply(q[:-1], _half(body_turn * dt), xp=np))
-    strength = np.linalg.norm(gravity) / earth.radius
-    pull = gravity + p[:-1] * (-strength, -strength, 2.0 * strength) - 2.0 * np.cross(turn, v[:-1])
-    force = rotate(conjugate(half, xp=np), np.diff(v, axis=0) / dt - pull, xp=np)
-    first_rate = R[:1].transpose(0, 2, 1) @ turn[:, None]
-    first_force = rotate(conjugate(q[:1], xp=np), -gravity[None], xp=np)
-    return np.concatenate([first_rate[..., 0], rate]), np.concatenate([first_force, force])
-
-
-def _half(turns: np.ndarray) -> np.ndarray:
-    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(angle / 4), turns * 0.25 * np.sinc(angle / 4 / np.pi)], axis=-1)
-
-
-def _sensed(
-    name: str, p: np.ndarray, v: np.ndarray, q: np.ndarray, values: Mapping[str, Any], draw: Any
-) -> Any:
-    """What a sensor reads at some times."""
-    n = len(p)
-    noise = values.get(f"{name}.noise", 0.0)
-    if name == "gps":
-        spread = noise * np.array([1.0, 1.0, 2.0])
-        latitude, longitude, height = from_enu(p + draw("gps", n, 3) * spread, ORIGIN).T
-        covariance = np.tile(np.diag(spread**2), (n, 1, 1))
-        return GnssFix(latitude=latitude, longitude=longitude, height=height, covariance=covariance)
-    if name == "gps_velocity":
-        seen = v + draw(name, n, 3) * noise
-        return GnssVelocity(velocity=seen, covariance=np.tile(np.eye(3) * noise**2, (n, 1, 1)))
-    x = rotate(q, np.tile([1.0, 0.0, 0.0], (n, 1)), xp=np)
-    if name == "heading":
-        angle = np.arctan2(x[:, 1], x[:, 0]) + draw(name, n) * noise
-        return GnssHeading(angle=angle, deviation=np.full(n, noise))
-    if name == "magnetometer":
-        field = rotate(conjugate(q, xp=np), np.tile(_FIELD, (n, 1)), xp=np)
-        return MagneticField(field=field + draw(name, n, 3) * noise)
-    if name == "barometer":
-        return Height(height=p[:, 2] + _LEVEL + draw(name, n) * noise)
-    return WheelSpeed(speed=(v * x).sum(axis=-1) + draw(name, n) * noise)

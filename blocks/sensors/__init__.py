@@ -1,7 +1,8 @@
 """Simulated sensors: blocks of a graph that read the motion of a tick (`BodyMotion`), each with its errors.
 
-`blocks` has those of a body, `plane` those of a point in the plane. What differs in time is said by clocks:
-the rate and phase of a sensor, and when a reading arrives, are those of the source at which it fires.
+`blocks` has those of a body, `plane` those of a point in the plane, `car` those of a car. What differs in
+time is said by clocks: the rate and phase of a sensor, and when a reading arrives, are those of the source at
+which it fires.
 """
 
 from __future__ import annotations
@@ -25,6 +26,14 @@ from flowgraph.blocks.sensors.blocks import (
     to_geodetic,
     true_state,
 )
+from flowgraph.blocks.sensors.car import (
+    read_fix,
+    read_heading,
+    read_height,
+    read_over_earth,
+    read_velocity,
+    read_wheels,
+)
 from flowgraph.blocks.sensors.magnetic import earth_field
 from flowgraph.blocks.sensors.plane import read_plane_position, read_plane_velocity
 
@@ -45,6 +54,12 @@ __all__ = [
     "read_thrust",
     "read_plane_position",
     "read_plane_velocity",
+    "read_fix",
+    "read_heading",
+    "read_height",
+    "read_over_earth",
+    "read_velocity",
+    "read_wheels",
     "to_geodetic",
     "true_state",
     "earth_field",

@@ -36,7 +36,7 @@ from flowgraph.blocks.signals.calibration import (
     Window,
 )
 from flowgraph.blocks.signals.control import Controller, FlightCommand
-from flowgraph.blocks.signals.experiment import BodyMotion, Drawn, FigureShape, PlaneShape, Vector
+from flowgraph.blocks.signals.experiment import BodyMotion, Drawn, FigureShape, PlaneShape, RoadPiece, Vector
 from flowgraph.blocks.signals.motion import (
     GRAVITY,
     Attitude,
@@ -125,6 +125,7 @@ __all__ = [
     "Drawn",
     "FigureShape",
     "PlaneShape",
+    "RoadPiece",
     "Vector",
     "Bounds",
     "Extremes",

@@ -53,6 +53,21 @@ class PlaneShape(Signal):
     paces: Array = real(3, unit="rad/s")
 
 
+class RoadPiece(Signal):
+    """How a car goes along its road for some seconds, and the pieces of the road that it reaches meanwhile.
+
+    begin, length: s. along: coefficients of the road's parameter in the share of the seconds gone, lowest
+    powers first. first: the parameter where the first piece begins, the others each 1 further. road: their
+    coefficients in the parameter since they began.
+    """
+
+    begin: Array = real(unit="s")
+    length: Array = real(unit="s")
+    along: Array = real(10, unit="1")
+    first: Array = real(unit="1")
+    road: Array = real(3, 6, 3, unit="m")
+
+
 class Vector(Signal):
     """Three numbers along the axes of the body: an error of a reading, in its unit."""
 

@@ -2,13 +2,14 @@
 
 A `World` answers for any times with a `Motion`: position and its derivatives, attitude and body rate, all
 exact. `thesis_flight` draws a random quadrotor flight, `Quadrotor` follows given key points, `RoundTrip`
-turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`, two blocks.
+turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`, two blocks;
+`drive` a car on a road.
 """
 
 from __future__ import annotations
 
 from flowgraph.blocks.world import thesis
-from flowgraph.blocks.world.draws import generator
+from flowgraph.blocks.world.drive import NO_ROAD, drive_motion, road_of
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover, hover_waves
@@ -41,7 +42,9 @@ __all__ = [
     "hover_waves",
     "Figures",
     "figures",
-    "generator",
+    "NO_ROAD",
+    "drive_motion",
+    "road_of",
     "AT_REST",
     "figure_motion",
     "figure_shape",
