@@ -177,7 +177,9 @@ def one(of: str, mode: str, engine: str, number: int, duration: float) -> None:
             simulated.load(settings={"duration": duration}), particles=number
         )
         options: dict[str, Any] = {"engine": engine, "keep": ["pose"], "runs_at_once": 1}
-        given = lambda: partial(simulate_many, case.graph, case.inputs, [0], **options)
+        given: Callable[[], Callable[[], object]] = lambda: partial(
+            simulate_many, case.graph, case.inputs, [0], **options
+        )
         if engine in ("c", "xla"):
             given()()
     else:

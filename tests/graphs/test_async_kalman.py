@@ -179,8 +179,12 @@ def test_a_flight_without_motion_capture_is_refused():
 
 @pytest.mark.parametrize("graph", [kalman, async_kalman])
 def test_a_run_can_be_smoothed_by_a_setting(graph):
-    """Both use what came later, so they are better than the filter; the whole run more than a lag."""
-    case = graph.case(thesis(1), smooth="rts", lag=1.0)
-    score = case.score(simulate(case.graph, case.inputs))
-    whole, lagged, plain = (score[f"{front}position_rmse_m"] for front in ("smoothed_", "lagged_", ""))
-    assert whole < 1.02 * lagged < lagged * 1.05 < plain
+    """Both use what came later, so they are better than the filter; the whole run more than a lag: means of
+    four flights."""
+    errors = []
+    for seed in range(1, 5):
+        case = graph.case(thesis(seed), smooth="rts", lag=1.0)
+        score = case.score(simulate(case.graph, case.inputs))
+        errors.append([score[f"{front}position_rmse_m"] for front in ("smoothed_", "lagged_", "")])
+    whole, lagged, plain = np.mean(errors, axis=0)
+    assert whole < lagged < 0.95 * plain

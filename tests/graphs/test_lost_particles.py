@@ -178,9 +178,9 @@ def test_every_cloud_says_whether_it_is_depleted():
 
 
 def test_the_indoor_covariance_is_honest_where_there_are_no_biases():
-    """Two flights of the thesis: the mean NEES of nine numbers, after a second."""
+    """Eight flights of the thesis: the mean NEES of nine numbers, after a second."""
     values = []
-    for seed in range(2):
+    for seed in range(8):
         flight = thesis(seed, 3.0)
         case = rbpf_indoor.case(flight, unknown_yaw=False, particles=200)
         values.append(case.score(simulate(case.graph, case.inputs))["nees_mean"])

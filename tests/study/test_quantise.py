@@ -198,7 +198,13 @@ def test_what_is_asked_wrongly():
         quantise([flown(0)], [], bounds={RELATIVE: 1.0})
     with pytest.raises(DeclarationError, match="(?s)no width can be tried.*8 to 20 bits.*24"):
         quantise([flown(0)], [flown(1)], width=20, least=24, bounds={RELATIVE: 1.0})
-    for wrong in ({"width": 4}, {"width": 64}, {"width": 24, "held_width": 20}, {"held_width": 64}):
+    refused: tuple[dict[str, Any], ...] = (
+        {"width": 4},
+        {"width": 64},
+        {"width": 24, "held_width": 20},
+        {"held_width": 64},
+    )
+    for wrong in refused:
         with pytest.raises(DeclarationError, match="no word has this width"):
             quantise([flown(0)], [flown(1)], bounds={RELATIVE: 1.0}, **wrong)
 

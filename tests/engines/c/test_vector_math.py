@@ -76,7 +76,7 @@ def computed(kind: str, name: str, x: Any, y: Any = 0.0) -> np.ndarray:
 
 def compare(kind: str, name: str, x: np.ndarray, y: np.ndarray | None = None) -> None:
     """Within 3 units in the last place of NumPy's in higher precision; alike where that is not finite."""
-    dtype = KINDS[kind][0]
+    dtype: Any = KINDS[kind][0]
     x = x.astype(dtype)
     wide = x.astype(np.longdouble)
     with np.errstate(all="ignore"):

@@ -51,7 +51,7 @@ def _of(built_graph):
 
 def test_weights_norms_and_sines_are_bounded_and_inputs_are_not():
     pipeline, found = _of(clouds.build(z=periodic("10ms")))
-    by_op = {}
+    by_op: dict[str, list[float]] = {}
     for name, size in found.items():
         by_op.setdefault(name.split()[1].rstrip(","), []).append(float(size.max()))
     assert by_op["exp"] == [1.0, 1.0]

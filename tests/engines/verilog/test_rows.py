@@ -192,6 +192,7 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
                 assert [w.back for w in body].index(True) == len(body) - FETCH - 1
                 for lane in range(0, head.last + 1, head.step):
                     for w in body:
+                        assert not isinstance(w.does, Loop)
                         for slot in w.does:
                             if slot is not None:
                                 step(slot, lane)

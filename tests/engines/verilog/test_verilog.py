@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import pytest
@@ -375,7 +375,8 @@ def test_whole_numbers_have_as_many_words_as_they_need_and_what_may_not_fit_is_r
     assert most_of(tick, fits) == 2**32
     tick.here = "a line"
     over = tick.sum([tick.plain(large), tick.plain(fits)], mode="RAW")
-    need_room(SimpleNamespace(tick=tick, order=[fits]))
+    planned = lambda *order: cast("Plan", SimpleNamespace(tick=tick, order=[*order]))
+    need_room(planned(fits))
     with pytest.raises(LoweringError, match="may not fit a word of the machine") as caught:
-        need_room(SimpleNamespace(tick=tick, order=[fits, over]))
+        need_room(planned(fits, over))
     assert caught.value.path == "a line"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from flowgraph import DeclarationError, MissingDependencyError, UnknownNameError
@@ -64,7 +66,7 @@ def test_toggles_are_the_sum_of_what_verilator_counted():
 @pytest.mark.slow
 def test_a_filter_is_compared_and_weighed():
     need_verilator()
-    given = dict(graphs="gyro_integration", flights=1, duration=1.0, compared=0.1, bound=1.0)
+    given: dict[str, Any] = dict(graphs="gyro_integration", flights=1, duration=1.0, compared=0.1, bound=1.0)
     (found,) = hardware(**given, energy=True).rows
     assert found["values_compared"] > 100
     assert found["values_differing"] == 0
