@@ -19,6 +19,7 @@ from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.lost import PATIENCE, Held, stay
 from flowgraph.blocks.models.euler_ins import euler_angles, navigation_belief
 from flowgraph.blocks.models.particle_ins import (
+    BANDWIDTH,
     average_kernels,
     average_state,
     correct_states,
@@ -52,7 +53,7 @@ def ins_particle(
     reading: str = "instant",
     resample_below: float = 0.5,
     spread: float = 0.0,
-    bandwidth: float | None = None,
+    bandwidth: float = BANDWIDTH,
     gate: float | None = None,
     patience: int = PATIENCE,
     scheme: str = "systematic",
@@ -127,9 +128,9 @@ def for_flight(
     filter: EulerPose,
     control: HeldControl,
     gated: Gated,
-    inflate: Positive = 1.25,
+    inflate: Positive = 1.0,
     spread: NotNegative = 0.0,
-    bandwidth: Share | None = None,
+    bandwidth: Share = BANDWIDTH,
 ) -> Case:
     """Start the particles around the first measured pose of a flight, at rest and without biases.
 
@@ -137,10 +138,10 @@ def for_flight(
         flight: with the stream `imu`, and one of `pose`, `tags` (of which PnP makes poses first) and `vicon`.
         particles: how many; the course asks for 5,000.
         gyro_factor, accelerometer_factor: on the densities of the flight's IMU.
-        inflate: on all standard deviations of the measured pose: a few particles are less sure than many.
+        inflate: on all standard deviations of the measured pose.
         spread: by what part of the sample's range, over particles^(1/15), copies are shaken apart; 0.2 is
             Gordon's.
-        bandwidth: of the kernels in deviations of the cloud; Silverman's if left out, and 0 draws the
+        bandwidth: of the kernels in deviations of the cloud: 1 makes it a Gaussian filter, 0 draws the
             particles without a look at the pose.
 
     Raises:

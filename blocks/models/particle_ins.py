@@ -34,7 +34,7 @@ from flowgraph.blocks.models.euler_ins import (
     pose_noise,
     see_pose_angles,
 )
-from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.guided import corrected, drawn, spread_of
 from flowgraph.blocks.particles.lost import verdict
 from flowgraph.blocks.particles.resampling import ancestor_index, roughening
 from flowgraph.blocks.signals import (
@@ -48,6 +48,7 @@ from flowgraph.blocks.signals import (
 )
 
 __all__ = [
+    "BANDWIDTH",
     "average_kernels",
     "average_state",
     "correct_states",
@@ -55,6 +56,9 @@ __all__ = [
     "resample_states",
     "start_states",
 ]
+
+BANDWIDTH = 0.95
+"""Of the kernels, if none is set: nearly a Gaussian filter, as the posterior of a pose is nearly Gaussian."""
 
 _MOVING = np.arange(15) < 9
 """Position, angles and velocity: what of a state may have lost track."""
@@ -102,7 +106,7 @@ def correct_states(
     R: npt.ArrayLike,
     factor: float = 1.0,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    bandwidth: float | None = None,
+    bandwidth: float = BANDWIDTH,
     gate: float | None = None,
     patience: int = PATIENCE,
     xp: Any,
@@ -119,8 +123,7 @@ def correct_states(
         pose: measured; an entry that is NaN was not, and a NaN in the quaternion takes all angles with it.
         order: "zxy" or "zyx".
         R, factor, lever: as in `euler_ins.update_pose_angles`.
-        bandwidth: of the kernels in deviations of the cloud, 0 to 1; 0 is the bootstrap filter, and
-            Silverman's if left out.
+        bandwidth: of the kernels in deviations of the cloud, 0 to 1; 0 is the bootstrap filter.
         gate, patience: as in `lost.verdict`.
 
     Returns:
@@ -129,7 +132,6 @@ def correct_states(
     State: how many poses were too far off in a row.
     """
     x, kind = cloud.state, cloud.state.dtype
-    n = x.shape[0]
     mean = _mean(cloud.log_weight, x, xp)
     spread = spread_of(x, xp.exp(cloud.log_weight), mean, space=STATE, xp=xp)
     e = mean[3:6]
@@ -159,7 +161,7 @@ def correct_states(
         H,
         noise,
         space=STATE,
-        bandwidth=silverman(n, STATE.tangent) if bandwidth is None else bandwidth,
+        bandwidth=bandwidth,
         wider=spread.covariance * moving * (grow - 1.0),
         xp=xp,
     )
@@ -187,7 +189,7 @@ def resample_states(
     xp: Any,
 ) -> tuple[StateCloud, Scalar, Ancestors]:
     """Choose which kernels live on where their effective sample size is below a part of their number; then
-    draw a particle of each, and shake the copies apart.
+    draw a particle of each, with the mean and covariance of the weighted kernels, and shake the copies apart.
 
     Draws `place` as the scheme has it, `kernel` (15, n) and `spread` (15, n).
 
@@ -209,13 +211,23 @@ def resample_states(
     resampled = size < below * n
     index = xp.where(resampled, index, xp.arange(n, dtype=xp.int64))
     shake = xp.asarray(draw.normal("spread", (15, n)), dtype=x.dtype).mT
-    apart = STATE.minus(x, _mean(kernels.log_weight, x, xp)[None, :], xp)
-    shake = shake * xp.where(resampled, roughening(apart, spread, xp=xp), 0.0)
+    mean = _mean(kernels.log_weight, x, xp)
+    about = spread_of(x, weight, mean, space=STATE, xp=xp)
+    shake = shake * xp.where(resampled, roughening(about.apart, spread, xp=xp), 0.0)
     normal = xp.asarray(draw.normal("kernel", (15, n)), dtype=x.dtype).mT
     root = covariance_root(kernels.covariance, xp=xp)
-    fresh = drawn(STATE.plus(xp.take(x, index, axis=0), shake, xp), root, normal, space=STATE, xp=xp)
     log_weight = xp.where(resampled, -math.log(n), kernels.log_weight)
-    cloud = StateCloud(log_weight=log_weight, state=fresh)
+    fresh = drawn(
+        xp.take(x, index, axis=0),
+        root,
+        normal,
+        xp.exp(log_weight),
+        mean,
+        about.covariance + kernels.covariance,
+        space=STATE,
+        xp=xp,
+    )
+    cloud = StateCloud(log_weight=log_weight, state=STATE.plus(fresh, shake, xp))
     return cloud, size, Ancestors(index=xp.astype(index, xp.int32), resampled=resampled)
 
 

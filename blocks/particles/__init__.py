@@ -24,7 +24,7 @@ from flowgraph.blocks.particles.cloud import (
     weights,
     within_depth,
 )
-from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.guided import Kernels, Spread, corrected, drawn, spread_of
 from flowgraph.blocks.particles.lost import (
     BELIEVED,
     believe_pose,
@@ -75,7 +75,6 @@ __all__ = [
     "roughening",
     "corrected",
     "drawn",
-    "silverman",
     "spread_of",
     "believe_pose",
     "depletion",

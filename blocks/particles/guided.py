@@ -9,15 +9,19 @@ the covariance of the cloud. Given a kernel, a measurement is then what it is fo
 
 and new points are drawn from N(m_i', C) of the kernels that live on. That is the proposal for which weights
 vary least, and a weight is known before its point is drawn; so no two points are copies of one. No derivative
-of the motion is needed. h = 0 is the bootstrap filter, h = 1 is all but an ensemble Kalman filter; between
-them h is Silverman's, by which a density of d numbers is told from n points.
+of the motion is needed. h = 0 is the bootstrap filter, h = 1 a Gaussian filter with a sampled motion. The
+weights tell what is not Gaussian, and chance has a say in them: a correction adds about (1 - h^2) V / N_eff
+to the error of the mean. New points are drawn second-order exact: with the mean and covariance of kernels.
 
 Sources: A. Doucet, S. Godsill and C. Andrieu, "On sequential Monte Carlo sampling methods for Bayesian
 filtering", Statistics and Computing 10, 2000, sec. II-D (the optimal proposal, by local linearisation); M.
 West, "Mixture models, Monte Carlo, Bayesian updating and dynamic models", Computing Science and Statistics
 24, 1993 (kernels drawn together); C. Musso, N. Oudjane and F. Le Gland, "Improving regularised particle
 filters", in "Sequential Monte Carlo Methods in Practice", 2001, sec. 12.2.3 (regularised before the
-correction); B. Silverman, "Density Estimation for Statistics and Data Analysis", 1986, sec. 4.3.
+correction); D. T. Pham, "Stochastic methods for sequential data assimilation in strongly nonlinear systems",
+Monthly Weather Review 129, 2001 (second-order-exact sampling); A. Stordal, H. Karlsen, G. Naevdal, H. Skaug
+and B. Valles, "Bridging the ensemble Kalman filter and particle filters: the adaptive Gaussian mixture
+filter", Computational Geosciences 15, 2011 (h between the two filters).
 """
 
 from __future__ import annotations
@@ -28,9 +32,13 @@ from typing import Any, NamedTuple
 from flowgraph import Array
 from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.lost import FARTHEST
+from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.particles.cloud import log_sum_exp
 
-__all__ = ["Kernels", "Spread", "corrected", "drawn", "silverman", "spread_of"]
+__all__ = ["Kernels", "Spread", "corrected", "drawn", "spread_of"]
+
+_FLAT = 1e-6
+"""The share of its variance from which what the numbers before it leave of a number is its own spread."""
 
 
 class Spread(NamedTuple):
@@ -47,12 +55,6 @@ class Kernels(NamedTuple):
     middle: Array
     covariance: Array
     log_weight: Array
-
-
-def silverman(n: int, d: int) -> float:
-    """The bandwidth h, in deviations of the cloud, for n points of d numbers: (4 / (n (d + 2)))^(1/(d + 4)),
-    at most 1."""
-    return min(1.0, float((4.0 / (n * (d + 2.0))) ** (1.0 / (d + 4.0))))
 
 
 def spread_of(x: Array, weight: Array, mean: Array, *, space: StateSpace, xp: Any) -> Spread:
@@ -110,10 +112,40 @@ def corrected(
     )
 
 
-def drawn(middle: Array, root: Array, normal: Array, *, space: StateSpace, xp: Any) -> Array:
-    """A point (n, size) of each kernel, about its middle.
+def drawn(
+    middle: Array,
+    root: Array,
+    normal: Array,
+    weight: Array,
+    mean: Array,
+    covariance: Array,
+    *,
+    space: StateSpace,
+    xp: Any,
+) -> Array:
+    """A point (n, size) of each kernel, all moved together so that they have a given mean and covariance.
 
-    The normal draws (n, t) are centred, which moves no mean; root (t, t) is one of the kernel's covariance.
+    What chance does to the first two moments, in choosing kernels and in drawing, would add up over the
+    corrections in whatever is told slowly; so it is taken back. The distances of the points from their own
+    mean are multiplied by L S^-1, L the root (t, t) of the covariance and S that of theirs. Points that do
+    not span all t directions, as with n <= t, are only centred.
+
+    Args:
+        middle: of the kernels that were chosen (n, size).
+        root: (t, t), of the covariance of each.
+        normal: standard normal draws (n, t).
+        weight: of the points (n).
+        mean, covariance: what the points shall have, (size) and (t, t).
     """
-    normal = normal - xp.mean(normal, axis=0, keepdims=True)
-    return space.plus(middle, normal @ root.mT, xp)
+    apart = space.minus(space.plus(middle, normal @ root.mT, xp), mean[None, :], xp)
+    apart = apart - (weight @ apart)[None, :]
+    n, t = apart.shape
+    if n <= t:
+        return space.plus(mean[None, :], apart, xp)
+    own = (apart * weight[:, None]).mT @ apart
+    one = xp.eye(t, dtype=own.dtype)
+    S, L = covariance_root(0.5 * (own + own.mT), xp=xp), covariance_root(covariance, xp=xp)
+    pivot, variance = xp.sum(S * one, axis=-1), xp.sum(own * one, axis=-1)
+    spans = xp.all(pivot * pivot > _FLAT * variance)
+    stretch = xp.linalg.solve(xp.where(spans, S, one).mT, xp.where(spans, L, one).mT)
+    return space.plus(mean[None, :], apart @ stretch, xp)

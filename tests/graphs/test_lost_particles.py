@@ -207,8 +207,8 @@ def course(seed: int, seconds: float = 6.0) -> Flight:
 def test_particles_keep_up_with_the_unscented_filter(tmp_path):
     """Eight flights, each with a cloud and draws of its own seed, as the command has them.
 
-    How many ticks of one flight are in the band is a matter of chance: over 64 flights `ins_ukf_pose` is
-    consistent (NEES 8.83 of 9, 0.948 inside), and of one in ten flights it has less than 0.9 inside.
+    How many ticks of one flight are in the band is a matter of chance, for a consistent filter too: over 64
+    flights `ins_ukf_pose` has less than 0.9 inside on one in ten. So each flight is held against its own.
     """
     pytest.importorskip("pyarrow")
     study = Study(graphs=["ins_particle", "ins_ukf_pose"], data=["sim"], seeds=8, engine="c", chunk=8)
@@ -217,9 +217,10 @@ def test_particles_keep_up_with_the_unscented_filter(tmp_path):
     for row in read_table(tmp_path):
         rows[row["graph"]][row["seed"]] = row
     for seed, row in rows["ins_particle"].items():
-        assert row["position_rmse_m"] < 1.3 * rows["ins_ukf_pose"][seed]["position_rmse_m"]
-    assert np.mean([row["nees_inside"] for row in rows["ins_particle"].values()]) > 0.9
-    assert np.mean([row["nees_mean"] for row in rows["ins_particle"].values()]) > 6.0
+        unscented = rows["ins_ukf_pose"][seed]
+        assert row["position_rmse_m"] < 1.1 * unscented["position_rmse_m"]
+        assert row["nees_inside"] == pytest.approx(unscented["nees_inside"], abs=0.04)
+        assert row["nees_mean"] == pytest.approx(unscented["nees_mean"], rel=0.1)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 from flowgraph import Series
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean
-from flowgraph.blocks.particles.guided import corrected, drawn, silverman, spread_of
+from flowgraph.blocks.particles.guided import corrected, drawn, spread_of
 from flowgraph.blocks.particles.lost import depletion_remarks, verdict, within_reach
 from flowgraph.blocks.particles.resampling import roughening
 from flowgraph.blocks.signals import Depletion
@@ -58,17 +58,45 @@ def test_wider_kernels_have_more_even_weights():
     assert sizes[0] < 0.6 * sizes[1] < 0.6 * sizes[2]
 
 
-def test_points_are_drawn_about_their_kernels_without_moving_the_mean():
-    middle = np.arange(12.0).reshape(4, 3)
-    normal = np.random.default_rng(3).normal(size=(4, 3))
-    points = drawn(middle, 0.1 * np.eye(3), normal, space=FLAT, xp=np)
-    np.testing.assert_allclose(points.mean(axis=0), middle.mean(axis=0))
-    np.testing.assert_allclose(points - middle, 0.1 * (normal - normal.mean(axis=0)))
+@pytest.mark.parametrize("even", [True, False])
+def test_points_are_drawn_with_the_mean_and_covariance_that_are_asked_for(even):
+    rng = np.random.default_rng(3)
+    n, root = 40, np.array([[0.5, 0.0, 0.0], [0.2, 0.4, 0.0], [0.3, -0.1, 0.3]])
+    weight = np.full(n, 1.0 / n) if even else rng.dirichlet(np.ones(n))
+    mean, covariance = np.array([1.0, -2.0, 3.0]), root @ root.T
+    points = drawn(
+        rng.normal(size=(n, 3)),
+        0.3 * root,
+        rng.normal(size=(n, 3)),
+        weight,
+        mean,
+        covariance,
+        space=FLAT,
+        xp=np,
+    )
+    np.testing.assert_allclose(weight @ points, mean, atol=1e-12)
+    np.testing.assert_allclose(
+        spread_of(points, weight, mean, space=FLAT, xp=np).covariance, covariance, atol=1e-12
+    )
 
 
-def test_silvermans_bandwidth():
-    assert silverman(1000, 15) == pytest.approx((4.0 / 17_000.0) ** (1.0 / 19.0))
-    assert silverman(1, 1) == 1.0
+def test_points_that_are_as_asked_for_stay():
+    rng = np.random.default_rng(4)
+    x, weight = rng.normal(size=(20, 3)), rng.dirichlet(np.ones(20))
+    V = spread_of(x, weight, weight @ x, space=FLAT, xp=np).covariance
+    points = drawn(x, np.zeros((3, 3)), rng.normal(size=(20, 3)), weight, weight @ x, V, space=FLAT, xp=np)
+    np.testing.assert_allclose(points, x, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 3, 20])
+def test_points_that_lie_in_a_plane_are_only_centred(n):
+    """Or too few: nothing stretches them into what they do not span."""
+    x = np.random.default_rng(5).normal(size=(n, 3))
+    if n > 3:
+        x[:, 2] = x[:, 0] - x[:, 1]
+    weight, mean = np.full(n, 1.0 / n), np.array([1.0, -2.0, 3.0])
+    points = drawn(x, np.zeros((3, 3)), np.zeros((n, 3)), weight, mean, np.eye(3), space=FLAT, xp=np)
+    np.testing.assert_allclose(points, x - weight @ x + mean, atol=1e-12)
 
 
 def test_roughening_goes_by_the_range_of_the_sample():

@@ -118,14 +118,17 @@ def others(start: Stream[Tick], imu: Stream[Tick]):
     )
     motion = figure_motion(latest(figure_shape(at=start), init=none), at=imu)
     first = latest(bias_at_start(at=start, deviation=0.3), init=Vector(vector=np.zeros(3)))
+    drawn = bias_at_start(at=start, deviation=1e-6, name="iron", draws="iron")
+    iron = latest(drawn, init=Vector(vector=np.zeros(3)), name="iron_now")
     return {
         "motion": motion,
         "range": read_altimeter(motion, noise=0.0, most_tilt=0.2),
         "position": read_position(motion, noise=0.0, lever=(0.0, 0.0, 1.0)),
         "attitude": read_attitude(motion, noise=0.05),
-        "field": read_magnetometer(motion, field=FIELD, noise=0.0),
+        "field": read_magnetometer(motion, iron, field=FIELD, noise=0.0),
         "flow": read_flow(motion, noise=0.0, turn_noise=0.0),
         "bias": drift(first, at=imu, walk=0.0),
+        "iron": drawn,
     }
 
 
@@ -145,7 +148,7 @@ def test_other_sensors_read_what_they_say() -> None:
     assert np.sqrt(np.mean(off**2)) == pytest.approx(np.degrees(0.05 * math.sqrt(3.0)), rel=0.2)
     q = motion["attitude"]
     world = multiply(
-        multiply(q, np.c_[np.zeros(len(q)), found["field"]["field"] - [1e-6, 0, 0]], xp=np),
+        multiply(q, np.c_[np.zeros(len(q)), found["field"]["field"] - found["iron"]["vector"]], xp=np),
         conjugate(q, xp=np),
         xp=np,
     )
