@@ -51,7 +51,7 @@ def test_a_step_is_that_of_the_filters_own_motion(seed, monkeypatch):
 
 def test_no_filter_is_below_it_and_one_that_knows_the_noise_is_near():
     quiet = {"sensors": "imu,vicon", "duration": "10", "gyro.noise": "0.01", "accelerometer.noise": "0.03"}
-    flights = [load_flight("sim:thesis", seed=seed, settings=quiet) for seed in range(8)]
+    flights = [load_flight("sim:thesis", seed=seed, settings=quiet) for seed in range(32)]
     truths = [flight.truth for flight in flights if flight.truth is not None]
     time = truths[0].time
     velocity, attitude = (np.stack([t[name] for t in truths], axis=1) for name in ("velocity", "attitude"))
@@ -64,6 +64,6 @@ def test_no_filter_is_below_it_and_one_that_knows_the_noise_is_near():
     inputs = [{name: flight.streams[name] for name in ("imu", "vicon")} for flight in flights]
     starts = [{"belief": start_pose(t["position"][0], t["attitude"][0])} for t in truths]
     graph = ekf.case(flights[0]).graph
-    many = simulate_many(graph, inputs, range(8), engine="c", init=starts, keep=["belief.attitude"])
+    many = simulate_many(graph, inputs, range(len(flights)), engine="c", init=starts, keep=["belief.attitude"])
     off = geodesic_angle(many["belief"].attitude, attitude.swapaxes(0, 1))[:, time >= 1_000_000_000]
     assert 0.9 < np.mean(np.radians(off) ** 2) / least < 1.15
