@@ -64,6 +64,8 @@ def test_no_filter_is_below_it_and_one_that_knows_the_noise_is_near():
     inputs = [{name: flight.streams[name] for name in ("imu", "vicon")} for flight in flights]
     starts = [{"belief": start_pose(t["position"][0], t["attitude"][0])} for t in truths]
     graph = ekf.case(flights[0]).graph
-    many = simulate_many(graph, inputs, range(len(flights)), engine="c", init=starts, keep=["belief.attitude"])
+    many = simulate_many(
+        graph, inputs, range(len(flights)), engine="c", init=starts, keep=["belief.attitude"]
+    )
     off = geodesic_angle(many["belief"].attitude, attitude.swapaxes(0, 1))[:, time >= 1_000_000_000]
     assert 0.9 < np.mean(np.radians(off) ** 2) / least < 1.15
