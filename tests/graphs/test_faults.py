@@ -108,8 +108,8 @@ UNGATED = {
 """Filters in which a spike that neither a range nor a gate refuses lasts: it throws them off by 30 m/s and
 3 rad, and a filter that believes each measurement takes it for a bias, or one of the aids for a liar."""
 
-SLOWER = {"outdoor_eskf": 3.0, "rbpf_outdoor": 10.0}
-"""How many times the usual error is right after a spike: the usual one is the mean of 11 readings of a
+SLOWER = {"outdoor_eskf": 3.0, "gnss_ins": 3.0, "rbpf_outdoor": 10.0}
+"""How many times the usual error is right after a spike: the usual one is the mean of a dozen readings of a
 receiver, and a small cloud that was thrown comes back by the grace of its draws; it warns of it."""
 
 
