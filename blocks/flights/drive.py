@@ -24,8 +24,7 @@ from flowgraph.blocks import sensors as s
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.inertial.navigation import earth_at, gravity_at
 from flowgraph.blocks.signals import BodyMotion, RoadPiece, Vector
-from flowgraph.blocks.world import NO_ROAD, drive_motion, road_of
-from flowgraph.blocks.world.drive import REST
+from flowgraph.blocks.world import NO_ROAD, REST_OF_DRIVE, drive_motion, road_of
 from flowgraph.data.experiment import Experiment
 from flowgraph.data.inputs import clocks_of
 from flowgraph.data.notes import note
@@ -104,7 +103,7 @@ def load_drive(*, seed: int = 0, settings: Mapping[str, Any] | None = None) -> F
         "origin": ORIGIN,
         "magnetic_field": _FIELD,
         "gps_lever": (0.0, 0.0, 0.0),
-        "still": REST,
+        "still": REST_OF_DRIVE,
         "noise": {"magnetometer": {"noise": values["magnetometer.noise"]}},
         "start_spread": (grade.gyro_bias, grade.accelerometer_bias),
     }

@@ -9,7 +9,7 @@ turns out and back in its place, `Hover` stays. `smooth` is the figure of `sim`,
 from __future__ import annotations
 
 from flowgraph.blocks.world import thesis
-from flowgraph.blocks.world.drive import NO_ROAD, drive_motion, road_of
+from flowgraph.blocks.world.drive import NO_ROAD, REST_OF_DRIVE, drive_motion, road_of
 from flowgraph.blocks.world.feasibility import LIMITS, Limits, feasible
 from flowgraph.blocks.world.figures import Figures, figures
 from flowgraph.blocks.world.hover import Hover, hover_waves
@@ -43,6 +43,7 @@ __all__ = [
     "Figures",
     "figures",
     "NO_ROAD",
+    "REST_OF_DRIVE",
     "drive_motion",
     "road_of",
     "AT_REST",

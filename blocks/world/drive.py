@@ -22,9 +22,9 @@ from flowgraph.blocks.geometry.rotations import multiply
 from flowgraph.blocks.signals import BodyMotion, RoadPiece
 from flowgraph.recorder.random import Site, seed_words
 
-__all__ = ["NO_ROAD", "REST", "drive_motion", "road_of"]
+__all__ = ["NO_ROAD", "REST_OF_DRIVE", "drive_motion", "road_of"]
 
-REST = 3.0
+REST_OF_DRIVE = 3.0
 """s, at the start."""
 
 _AWAY = 4.0  # s, until the pace is what it is to be
@@ -51,7 +51,7 @@ class Timetable:
     @classmethod
     def of(cls, duration: float) -> Self:
         knots = np.linspace(0.0, max(duration, 1.0), max(int(duration / 6.0), 2) + 1)
-        begins = np.minimum([REST, REST + _AWAY], knots[-1])
+        begins = np.minimum([REST_OF_DRIVE, REST_OF_DRIVE + _AWAY], knots[-1])
         breaks = np.unique(np.rint(np.concatenate([knots, begins]) * 1e9)) / 1e9  # a tick each
         return cls(knots, breaks, max(6, int(duration * 15.0 / _APART) + 6))
 
@@ -158,7 +158,7 @@ def _along_it(table: Timetable, paces: np.ndarray) -> np.ndarray:
 
 def _begun(begin: float, length: float) -> np.ndarray:
     """The share of the pace that the car has, 0 at rest, up to 1: coefficients (6,) in a piece's share."""
-    since = (begin - REST) / _AWAY
+    since = (begin - REST_OF_DRIVE) / _AWAY
     if since < 0.0 or since >= 1.0:
         return np.array([float(since >= 1.0), 0.0, 0.0, 0.0, 0.0, 0.0])
     smooth = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
