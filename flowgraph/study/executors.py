@@ -366,10 +366,13 @@ class OnDask(_Closing):
                 self._send(self._suspects.popleft(), alone=True)
 
     def close(self) -> None:
+        if self._cluster is not None:
+            with suppress(Exception):  # one that is just being started again cannot be told to go
+                self._client.wait_for_workers(self.workers, timeout=10)
         with suppress(TimeoutError):  # what has been done is there, however long they take to go
             self._client.close(timeout=5)
         if self._cluster is not None:
-            with suppress(TimeoutError):
+            with suppress(TimeoutError, AssertionError):  # its keepers trip over a worker that died unseen
                 self._cluster.close(timeout=10)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import multiprocessing
 import os
 import signal
 import socket
@@ -64,6 +65,15 @@ def test_a_task_that_kills_its_workers_is_given_up_and_the_rest_end(kind, worker
     assert done["poison"].lost
     assert "2" in done["poison"].lost or kind is OnDask
     assert all(done[f"{x}"].value == x for x in range(6))
+
+
+def test_a_cluster_closes_while_its_worker_is_started_anew():
+    """A worker that is about to be there cannot be told to go, and no process is left behind."""
+    pytest.importorskip("distributed")
+    pool = OnDask(workers=1)
+    os.kill(pool.pids()[0], signal.SIGKILL)
+    pool.close()
+    assert not [p for p in multiprocessing.active_children() if "Dask" in p.name]
 
 
 def test_a_death_is_forgiven_once(tmp_path):
