@@ -45,6 +45,7 @@ def hardware(
     played: str = "verilog",
     energy: bool = False,
     routed: bool = False,
+    seeds: int = 1,
     space: str = "",
     folder: str = "",
     seed: int = 0,
@@ -63,6 +64,7 @@ def hardware(
         played: "verilog", or "hls" for the C++ of high-level synthesis, which has no cycles.
         energy: whether to count what the energy of a tick goes with.
         routed: whether to synthesise, place and route each.
+        seeds: of the placer: they are tried until one reaches 100 MHz, and the fastest counts.
         space: widths between commas, such as 16,20,24: then one graph is made in each, and a row is a
             machine, with a picture of the Pareto front. See `hardware_space`.
         folder: where the files of each go; a temporary one if left out.
@@ -91,7 +93,7 @@ def hardware(
             )  # fmt: skip
         return design_space(
             names[0], numbers(space, "space"), counts, flights=flights, duration=duration,
-            particles=particles, routed=routed, folder=folder, seed=seed,
+            particles=particles, routed=routed, seeds=seeds, folder=folder, seed=seed,
         )  # fmt: skip
     rows: list[dict[str, Any]] = []
     for name, count in product(names, counts):
@@ -112,7 +114,7 @@ def hardware(
             if energy:
                 _weighed(row, pipeline, some[-1], compared)
             if routed:
-                _routed(row, pipeline, some[-1], folder)
+                _routed(row, pipeline, some[-1], folder, seeds)
             clock = row["fmax_hz"] or TARGET_HZ
             row["us_per_tick"] = row["cycles_all_aids"] / clock * 1e6
         except FlowgraphError as error:
@@ -120,7 +122,8 @@ def hardware(
         rows.append(row)
     where = "Verilator" if played == "verilog" else "C++ compiled here"
     note = f"formats from {flights} flights of {duration:g} s; {compared:g} s of another played in {where}"
-    return Report(rows, {}, (note,))
+    tried = (f"place and route with up to {seeds} seeds, the fastest counts",) if routed and seeds > 1 else ()
+    return Report(rows, {}, (note, *tried))
 
 
 _COLUMNS = (
@@ -161,11 +164,11 @@ def _weighed(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) ->
     row["energy_estimate_toggles"] = round(toggles(image, events, start.cells, seed_words(flight.seed)))
 
 
-def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> None:
+def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str, seeds: int) -> None:
     events, _ = taped(flight, None)
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / pipeline.name
         at.mkdir(parents=True, exist_ok=True)
         for name, text in texts(Image(pipeline, events.patterns, row["lanes"])).items():
             put(at / name, text)
-        row |= vars(route(at, pipeline.name))
+        row |= vars(route(at, pipeline.name, seeds=seeds))
