@@ -24,6 +24,7 @@ from flowgraph.engines.verilog.text import texts
 from flowgraph.engines.verilog.toggles import toggles
 from flowgraph.graphs.benches.fixed import flown
 from flowgraph.graphs.benches.hardware_space import design_space, numbers, taped
+from flowgraph.language.checks import need_count
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import RELATIVE, quantise
 
@@ -58,7 +59,7 @@ def hardware(
         bound: of the difference of the estimate to float64, relative to its size.
         flights: simulated ones, that the formats are found on; one more judges.
         duration: of a flight, s.
-        compared: seconds of it that are played in Verilator.
+        compared: seconds of it that are played in Verilator; with 0 the machine is made and not played.
         particles: of the filters that have some; as many as `bench fixed` takes if left out.
         lanes: of the machine, some between commas; each has a multiplier of 34 bits.
         played: "verilog", or "hls" for the C++ of high-level synthesis, which has no cycles.
@@ -75,14 +76,20 @@ def hardware(
         `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
-        the program and `words` of memory; where `energy` is asked for, `energy_estimate_operations` (terms of
-        sums in the longest tick; None of a filter with loops) and `energy_estimate_toggles` (bits that change
-        in a mean tick, block memories left out); `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
-        routed), `us_per_tick` (with all aids, at that clock, or else at 100 MHz), and `reason`, why
-        there is no machine.
+        the program, `words` of memory, and the `memories` of 18 kbit that both want; where `energy` is asked
+        for, `energy_estimate_operations` (terms of sums in the longest tick; None of a filter with loops) and
+        `energy_estimate_toggles` (bits that change in a mean tick, block memories left out); `lut`, `ff`,
+        `dsp`, `bram`, `fmax_hz` (None where it was not routed), `us_per_tick` (with all aids, at that clock,
+        or else at 100 MHz), and `reason`, why there is no machine.
     """
     if played not in ("verilog", "hls"):
         raise UnknownNameError("text to play", played, ("verilog", "hls"), path="played")
+    if compared < 0.0 or (compared == 0.0 and (energy or played == "hls")):
+        raise DeclarationError(
+            "this plays a part of a flight", path="compared", expected="more than 0 s", got=f"{compared:g}",
+            fix="write --set compared=0.5",
+        )  # fmt: skip
+    need_count("hardware", "seeds", seeds, least=1)
     names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
     counts = numbers(lanes, "lanes")
     if space:
@@ -129,24 +136,26 @@ def hardware(
 _COLUMNS = (
     "graph", "particles", "width", "lanes", "multipliers", "position_difference_rms_m",
     "attitude_difference_rms_deg", "saturations", "values_compared", "values_differing",
-    "cycles", "cycles_all_aids", "steps", "words",
+    "cycles", "cycles_all_aids", "steps", "words", "memories",
     "energy_estimate_operations", "energy_estimate_toggles", "lut", "ff", "dsp", "bram", "fmax_hz",
     "us_per_tick", "reason",
 )  # fmt: skip
 
 
 def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
-    events, start = taped(flight, seconds)
-    player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
-    player.play(events, start.cells, seed_words(flight.seed), None)
+    if seconds:
+        events, start = taped(flight, seconds)
+        player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
+        player.play(events, start.cells, seed_words(flight.seed), None)
+        image, cycles = player.image, player.cycles
+        row |= {"values_compared": player.compared, "values_differing": player.differing}
+    else:
+        image = Image(pipeline, taped(flight)[0].patterns, row["lanes"])
+        cycles = [e.cycles for e in image.entries]
     row |= {
-        "values_compared": player.compared,
-        "values_differing": player.differing,
-        "cycles": min(player.cycles),
-        "cycles_all_aids": max(player.cycles),
-        "steps": len(player.image.program),
-        "words": player.image.words,
-    }
+        "cycles": min(cycles), "cycles_all_aids": max(cycles), "steps": len(image.program),
+        "words": image.words, "memories": image.memories,
+    }  # fmt: skip
 
 
 def _compiled(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:

@@ -15,7 +15,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from flowgraph.errors import MissingDependencyError
-from flowgraph.language.checks import need_count
 
 TARGET_HZ = 100e6
 """The clock that the router is asked for."""
@@ -98,10 +97,8 @@ def route(folder: Path, name: str, *, clock: float = TARGET_HZ, seeds: int = 1) 
         seeds: of the placer that are tried, 1 and so on, until one reaches that clock; the fastest is kept.
 
     Raises:
-        DeclarationError: for less than one seed.
         MissingDependencyError: where a tool is not installed.
     """
-    need_count("place and route", "seeds", seeds, least=1)
     synthesise(folder, name)
     best: Figures | None = None
     for seed in range(1, seeds + 1):

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from flowgraph import DeclarationError, MissingDependencyError, Scalar, Stream, block, delay, graph
+from flowgraph import MissingDependencyError, Scalar, Stream, block, delay, graph
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.engines.verilog import place
 from flowgraph.engines.verilog.image import Image
@@ -76,11 +76,6 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
     assert ran == list(range(1, tried + 1))
     assert (tmp_path / "tank.config").read_text() == f"{best}"
     assert json.loads((tmp_path / "tank_report.json").read_text())["fmax"]["clk"]["achieved"] == best
-
-
-def test_place_and_route_needs_a_seed(tmp_path):
-    with pytest.raises(DeclarationError, match="needs a whole number as 'seeds'"):
-        place.route(tmp_path, "tank", seeds=0)
 
 
 def test_figures_are_those_of_the_report():
