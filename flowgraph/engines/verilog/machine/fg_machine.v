@@ -51,7 +51,7 @@ module fg_machine #(
   localparam FETCH = 5;  // registers from the number of a step to its microword
 
   // -- the program ------------------------------------------------------------------------------------------
-  wire [CODE-1:0] fetched;
+  wire [CODE-1:0] arrived, fetched;
   reg [STEP-1:0] step;
   reg [CODE-1:0] code;
   reg running;
@@ -63,8 +63,32 @@ module fg_machine #(
   fg_memory #(
       .WIDTH(CODE), .PLACE(STEP), .WORDS(STEPS), .DEEP(1), .READS(1), .FILE(PROGRAM)
   ) steps (
-      .clk(clk), .go(go), .place(step), .word(fetched), .write(1'b0), .to({STEP{1'b0}}), .written({CODE{1'b0}})
+      .clk(clk), .place(step), .word(arrived), .write(1'b0), .to({STEP{1'b0}}), .written({CODE{1'b0}})
   );
+  // The program's memory never stands still: what arrives while the machine does is kept, to be taken in its order.
+  generate
+    if (ROWS != 0) begin : keeps
+      reg [CODE-1:0] kept[0:7];
+      reg [2:0] kept_to, kept_from;
+      reg [FETCH-2:0] went;
+      initial begin
+        kept_to = 3'd0;
+        kept_from = 3'd0;
+        went = {FETCH - 1{1'b1}};
+      end
+      always @(posedge clk) begin
+        went <= {went[FETCH-3:0], go};
+        if (went[FETCH-2]) begin
+          kept[kept_to] <= arrived;
+          kept_to <= kept_to + 3'd1;
+        end
+        if (go) kept_from <= kept_from + 3'd1;
+      end
+      assign fetched = kept_from == kept_to ? arrived : kept[kept_from];
+    end else begin : keeps_none
+      assign fetched = arrived;
+    end
+  endgenerate
   wire halts = go && live[FETCH-1] && code[HALT];
   wire takes = live[FETCH-2] && !halts;
   always @(posedge clk) begin
@@ -209,12 +233,12 @@ module fg_machine #(
       fg_memory #(
           .PLACE(PLACE), .WORDS(WORDS), .BANKS(BANKS), .DEEP(DEEP), .FILE(MEMORY)
       ) memory_a (
-          .clk(clk), .go(1'b1), .place(a_place), .word(a), .write(bank_write), .to(bank_to), .written(bank_word)
+          .clk(clk), .place(a_place), .word(a), .write(bank_write), .to(bank_to), .written(bank_word)
       );
       fg_memory #(
           .PLACE(PLACE), .WORDS(WORDS), .BANKS(BANKS), .DEEP(DEEP), .FILE(MEMORY)
       ) memory_b (
-          .clk(clk), .go(1'b1), .place(b_place), .word(b), .write(bank_write), .to(bank_to), .written(bank_word)
+          .clk(clk), .place(b_place), .word(b), .write(bank_write), .to(bank_to), .written(bank_word)
       );
       if (LATER != 0) begin : later
         reg [LANE-1:0] code1, code2;

@@ -2,7 +2,7 @@
 // lowest bits, so that a cycle writes a word to each bank. Of a deep memory each block has its own registers
 // before and behind it, and then one block is chosen.
 //
-// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP; nothing moves without `go`.
+// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP.
 // A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later.
 module fg_memory #(
     parameter WIDTH = 36,
@@ -14,7 +14,6 @@ module fg_memory #(
     parameter FILE = "memory"  // begin of the files' names, one for each block: FILE_00.hex and so on
 ) (
     input wire clk,
-    input wire go,
     // verilator lint_off UNUSEDSIGNAL
     input wire [PLACE-1:0] place,
     input wire [BANKS-1:0] write,
@@ -57,23 +56,21 @@ module fg_memory #(
         reg [IN-1:0] near;
         reg asked1, asked2;
         wire mine = block_of(place) == k[PICK-1:0];
-        always @(posedge clk)
-          if (go) begin
-            if (mine) near <= place[LOW+:IN];
-            asked1 <= mine;
-            asked2 <= asked1;
-          end
+        always @(posedge clk) begin
+          if (mine) near <= place[LOW+:IN];
+          asked1 <= mine;
+          asked2 <= asked1;
+        end
         assign at = near;
         assign asked = asked2;
       end else begin : shallow
         assign at = place[LOW+:IN];
         assign asked = 1'b1;
       end
-      always @(posedge clk)
-        if (go) begin
-          read <= words[at];
-          out <= asked ? read : {WIDTH{1'b0}};
-        end
+      always @(posedge clk) begin
+        read <= words[at];
+        out <= asked ? read : {WIDTH{1'b0}};
+      end
       if (READS == 0 && DEEP != 0) begin : deep_write
         reg here;
         reg [IN-1:0] near;
@@ -98,7 +95,7 @@ module fg_memory #(
         any = {WIDTH{1'b0}};
         for (n = 0; n < COUNT; n = n + 1) any = any | found[n*WIDTH+:WIDTH];
       end
-      always @(posedge clk) if (go) picked <= any;
+      always @(posedge clk) picked <= any;
       assign word = picked;
     end else begin : alone
       assign word = found;
