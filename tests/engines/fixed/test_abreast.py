@@ -7,6 +7,7 @@ from time import process_time
 import numpy as np
 import pytest
 
+from flowgraph.engines.fixed import ranges
 from flowgraph.engines.fixed.abreast import Recorded, abreast, varying
 from flowgraph.engines.fixed.ranges import Sizes
 from flowgraph.engines.options import RunOptions
@@ -94,6 +95,19 @@ def test_formats_are_those_of_the_sizes_of_each_flight_by_itself(name):
                 see(alone.largest, cells[k].read, env[program.writes[k]])
     for widths in ((24, 2.0, 0), (28, 8.0, 40)):
         assert together.formats(*widths).to_json() == alone.formats(*widths).to_json()
+
+
+def test_memory_bounds_how_many_go_at_once(monkeypatch):
+    flights = [recorded("kalman", seed, 0.2) for seed in range(3)]
+    together, apart = Sizes(flights[0].pipeline), Sizes(flights[0].pipeline)
+    together.play(flights)
+    played = []
+    monkeypatch.setattr(ranges, "_AT_ONCE", 1)
+    monkeypatch.setattr(ranges, "abreast", lambda some: played.append(len(some)) or abreast(some))
+    apart.play(flights)
+    assert played == [1, 1, 1]
+    assert apart.ticks == together.ticks
+    assert apart.formats(24).to_json() == together.formats(24).to_json()
 
 
 def test_ten_flights_cost_about_what_one_does():
