@@ -19,7 +19,19 @@ from flowgraph.blocks.scoring.readings import AIDS, CONTROLS
 from flowgraph.blocks.signals import MagneticField
 from flowgraph.types import StructType, unflatten
 
-__all__ = ["HOUR", "Fault", "aids_of", "controls_of", "faults_of", "faulty", "gap", "jump", "nan", "spikes"]
+__all__ = [
+    "HOUR",
+    "Fault",
+    "aids_of",
+    "controls_of",
+    "faults_of",
+    "faulty",
+    "gap",
+    "jump",
+    "nan",
+    "outliers",
+    "spikes",
+]
 
 HOUR = 3600.0
 SPIKES = {"gyro": 20.0, "rate": 20.0, "specific_force": 150.0, "force": 150.0, "acceleration": 150.0}
@@ -28,6 +40,9 @@ SPIKES = {"gyro": 20.0, "rate": 20.0, "specific_force": 150.0, "force": 150.0, "
 FAR, TURNED, METRE = 10.0, 1.0, 1.6e-7
 """By how much a spike of a measurement is off: m (or what its unit is), and rad; how much of a latitude one
 metre is, rad."""
+
+OFF, OFF_TURNED = 3.0, 0.5
+"""m and rad: how far an outlier is off."""
 
 TOLD = ("covariance", "deviation", "interval")
 """What a reading tells of itself, which no fault changes."""
@@ -151,6 +166,23 @@ def spikes(series: Series, t: np.ndarray, begins: float, count: float = 5, times
                 times * SPIKES.get(name, FAR) * (METRE if name in ("latitude", "longitude") else 1.0)
             )
     return _with(series, leaves=leaves)
+
+
+def outliers(series: Series, t: np.ndarray, begins: float, share: float, seed: float) -> Series:
+    """From then on so large a share of the poses or positions, drawn at random, is off to any side."""
+    rng = np.random.default_rng(int(seed))
+    rows = np.flatnonzero((rng.random(len(t)) < share) & (t >= begins))
+    leaves = {n: np.array(a) for n, a in series.leaves.items()}
+    leaves["position"][rows] += OFF * _directions(rng, len(rows))
+    if "attitude" in leaves:
+        turns = from_rotation_vector(OFF_TURNED * _directions(rng, len(rows)), xp=np)
+        leaves["attitude"][rows] = multiply(leaves["attitude"][rows], turns, xp=np)
+    return _with(series, leaves=leaves)
+
+
+def _directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    drawn = rng.normal(size=(count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)  # type: ignore[no-any-return]
 
 
 def _stuck(series: Series, t: np.ndarray, begins: float, length: float) -> Series:

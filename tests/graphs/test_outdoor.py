@@ -30,6 +30,7 @@ from flowgraph.blocks.outdoor.belief import (
     observe_flow,
 )
 from flowgraph.blocks.outdoor.flight import AIDS, OutdoorSensors, attitude_of_two, outdoor_flight
+from flowgraph.graphs.benches.biases import found_biases, true_biases
 from flowgraph.graphs.outdoor_eskf import outdoor_eskf
 from flowgraph.graphs.rbpf_outdoor import rbpf_outdoor
 from flowgraph.study import Study, read_table, run_study
@@ -323,14 +324,10 @@ def test_a_start_that_nobody_tells_says_how_little_it_knows():
 BIASED = {"gyro__bias": 0.05, "accelerometer__bias": 0.3}
 
 
-def found_biases(result: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The last estimate (6), and its deviations."""
-    if "biases" in result.series:
-        last = result["biases"][-1:]
-        return last["mean"][0], np.sqrt(np.diag(last["covariance"][0]))
-    last = result["belief"][-1:]
-    mean = np.concatenate([last["gyro_bias"][0], last["accelerometer_bias"][0]])
-    return mean, np.sqrt(np.diag(last["covariance"][0])[9:])
+def ended(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    found = found_biases(result)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize(
@@ -354,11 +351,9 @@ def test_biases_of_several_flights_are_found(seeds, seconds, least):
         told, untold = (case.score(run) for case, run in zip(cases, runs, strict=True))
         ours.append(told)
         theirs.append(untold)
-        assert f.truth is not None
-        true = np.concatenate([f.truth["gyro_bias"][-1], f.truth["accelerometer_bias"][-1]])
-        mean, deviations = found_biases(runs[0])
+        mean, deviations = ended(runs[0])
         assert (deviations[:3] < 0.015).all()
-        off.append((mean - true) / deviations)
+        off.append((mean - true_biases(f)) / deviations)
     assert np.sqrt(np.mean(np.square(off))) < 1.3
     rms = lambda scores, name: np.sqrt(np.mean([score[name] ** 2 for score in scores]))
     for name, times in least.items():
@@ -380,7 +375,7 @@ def test_particles_find_biases_too():
     for seed in range(2):
         truth = flight(seed, 4.0, **BIASED).truth
         assert truth is not None
-        gyro = found_biases(runs[2 * seed])[0][:3]
+        gyro = ended(runs[2 * seed])[0][:3]
         np.testing.assert_allclose(gyro, truth["gyro_bias"][-1], atol=0.04)
 
 
