@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from flowgraph.engines.c.nodes import Buffer, Node
+from flowgraph.engines.c.nodes import Buffer, Node, value_of
 from flowgraph.engines.c.syntax import ctype, number
 from flowgraph.engines.comparisons import COMPARISONS
 from flowgraph.errors import LoweringError
@@ -105,7 +105,7 @@ class Expressions:
         if op == "astype":
             return self._cast(kind, dtype, args[0])
         if op in ("maximum", "minimum"):
-            return self._extreme(op, dtype, args)
+            return self._extreme(op, node, args)
         if op == "abs":
             if dtype == "real":
                 return f"{self.libm('fabs')}({args[0]})"
@@ -153,11 +153,16 @@ class Expressions:
             return f"{self.helper('fg_whole_' + dtype)}({arg})"
         return f"({ctype(dtype, self.real)}){arg}"
 
-    def _extreme(self, op: str, dtype: str, args: Sequence[str]) -> str:
-        """NaN wins, as in NumPy."""
+    def _extreme(self, op: str, node: Node, args: Sequence[str]) -> str:
+        """NaN wins, as in NumPy; with a number that is known one comparison says so."""
         a, b = args
-        sign = ">" if op == "maximum" else "<"
-        if dtype == "real":
+        sign, other = (">", "<=") if op == "maximum" else ("<", ">=")
+        if node.dtype == "real":
+            first, second = map(value_of, node.args)
+            if first is not None and first == first:
+                return f"{a} {sign} {b} ? {a} : {b}"
+            if second is not None and second == second:
+                return f"!({a} {other} {b}) ? {a} : {b}"
             return f"({a} {sign} {b} || {a} != {a}) ? {a} : {b}"
         return f"{a} {sign} {b} ? {a} : {b}"
 

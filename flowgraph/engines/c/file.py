@@ -28,6 +28,7 @@ from flowgraph.engines.c.preamble import MACROS, PACK, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
 from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.engines.c.tables import join_tables
 from flowgraph.engines.c.values import Value, row_major
 from flowgraph.pipeline.optimise.aside import CHOOSE, Choice, put_aside
 from flowgraph.pipeline.pipeline import Cell, Leaf, Pipeline, kind_of
@@ -124,12 +125,17 @@ class File:
 
     # -- one reaction --------------------------------------------------------------------------------
 
+    def tidied(self, program: Program) -> Program:
+        """The program made shorter, and its tables joined where numbers are as wide as what comes of that."""
+        program = self.tidy(program)
+        return join_tables(program) if self.real == "double" else program
+
     def reaction(self, key: int | None) -> str:
         """The function of one pattern of present inputs."""
         pipeline, tape = self.pipeline, Tape()
         sites = {site.value: site for site in pipeline.random}
         program, choices = put_aside(specialise(pipeline, key), sites)
-        program = self.tidy(program)
+        program = self.tidied(program)
         values = self._given(tape, program, key)
         expander = Expander(tape, values)
         places = self._in_place(program)
@@ -239,7 +245,7 @@ class File:
             result: where its result belongs.
             whose: its large buffers are.
         """
-        program = self.tidy(program)
+        program = self.tidied(program)
         tape, values = Tape(), {}
         for n, text in inputs.items():
             spec = program.specs[n]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.nodes import Node, Tape, View
+from flowgraph.engines.c.nodes import Node, Tape, View, value_of
 from flowgraph.engines.c.values import Value, Values, lanes, row_major, space_of, unrolled
 from flowgraph.pipeline.pipeline import kind_of
 from flowgraph.recorder.namespaces import LEAST_ANGLE
@@ -29,6 +29,7 @@ class Shapes:
 
     def __init__(self, tape: Tape, values: dict[int, Value]) -> None:
         self.tape, self.known, self.form = tape, values, Values(tape)
+        self.halves: dict[Node, tuple[Node, Node]] = {}
 
     # -- element by element --------------------------------------------------------------------------
 
@@ -37,10 +38,28 @@ class Shapes:
         if op == "square":
             op, parts = "multiply", [parts[0], parts[0]]
         if op == SINC:
-            least: Any = np.array(self.tape.const(LEAST_ANGLE, spec.dtype), object)
-            size = self.combine("maximum", spec, self.combine("abs", spec, *parts), least)
-            op, parts = "divide", [self.combine("sin", spec, size), size]
+            made: Any = np.empty(unrolled(spec.shape), object)
+            for index in np.ndindex(made.shape):
+                made[index] = self.sinc(parts[0][index])
+            return Value(spec, made)
         return Value(spec, self.combine(op, spec, *parts))
+
+    def sinc(self, x: Node) -> Node:
+        """sin(x) / x, and 1 at 0; where that of x / 2 is there, its product with cos(x / 2).
+
+        Sine and cosine of one angle share most of their work, and the product saves a division.
+        """
+        tape, dtype = self.tape, x.dtype
+        if x in self.halves:
+            size, half = self.halves[x]
+            return tape.op("multiply", dtype, half, tape.op("cos", dtype, size))
+        size = tape.op("maximum", dtype, tape.op("abs", dtype, x), tape.const(LEAST_ANGLE, dtype))
+        made = tape.op("divide", dtype, tape.op("sin", dtype, size), size)
+        if x.op == "multiply":
+            for k in (0, 1):
+                if value_of(x.args[k]) == 0.5:
+                    self.halves[x.args[1 - k]] = size, made
+        return made
 
     def combine(self, op: str, spec: Spec, *parts: Any) -> Any:
         """An operation on element arrays that broadcast to the elements of a shape."""
