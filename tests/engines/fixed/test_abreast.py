@@ -19,12 +19,12 @@ from flowgraph.pipeline.program import needed
 from flowgraph.recorder.random import seed_words
 
 
-def recorded(name, seed, duration, ticks=None):
+def recorded(name, seed, duration, *, first=0, last=10**9):
     flight = flown(name, seed, duration, particles=12)
     subject = LoweredGraph(flight.graph)
     start = subject.start(RunOptions(seed=seed))
     events = subject.tape(flight.inputs, start.last)
-    return Recorded(plain(subject.pipeline), events.first(ticks or 10**9), start.cells, seed_words(seed))
+    return Recorded(plain(subject.pipeline), events.part(first, last), start.cells, seed_words(seed))
 
 
 def one_by_one(flight):
@@ -40,7 +40,8 @@ def one_by_one(flight):
 
 @pytest.mark.parametrize("name", ["kalman", "ins_eskf", "rbpf_indoor", "marg", "particle"])
 def test_values_and_what_is_taken_of_them_are_those_of_each_flight(name):
-    flights = [recorded(name, seed, 0.3, ticks) for seed, ticks in enumerate((None, 25, 40))]
+    parts: tuple[dict[str, int], ...] = ({}, {"last": 25}, {"first": 3, "last": 40})
+    flights = [recorded(name, seed, 0.3, **part) for seed, part in enumerate(parts)]
     alone = [one_by_one(f) for f in flights]
     compared = partly = 0
     with np.errstate(all="ignore"):
