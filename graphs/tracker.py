@@ -1,9 +1,9 @@
 """tracker: a point in the plane that is seen now and then, by any method of filtering.
 
 The model is declared once, a velocity that wanders and a position that is measured, and the method is a
-setting: Kalman, extended, unscented, cubature, on a root of the covariance, particles, or two motions of which
-either may be the true one. For a linear model with Gaussian noise the first five are one filter, and particles
-approach it.
+setting: Kalman, extended, unscented, cubature, on a root of the covariance, particles, or two motions of
+which either may be the true one. For a linear model with Gaussian noise the first five are one filter, and
+particles approach it.
 
     p' = v      v' = w      z = p + N(0, noise^2 I)
 

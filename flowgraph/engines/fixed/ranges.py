@@ -7,6 +7,7 @@ is bounded to the first order from the formats of its arguments, and a format fi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -22,8 +23,8 @@ from flowgraph.pipeline.program import needed
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.trace import Instruction
 
-_TOGETHER = 1 << 22
-"""Numbers that are looked at in one go."""
+_TOGETHER, _AT_ONCE = 1 << 22, 1 << 25
+"""Numbers that are looked at in one go, and in a tick of flights that are played at once."""
 
 _HELD = 16.0
 """Errors of a register, in units of its last place: it gathers those of many ticks."""
@@ -77,13 +78,18 @@ class Sizes:
         self._proven: dict[int, np.ndarray] | None = None
 
     def play(self, flights: Sequence[Recorded]) -> None:
-        """Play some flights, all at once, and widen the sizes by what occurs in them.
+        """Play some flights, as many at once as memory is for, and widen the sizes by what occurs in them.
 
         Args:
             flights: of pipelines of the same structure, with numbers of their own.
         """
         self._varying |= varying([self.pipeline, *(f.pipeline for f in flights)])
         self._proven = None
+        most = max(1, _AT_ONCE // sum(math.prod(spec.shape) for spec in self.pipeline.specs.values()))
+        for first in range(0, len(flights), most):
+            self._play(flights[first : first + most])
+
+    def _play(self, flights: Sequence[Recorded]) -> None:
         for flight in flights:
             for cell, value in zip(self._cells, flight.cells, strict=True):
                 self._see(cell.read, cell.dtype, np.asarray(value)[..., None])

@@ -7,6 +7,7 @@ from time import process_time
 import numpy as np
 import pytest
 
+from flowgraph.engines.fixed import ranges
 from flowgraph.engines.fixed.abreast import Recorded, abreast, varying
 from flowgraph.engines.fixed.ranges import Sizes
 from flowgraph.engines.options import RunOptions
@@ -18,12 +19,12 @@ from flowgraph.pipeline.program import needed
 from flowgraph.recorder.random import seed_words
 
 
-def recorded(name, seed, duration, ticks=None):
+def recorded(name, seed, duration, *, first=0, last=10**9):
     flight = flown(name, seed, duration, particles=12)
     subject = LoweredGraph(flight.graph)
     start = subject.start(RunOptions(seed=seed))
     events = subject.tape(flight.inputs, start.last)
-    return Recorded(plain(subject.pipeline), events.first(ticks or 10**9), start.cells, seed_words(seed))
+    return Recorded(plain(subject.pipeline), events.part(first, last), start.cells, seed_words(seed))
 
 
 def one_by_one(flight):
@@ -39,7 +40,8 @@ def one_by_one(flight):
 
 @pytest.mark.parametrize("name", ["kalman", "ins_eskf", "rbpf_indoor", "marg", "particle"])
 def test_values_and_what_is_taken_of_them_are_those_of_each_flight(name):
-    flights = [recorded(name, seed, 0.3, ticks) for seed, ticks in enumerate((None, 25, 40))]
+    parts: tuple[dict[str, int], ...] = ({}, {"last": 25}, {"first": 3, "last": 40})
+    flights = [recorded(name, seed, 0.3, **part) for seed, part in enumerate(parts)]
     alone = [one_by_one(f) for f in flights]
     compared = partly = 0
     with np.errstate(all="ignore"):
@@ -94,6 +96,19 @@ def test_formats_are_those_of_the_sizes_of_each_flight_by_itself(name):
                 see(alone.largest, cells[k].read, env[program.writes[k]])
     for widths in ((24, 2.0, 0), (28, 8.0, 40)):
         assert together.formats(*widths).to_json() == alone.formats(*widths).to_json()
+
+
+def test_memory_bounds_how_many_go_at_once(monkeypatch):
+    flights = [recorded("kalman", seed, 0.2) for seed in range(3)]
+    together, apart = Sizes(flights[0].pipeline), Sizes(flights[0].pipeline)
+    together.play(flights)
+    played = []
+    monkeypatch.setattr(ranges, "_AT_ONCE", 1)
+    monkeypatch.setattr(ranges, "abreast", lambda some: played.append(len(some)) or abreast(some))
+    apart.play(flights)
+    assert played == [1, 1, 1]
+    assert apart.ticks == together.ticks
+    assert apart.formats(24).to_json() == together.formats(24).to_json()
 
 
 def test_ten_flights_cost_about_what_one_does():
