@@ -108,7 +108,9 @@ def growth(
             fix="write least=10000 and most=1000000",
         )  # fmt: skip
     chosen = engines.split(","), parts.split(",")
-    for what, names, offered in zip(("engine", "part"), chosen, (RANGES, RANGES["c"]), strict=True):
+    for what, names, offered in zip(
+        ("engine", "part"), chosen, (list(RANGES), list(RANGES["c"])), strict=True
+    ):
         for name in names:
             if name not in offered:
                 raise UnknownNameError(what, name, offered, path=f"growth.{what}s")
