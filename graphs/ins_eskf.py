@@ -6,7 +6,7 @@ Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", arX
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +33,12 @@ SEARCHED, LONGEST, HEADINGS = 15.0, 60.0, 12
 """For how many seconds a heading is sought of which nothing is known, for how many at most where these do not
 tell it, and how many are tried."""
 
-NEAR, APART = 0.5, 30.0
-"""How far off the nearest of them may be, rad, and how far apart two are that are not one, degrees."""
+NEAR, APART = 0.15, 30.0
+"""The deviation of the heading of one of them, rad, and how far apart two are that are not one, degrees. A
+wider one corrects by more than it is off, and the best of twelve is then another's."""
+
+FINER, BESIDE = 4, (-3, -2, -1, 0, 1, 2, 3)
+"""A finer step is such a part of that between two of them; where beside the best is tried, in finer steps."""
 
 SURE = 40.0
 """By how much the best must foretell better than others, in -2 log of the likelihood."""
@@ -185,19 +189,19 @@ def _searched(
     itself, where it foretells them as well, or where they do not tell one heading from another.
 
     One Gaussian cannot hold a whole circle: from the wrong side of it the innovations look like errors of
-    velocity and bias, and the filter grows sure of a wrong heading. One of `HEADINGS` is near enough. Nothing
-    is told by a body that stays where it is, so the time of the search counts from when it has moved.
+    velocity and bias, and the filter grows sure of a wrong heading. One of `HEADINGS` is near enough to tell
+    the side, and of finer steps beside it the best is taken. Nothing is told by a body that stays where it
+    is, so the time of the search counts from when it has moved.
     """
-    about_z = [np.array([0.0, 0.0, 2.0 * math.pi * k / HEADINGS]) for k in range(HEADINGS)]
-    turns = [np.asarray(multiply(from_rotation_vector(v, xp=np), begin.attitude, xp=np)) for v in about_z]
-    circle = [Guess(turn, NEAR, True) for turn in turns]
+    step = 2.0 * math.pi / HEADINGS
+    circle = [Guess(_turned(begin.attitude, k * step), NEAR, True) for k in range(HEADINGS)]
     runs = circle if begin.unknown else [guess, *circle]
     since, end = _moved(inputs["position"], settings["position_noise"]), inputs["imu"].time[-1]
     seconds = SEARCHED
     while since is not None:
         until = since + round(seconds * 1e9)
         first = {name: series[series.time <= until] for name, series in inputs.items()}
-        found = [_foretold(run.belief(begin.position, force), run.invariant, first, settings) for run in runs]
+        found = _foretold_all(runs, begin, force, first, settings)
         costs = np.array([cost for cost, _ in found])
         best = int(np.argmin(costs))
         ends = np.array([q for _, q in found])
@@ -210,7 +214,9 @@ def _searched(
                 on.note("info", f"the heading at the start was sought in {span}")
             else:
                 on.note("warning", f"{span} speak against the heading at the start: another was taken")
-            return runs[best]
+            near = [Guess(_turned(runs[best].attitude, k * step / FINER), NEAR / 2.0, True) for k in BESIDE]
+            costs = np.array([cost for cost, _ in _foretold_all(near, begin, force, first, settings)])
+            return near[int(np.argmin(costs))]
         if until >= end or seconds >= LONGEST:
             break
         seconds *= 2.0
@@ -218,6 +224,21 @@ def _searched(
         sentence = "it stays unknown, however sure the filter grows of it"
         on.note("warning", f"the measurements do not tell the heading at the start: {sentence}")
     return guess
+
+
+def _turned(attitude: np.ndarray, heading: float) -> np.ndarray:
+    turn = from_rotation_vector(np.array([0.0, 0.0, heading]), xp=np)
+    return np.asarray(multiply(turn, attitude, xp=np))
+
+
+def _foretold_all(
+    runs: Sequence[Guess],
+    begin: StartPose,
+    force: np.ndarray | None,
+    inputs: dict[str, Series],
+    settings: dict[str, Any],
+) -> list[tuple[float, np.ndarray]]:
+    return [_foretold(run.belief(begin.position, force), run.invariant, inputs, settings) for run in runs]
 
 
 def _foretold(

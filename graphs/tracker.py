@@ -1,8 +1,9 @@
 """tracker: a point in the plane that is seen now and then, by any method of filtering.
 
 The model is declared once, a velocity that wanders and a position that is measured, and the method is a
-setting: Kalman, extended, unscented, cubature, particles, or two motions of which either may be the true one.
-For a linear model with Gaussian noise the first four are one filter, and particles approach it.
+setting: Kalman, extended, unscented, cubature, on a root of the covariance, particles, or two motions of
+which either may be the true one. For a linear model with Gaussian noise the first five are one filter, and
+particles approach it.
 
     p' = v      v' = w      z = p + N(0, noise^2 I)
 
@@ -28,6 +29,7 @@ from flowgraph.blocks.filtering import (
     imm,
     linear,
     particles,
+    square_root,
     unscented,
 )
 from flowgraph.blocks.filtering.batch import Recording
@@ -39,7 +41,7 @@ from flowgraph.blocks.scoring.cases import Gated, OnFlight, Particles, Smoothed,
 from flowgraph.blocks.scoring.settings import Positive, one_of
 from flowgraph.blocks.signals import Gaussian, PlaneBelief, PlanePosition
 
-METHODS = ("linear", "extended", "unscented", "cubature", "particles", "imm")
+METHODS = ("linear", "extended", "unscented", "cubature", "square_root", "particles", "imm")
 
 
 @block
@@ -110,8 +112,8 @@ def for_flight(
 
     Args:
         flight: with the stream `position`.
-        method: linear, extended, unscented, cubature, particles, or imm, which also has a motion of density
-            `calm`.
+        method: linear, extended, unscented, cubature, square_root, particles, or imm, which also has a motion
+            of density `calm`.
         wander: density of the acceleration, m/s^2/sqrt(Hz).
         calm: that of the other motion of imm.
         position_noise: standard deviation in m; the flight's own if left out.
@@ -126,6 +128,7 @@ def for_flight(
         "extended": extended,
         "unscented": unscented,
         "cubature": cubature,
+        "square_root": square_root,
         "particles": lambda: particles(cloud.particles, seed=cloud.seed, **cloud.resampling()),
         "imm": lambda: imm(motion, constant_velocity(calm), method=linear()),
     }[method]()

@@ -1,7 +1,8 @@
 """A plant whose differential equation is solved to a tolerance, on the host, as stiff or sudden motion needs.
 
 The steps follow the motion, so their number is not known beforehand and no fixed-size pipeline can hold them:
-a plant of this kind runs in Python whatever the engine, and the rest of the graph where it is told to.
+a plant of this kind runs in Python whatever the engine, and what does not lie in a loop with it where it is
+told to. A loop that closes through it takes `engine="python"`.
 
 Source: J. Dormand, P. Prince, "A family of embedded Runge-Kutta formulae", J. Comput. Appl. Math. 6(1), 1980;
 as `scipy.integrate.solve_ivp` has it.
@@ -30,12 +31,13 @@ class DormandPrince:
 
     Args:
         space: of the state, made of vectors and angles.
-        rates: `rates(x, u, xp)`, the derivative of each part by time, per s; u may be left out.
-        relative, absolute: tolerances of a step.
+        rates: `rates(x, u, t, xp)`, the derivative of each part by time, per s; t, the time in s, and u may
+            be left out.
+        relative, absolute: tolerances of a step, above 0.
 
     Raises:
-        DeclarationError: where `rates` has other parameters, or the space has attitudes: those keep their
-            length by `runge_kutta`.
+        DeclarationError: where `rates` has other parameters, a tolerance is none, or the space has attitudes:
+            those keep their length by `runge_kutta`.
     """
 
     space: StateSpace
@@ -53,10 +55,18 @@ class DormandPrince:
                 got=f"{self.space.size} numbers with {self.space.tangent} directions",
                 fix="use runge_kutta",
             )
-        object.__setattr__(self, "_rates", Handed(self.rates, "DormandPrince.rates", ("xp",), "control"))
+        if not (0.0 < self.relative < np.inf and 0.0 < self.absolute < np.inf):
+            raise DeclarationError(
+                "no step is this good",
+                path="DormandPrince",
+                expected="relative and absolute: numbers above 0",
+                got=f"relative={self.relative!r}, absolute={self.absolute!r}",
+                fix="leave them out, or write relative=1e-6",
+            )
+        object.__setattr__(self, "_rates", Handed(self.rates, "DormandPrince.rates", ("t", "xp"), "control"))
 
-    def after(self, x: np.ndarray, control: Any, seconds: float) -> np.ndarray:
-        """The state (size) that x has become after so many seconds under one control.
+    def after(self, x: np.ndarray, control: Any, seconds: float, *, begin: float = 0.0) -> np.ndarray:
+        """The state (size) that x has become so many seconds after `begin` (s) under one control.
 
         Raises:
             RunError: where no step is short enough.
@@ -64,8 +74,8 @@ class DormandPrince:
         if seconds <= 0.0:
             return np.array(x)
 
-        def slope(_: float, now: np.ndarray) -> np.ndarray:
-            made = self._rates(self.space.view(now, np), control, xp=np)
+        def slope(since: float, now: np.ndarray) -> np.ndarray:
+            made = self._rates(self.space.view(now, np), control, t=begin + since, xp=np)
             return np.asarray(joined(self.space, made, now, np, tangent=True))
 
         found = scipy.integrate.solve_ivp(

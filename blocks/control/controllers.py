@@ -20,6 +20,17 @@ from flowgraph.types import Type, as_value, flatten, unflatten
 __all__ = ["late", "limited", "pid", "regulator", "state_feedback"]
 
 
+def _check_limits(path: str, low: float, high: float) -> None:
+    if np.any(np.greater(low, high)):
+        raise DeclarationError(
+            "there is nothing between these limits",
+            path=path,
+            expected="low, and high that is not below it",
+            got=f"low={low!r}, high={high!r}",
+            fix=f"write {path}(..., low=-1.0, high=1.0)",
+        )
+
+
 @block
 def pid(
     state: Controller, error: Scalar, *, gain: float, integral: float = 0.0, derivative: float = 0.0,
@@ -30,6 +41,7 @@ def pid(
     The derivative is that of the error through a first-order filter of `filter` seconds, `derivative` de/dt
     where that is 0; it is 0 where it fires first. While u is at a limit the integral does not grow further
     beyond it."""
+    _check_limits("pid", low, high)
     kind = error.dtype
     first = xp.asarray(dt, dtype=kind) <= 0.0
     grown = state.integral + integral * state.error * dt
@@ -55,6 +67,7 @@ def state_feedback(x: Array, target: Array, *, gains: Array, xp: Any) -> Array: 
 @block
 def limited(u, *, low: float, high: float, xp: Any):  # type: ignore[no-untyped-def]
     """Each number of u, no smaller than `low` and no larger than `high`: what an actuator can do."""
+    _check_limits("limited", low, high)
     return xp.minimum(xp.maximum(u, low), high)
 
 

@@ -19,6 +19,7 @@ sec. 6.3 (noise that is constant over a step).
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -69,12 +70,14 @@ class MotionModel:
         space: of the state.
         move: `move(x, u, w, dt, xp) -> x'`, on x (..., size) and w (..., n_w), a state a row. x is a view
             where the parts of the space have names; x' may be a view, an array or the parts in order. u is
-            the control, under any name. What it does not need it leaves out: `move(x, w, dt, xp)`.
+            the control, under any name. What it does not need it leaves out: `move(x, w, dt, xp)`. Of a plant
+            it may ask for t, s, when the step begins; a filter's has no time but that in its state.
         density: spectral density of w, (n_w, n_w); (n_w) is its diagonal; or a function of the control that
             gives one. None where there is no noise.
 
     Raises:
-        DeclarationError: where `move` has other parameters, or the density is no covariance.
+        DeclarationError: where `move` has other parameters, or the density is no covariance; and of a filter,
+            where it asks for the time.
     """
 
     space: StateSpace
@@ -84,7 +87,7 @@ class MotionModel:
     _density: Covariance | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        move = Handed(self.move, "MotionModel.move", ("w", "dt", "xp"), "control")
+        move = Handed(self.move, "MotionModel.move", ("w", "t", "dt", "xp"), "control")
         if ("w" in move.names) != (self.density is not None):
             raise DeclarationError(
                 "a noise and its density go together",
@@ -101,8 +104,21 @@ class MotionModel:
     def linear(self) -> bool:
         return False
 
-    def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
-        found = self._move(self.space.view(x, xp), control, w=w, dt=dt, xp=xp)
+    @property
+    def timed(self) -> bool:
+        """Whether it asks when a step begins."""
+        return "t" in self._move.names
+
+    def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any, *, t: Any = None) -> Array:
+        if self.timed and t is None:
+            raise DeclarationError(
+                "a filter does not tell a motion the time",
+                path="MotionModel.move",
+                expected="a motion that depends on its state and what it is told; t is for a plant",
+                got=f"move({', '.join(('x', *self._move.names))})",
+                fix="leave t out: a part of the state may grow by 1 a second, or a control say it",
+            )
+        found = self._move(self.space.view(x, xp), control, w=w, t=t, dt=dt, xp=xp)
         return numbers(found, x, self.space, xp)
 
     def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array | None:
@@ -211,35 +227,56 @@ def runge_kutta(space: StateSpace, rates: Callable[..., Any], *, steps: int = 1)
 
     Args:
         space: of the state.
-        rates: `rates(x, u, w, xp)`, the velocity of each part as `space.plus(x, velocity=...)` takes it; u
-            and w may be left out.
+        rates: `rates(x, u, w, t, xp)`, the velocity of each part as `space.plus(x, velocity=...)` takes it;
+            u, w and t may be left out. t is the time in s, which a plant tells (see `MotionModel`).
         steps: equal parts that a step is taken in.
 
     Raises:
-        DeclarationError: where `rates` has other parameters.
+        DeclarationError: where `rates` has other parameters, or `steps` is no whole number from 1.
     """
-    slope = Handed(rates, "runge_kutta.rates", ("w", "xp"), "control")
+    slope = Handed(rates, "runge_kutta.rates", ("w", "t", "xp"), "control")
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise DeclarationError(
+            "a step cannot be taken in so many parts",
+            path="runge_kutta.steps",
+            expected="a whole number from 1",
+            got=repr(steps),
+            fix="write steps=4, or leave it out",
+        )
 
-    def move(x: Any, u: Any, w: Any, dt: Any, xp: Any) -> Any:
+    def move(x: Any, u: Any, w: Any, t: Any, dt: Any, xp: Any) -> Any:
         start, h = space.view(x, xp), dt / steps
-        for _ in range(steps):
-            here = array_of(start)
-            at = lambda y: joined(space, slope(y, u, w=w, xp=xp), here, xp, tangent=True)  # noqa: B023
+        for part in range(steps):
+            here, begin = array_of(start), None if t is None else t + part * h
+
+            def at(y: Any, share: float, here: Any = here, begin: Any = begin) -> Any:
+                now = None if begin is None else begin + share * h
+                return joined(space, slope(y, u, w=w, t=now, xp=xp), here, xp, tangent=True)
+
             go = lambda d: space.view(space.plus(here, d, xp), xp)  # noqa: B023
-            k1 = at(start)
-            k2 = at(go(0.5 * h * k1))
-            k3 = at(go(0.5 * h * k2))
-            k4 = at(go(h * k3))
+            k1 = at(start, 0.0)
+            k2 = at(go(0.5 * h * k1), 0.5)
+            k3 = at(go(0.5 * h * k2), 0.5)
+            k4 = at(go(h * k3), 1.0)
             start = go(h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4))
         return start
 
-    if "w" in slope.names and slope.other:
-        return move
-    if slope.other:
-        return lambda x, u, dt, xp: move(x, u, None, dt, xp)
-    if "w" in slope.names:
-        return lambda x, w, dt, xp: move(x, None, w, dt, xp)
-    return lambda x, dt, xp: move(x, None, None, dt, xp)
+    return _asking(move, control=slope.other is not None, noise="w" in slope.names, time="t" in slope.names)
+
+
+def _asking(move: Callable[..., Any], *, control: bool, noise: bool, time: bool) -> Callable[..., Any]:
+    """A `move` with only those parameters that are asked for, as `MotionModel` reads them."""
+    names = tuple(n for n, asked in (("u", control), ("w", noise), ("t", time)) if asked)
+
+    def asked(x: Any, *given: Any) -> Any:
+        found = dict(zip((*names, "dt", "xp"), given, strict=True))
+        return move(x, *(found.get(n) for n in ("u", "w", "t", "dt", "xp")))
+
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    asked.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(n, kind) for n in ("x", *names, "dt", "xp")]
+    )
+    return asked
 
 
 def _given(matrix: Any, control: Any) -> Any:

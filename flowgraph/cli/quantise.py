@@ -22,6 +22,16 @@ def quantise(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="For the formats.")],
     seeds: Annotated[int, typer.Option(min=1, help="Flights of each SPEC that formats are found on.")] = 4,
     held_out_seeds: Annotated[int, typer.Option(min=1, help="Other flights, that judge them.")] = 3,
+    held_out_data: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SPEC", help="Flights that judge, where they are others than --data; repeatable."
+        ),
+    ] = None,
+    held_out_settings: Annotated[
+        list[str] | None,
+        typer.Option("--held-out-set", metavar="KEY=VALUE", help="Settings for these, in place of --set."),
+    ] = None,
     first_seed: Annotated[int, typer.Option(min=0, help="Of the first flight.")] = 0,
     width: Annotated[int, typer.Option(help="Bits of a word at most.")] = 32,
     held_width: Annotated[
@@ -49,12 +59,20 @@ def quantise(
     make_ready(output)
     bounds = _bounds(bound)
     given = with_file(settings, settings_file)
+    if held_out_settings and not held_out_data:
+        raise DeclarationError(
+            "these settings are for flights that are not given",
+            path="--held-out-set",
+            expected="--held-out-data beside it",
+            got=", ".join(held_out_settings),
+            fix="add --held-out-data SPEC, or write --set for all flights",
+        )
 
-    def flown(first: int, count: int) -> list[Any]:
+    def flown(specs: list[str], chosen: list[str] | None, first: int, count: int) -> list[Any]:
         made = []
-        for spec in data:
+        for spec in specs:
             for seed in range(first, first + count):
-                case, _ = case_of(graph, spec, given, seed, truth)
+                case, _ = case_of(graph, spec, chosen, seed, truth)
                 made.append(Flown(case.graph, case.inputs, case.estimate, seed))
         return made
 
@@ -62,13 +80,15 @@ def quantise(
         if not as_json:
             err_console.print(words, markup=False)
 
-    held_out = flown(first_seed + seeds, held_out_seeds)
+    others = (held_out_data, held_out_settings) if held_out_data else (data, given)
+    held_out = flown(*others, first_seed + seeds, held_out_seeds)
     found = search(
-        flown(first_seed, seeds), held_out, width=width, bounds=bounds, margin=margin, least=least, say=say,
-        held_width=held_width,
+        flown(data, given, first_seed, seeds), held_out, width=width, bounds=bounds, margin=margin,
+        least=least, say=say, held_width=held_width,
     )  # fmt: skip
     report = {
         "graph": graph, "data": data, "settings": given, "seeds": seeds, "held_out_seeds": held_out_seeds,
+        "held_out_data": others[0], "held_out_settings": others[1],
         "first_seed": first_seed, "margin": margin, "bounds": bounds, **found.figures,
         "tried": [dict(row) for row in found.tried], "notes": list(found.notes),
     }  # fmt: skip

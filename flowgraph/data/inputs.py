@@ -58,18 +58,20 @@ def arrays(
     return series
 
 
-def ticks(period: str | int, *, until: str | int, start: int = 0, name: str = "ticks") -> Series:
-    """A source that only keeps time: true at `start` (int ns) and each `period` after it, before `until`.
+def ticks(period: str | int, *, until: str | int, start: str | int = 0, name: str = "ticks") -> Series:
+    """A source that only keeps time: true at `start` and each `period` after it, before `until`.
 
     Args:
-        period, until: a duration such as "5ms", or integer nanoseconds; `until` counts from `start`.
+        period, until, start: a duration such as "5ms", or integer nanoseconds; `until` counts from `start`.
 
     Raises:
         DeclarationError: for a period below 1 ns, or an `until` below 0. DataError: for a start that is no
             whole number, or an end that int64 nanoseconds do not hold.
     """
     step, end = nanoseconds(period, what="period", least=1), nanoseconds(until, what="until", least=0)
-    begin = check_stamp(f"{name}.start", start)
+    begin = check_stamp(
+        f"{name}.start", nanoseconds(start, what="start") if isinstance(start, str) else start
+    )
     check_stamp(f"{name}.until", begin + end)
     time = np.arange(0, end, step, dtype=np.int64) + begin
     return Series(time, np.ones(len(time), dtype=bool), name=name)

@@ -97,11 +97,13 @@ class Engine(abc.ABC):
         name: by which users ask for it.
         dtypes: the kinds of number that it offers.
         takes_many: whether many runs go together in one call.
+        shards: whether its work can be shared out among devices.
     """
 
     name: str
     dtypes: tuple[str, ...] = DTYPES
     takes_many: bool = False
+    shards: bool = False
 
     def need(self) -> None:  # noqa: B027  most need nothing
         """Refuse where something is not installed that this engine needs.
@@ -123,6 +125,14 @@ class Engine(abc.ABC):
                 expected=" or ".join(self.dtypes),
                 got=options.dtype,
                 fix="leave dtype out, or choose another engine",
+            )
+        if options.shard and not self.shards:
+            raise DeclarationError(
+                f"the {self.name} engine shares nothing out among devices",
+                path=f"engine={self.name!r}",
+                expected="no shard",
+                got=str(dict(options.shard)),
+                fix='leave shard out, or choose engine="xla"',
             )
 
 
@@ -230,6 +240,10 @@ class PipelineEngine(Engine):
     def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
         """Play many runs in one call; only asked of an engine that `takes_many`."""
         raise NotImplementedError(f"engine {self.name!r} says that it takes many runs, and has no play_many")
+
+    def with_shard(self, shard: Mapping[str, int] | None) -> PipelineEngine:
+        """The engine that shares each run out so among devices; itself where it does not."""
+        return self
 
     def with_lanes(self, lanes: int) -> PipelineEngine:
         """The engine that writes a machine of so many lanes; itself where what it writes has none."""

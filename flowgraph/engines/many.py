@@ -45,6 +45,7 @@ def simulate_many(
     progress: Meter | None = None,
     passes: Collection[str] | None = None,
     diverged: str = "raise",
+    shard: Mapping[str, int] | None = None,
 ) -> Batch:
     """Run a graph once for each seed.
 
@@ -61,6 +62,8 @@ def simulate_many(
         progress: told the number of finished runs.
         passes: of the optimiser, as for `simulate`.
         diverged: as for `simulate`; "count" lists the runs in `Batch.diverged`.
+        shard: as for `simulate`. Of `{"runs": n}`, n devices take as many of the runs that go together each,
+            and `runs_at_once` is rounded up to what n divides.
 
     Raises:
         DeclarationError: without a seed, or where one is none; for a list that is not one a run.
@@ -69,7 +72,7 @@ def simulate_many(
     """
     options = RunOptions(
         engine=engine, dtype=dtype, init=init, keep=keep, runs_at_once=runs_at_once, progress=progress,
-        passes=passes, diverged=diverged,
+        passes=passes, diverged=diverged, shard=shard,
     )  # fmt: skip
     return run_many(graph, inputs, seeds, options)
 
@@ -90,7 +93,7 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
     if options.init is not None:
         passes = without(*RELYING, passes=passes)  # they rely on the values at reset
     if not len(runs.first.time):  # nothing to make ready for
-        return _one_by_one(graph, inputs, seeds, keep, options)
+        return _one_by_one(graph, inputs, seeds, keep, options.but(shard=None))
     found = engine.play_many(runs, passes, options)
     series = {name: found.series[name] for name in keep}
     astray = troubles.astray(series)

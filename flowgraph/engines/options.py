@@ -74,10 +74,12 @@ class RunOptions:
         diverged: what an output or register that is no longer finite does: "raise", or "count" it and go on.
         checkpoint: how the run is kept, and from where it goes on.
         formats: number formats for fixed point, or the folder that `quantise` wrote them to.
+        shard: among how many devices the work along an axis is shared out: "runs", or an axis that the types
+            of the graph name, such as "particles".
 
     Raises:
         UnknownNameError: for another dtype, pass or way of `diverged`.
-        DeclarationError: for a seed that is none.
+        DeclarationError: for a seed that is none, or a number of devices.
     """
 
     engine: str = "python"
@@ -92,6 +94,7 @@ class RunOptions:
     diverged: str = "raise"
     checkpoint: Checkpoint | None = None
     formats: Formats | str | Path | None = None
+    shard: Mapping[str, int] | None = None
 
     def __post_init__(self) -> None:
         if self.dtype not in KINDS:
@@ -109,7 +112,22 @@ class RunOptions:
         if self.passes is not None:
             check_passes(self.passes)
         seed_words(self.seed)
+        _check_shard(self.shard)
 
     def but(self, **changes: Any) -> RunOptions:
         """The same with some changed."""
         return replace(self, **changes)
+
+
+def _check_shard(shard: Any) -> None:
+    if shard is None:
+        return
+    named = isinstance(shard, Mapping) and all(isinstance(name, str) for name in shard)
+    if not named or any(type(devices) is not int or devices < 1 for devices in shard.values()):
+        raise DeclarationError(
+            "a share is a number of devices for each axis",
+            path="shard",
+            expected='a mapping such as {"runs": 4} or {"runs": 2, "particles": 4}',
+            got=repr(shard),
+            fix="leave it out for one device",
+        )

@@ -35,6 +35,7 @@ def play(subject: Subject, inputs: Any, options: RunOptions) -> Result:
     """Play what was lowered over its inputs to their end."""
     engine = find_pipeline_engine(options.engine)
     engine.check(options)
+    engine = engine.with_shard(options.shard)
     pipeline = _formatted(subject.pipeline, engine, options)
     start = subject.start(options)
     events = subject.tape(inputs, start.last)

@@ -34,6 +34,7 @@ def simulate(
     diverged: str = ...,
     checkpoint: Checkpoint | None = ...,
     formats: Formats | str | Path | None = ...,
+    shard: Mapping[str, int] | None = ...,
 ) -> Result: ...
 @typing.overload
 def simulate(
@@ -51,6 +52,7 @@ def simulate(
     diverged: str = ...,
     checkpoint: Checkpoint | None = ...,
     formats: Formats | str | Path | None = ...,
+    shard: Mapping[str, int] | None = ...,
 ) -> Batch: ...
 def simulate(
     graph: Graph,
@@ -67,6 +69,7 @@ def simulate(
     diverged: str = "raise",
     checkpoint: Checkpoint | None = None,
     formats: Formats | str | Path | None = None,
+    shard: Mapping[str, int] | None = None,
 ) -> Result | Batch:
     """Run a graph over its inputs to their end.
 
@@ -92,16 +95,19 @@ def simulate(
         checkpoint: `Checkpoint(file, every=10.0)` keeps the run in a file now and then;
             `Checkpoint(resume=file)` goes on from one, to the same bits. Of one run alone.
         formats: for fixed point, the number formats, or the folder that `flowgraph quantise` wrote.
+        shard: for "xla", among how many devices the work along an axis is shared out, such as
+            `{"particles": 4}`, and with seeds also `{"runs": 4}`.
 
     Raises:
         UnknownNameError, DataError, ClockError, TypeMismatchError: naming the source.
         FifoOverflowError: where a queue of a join overflows.
         DivergedError: where a number is not finite any more.
         MissingDependencyError: for "xla" without JAX, for "c" without a C compiler.
+        DeclarationError: for a shard of more devices than there are, or of what cannot be cut so.
     """
     options = RunOptions(
         engine=engine, dtype=dtype, init=init, state=state, seed=seed, progress=progress, passes=passes,
-        diverged=diverged, checkpoint=checkpoint, formats=formats,
+        diverged=diverged, checkpoint=checkpoint, formats=formats, shard=shard,
     )  # fmt: skip
     if seeds is None:
         need_inputs(graph, inputs)

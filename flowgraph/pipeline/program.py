@@ -163,17 +163,25 @@ def _fold(
     return None
 
 
-def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
+def needed(program: Program, env: Mapping[int, Any], tail: tuple[int, ...] = ()) -> dict[int, Any]:
     """Which elements of each value bear on an output or a register in this tick: a mask, or True for all.
 
     A selection needs what it takes: the quotient beside a guard `where(small, 1.0, x / y)` may be of any
     size.
+
+    Args:
+        program: of the tick.
+        env: the values in it.
+        tail: sizes of axes that all values have behind their own, as one of several flights: each by itself.
     """
     sure, others = program.surely
     taken: dict[int, Any] = dict.fromkeys(sure, True)
     for flag, leaves in program.outputs:
-        if flag is not None and env.get(flag, True):
+        there = env.get(flag, True) if flag is not None else False
+        if np.all(there):
             taken.update(dict.fromkeys(leaves, True))
+        elif np.any(there):
+            taken.update((n, _either(taken.get(n, False), there)) for n in leaves)
     for i in others:
         mask = taken.get(i.out, False)
         if mask is not True and not np.any(mask):
@@ -181,7 +189,7 @@ def needed(program: Program, env: Mapping[int, Any]) -> dict[int, Any]:
         for place, a in enumerate(i.args):
             before = taken.get(a, False)
             if before is not True:
-                taken[a] = _either(before, _through(i, place, mask, env))
+                taken[a] = _either(before, _through(i, place, mask, env, tail))
     return {n: mask for n, mask in taken.items() if mask is True or np.any(mask)}
 
 
@@ -216,16 +224,21 @@ def needed_of(program: Program, env: Mapping[int, Any], values: Iterable[int]) -
         return {n: found[n] for n in asked if n in found}
 
 
-def _through(i: Instruction, place: int, mask: Any, env: Mapping[int, Any]) -> Any:
+def _through(
+    i: Instruction, place: int, mask: Any, env: Mapping[int, Any], tail: tuple[int, ...] = ()
+) -> Any:
     """What an instruction of whose result a mask is needed needs of the argument at a place."""
     if i.op == "where" and place:
         chosen = np.asarray(env[i.args[0]], bool)
         mask = (chosen if place == 1 else ~chosen) & mask
     elif i.op != "where" and i.op not in ELEMENTWISE:
-        return True
+        if not tail or mask is True:
+            return True
+        whole = np.broadcast_to(mask, (*i.spec.shape, *tail))
+        return np.any(whole, axis=tuple(range(len(i.spec.shape))))
     if mask is True:
         return True
-    return _reduced(np.broadcast_to(mask, i.spec.shape), np.shape(env[i.args[place]]))
+    return _reduced(np.broadcast_to(mask, (*i.spec.shape, *tail)), np.shape(env[i.args[place]]))
 
 
 def _either(a: Any, b: Any) -> Any:

@@ -59,13 +59,14 @@ def whole_case(experiment: Experiment, one: tuple[Case, Flight], other: tuple[Ca
             return None
         if not all(_alike(made[k][n], start[n], 1e-9) for k, start in enumerate(starts) for n in made[k]):
             return None
-    return _composed(experiment, case, parts, begin=bool(moving))
+    same = {n for n in parts if np.array_equal(_given(case)[n].time, _given(other[0])[n].time)}
+    return _composed(experiment, case, parts, same, begin=bool(moving))
 
 
 def _parts(case: Case, flight: Flight) -> dict[str, str] | None:
     """Of which stream of the flight each source of the filter is, or is some fields; None where one is of
     none, or where the score is not against the flight's truth."""
-    given = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
+    given = _given(case)
     if getattr(case.score, "truth", None) is not flight.truth:
         return None
     found = {}
@@ -79,6 +80,10 @@ def _parts(case: Case, flight: Flight) -> dict[str, str] | None:
             return None
         found[source] = name
     return found
+
+
+def _given(case: Case) -> Any:
+    return case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
 
 
 def _within(a: Any, b: Series) -> bool:
@@ -104,7 +109,9 @@ def _begun(experiment: Experiment, case: Case) -> list[dict[str, Any]] | None:
     build = Builder(f"{case.graph.name}_start")
     with building(build):
         ticks = {**experiment.ticks, BEGIN: _once(BEGIN, first)}
-        sources = {name: _source(build, series) for name, series in {**ticks, **experiment.given(0)}.items()}
+        sources = {
+            name: _source(build, name, series) for name, series in {**ticks, **experiment.given(0)}.items()
+        }
         made = _world(experiment, sources)
         starts = case.begin(_firsts(build, made), sources[BEGIN])
         for name, stream in starts.items():
@@ -123,26 +130,30 @@ def _leaves(a: Any, b: Any) -> Iterator[tuple[Any, Any]]:
     yield from zip(flatten(a, kind), flatten(b, kind), strict=True)
 
 
-def _composed(experiment: Experiment, case: Case, parts: dict[str, str], *, begin: bool) -> Case | None:
+def _composed(
+    experiment: Experiment, case: Case, parts: dict[str, str], same: set[str], *, begin: bool
+) -> Case | None:
+    """The whole case; `same` are the sources whose times are those of all seeds."""
     in_graph = getattr(case.score, "in_graph", None)
     if in_graph is None:
         return None
-    given = case.inputs.streams if isinstance(case.inputs, Flight) else case.inputs
+    given, clocks = _given(case), {n.path: n.clock for n in case.graph.nodes if isinstance(n, SourceNode)}
     inputs = {**experiment.ticks, **experiment.given(0)}
     inputs[END] = _once(END, max(int(series.time[-1]) for series in experiment.ticks.values()))
     if begin:
         inputs[BEGIN] = _once(BEGIN, min(int(series.time[0]) for series in experiment.ticks.values()))
-    for name, whose in parts.items():
-        if name != whose:
-            inputs[name] = Series(given[name].time, np.ones(len(given[name]), dtype=bool), name=name)
     build = Builder(case.graph.name)
     with building(build):
-        sources = {name: _source(build, series) for name, series in inputs.items()}
+        sources = {name: _source(build, name, series) for name, series in inputs.items()}
         made = _world(experiment, sources)
-        wires = {
-            name: made[whose] if name == whose else _picked(build, made[whose], given[name], sources[name])
-            for name, whose in parts.items()
-        }
+        wires = {name: made[whose] for name, whose in parts.items()}
+        for name, stream in wires.items():
+            if name == parts[name] and stream.clock == clocks[name]:
+                continue
+            if name in inputs or name not in same or not isinstance(given[name].type, StructType):
+                return None  # of a clock that no source of this name can tell
+            inputs[name] = Series(given[name].time, np.ones(len(given[name]), dtype=bool), name=name)
+            wires[name] = _picked(build, stream, given[name], _source(build, name, inputs[name]))
         starts = case.begin(_firsts(build, made), sources[BEGIN]) if begin and case.begin is not None else {}
         streams = inlined(build, case.graph, wires, starts)
         wired = in_graph(streams, made["truth"], sources[END])
@@ -188,6 +199,6 @@ def _none(kind: Type) -> Any:
     return unflatten(kind, iter([np.zeros([int(n) for n in of.shape]) for _, of in leaves_of(kind)]))
 
 
-def _source(build: Builder, series: Series) -> Stream[Any]:
-    path = build.path(series.name, given=True)
+def _source(build: Builder, name: str, series: Series) -> Stream[Any]:
+    path = build.path(name, given=True)
     return build.stream(Wire(build.add(SourceNode(path, series.type, Source(path, timing_of(series)))), 0))

@@ -15,6 +15,7 @@ run took more than the allocator's own. 1 is linear.
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import process_time
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ from flowgraph import (
     simulate_to_parquet,
 )
 from flowgraph.blocks.flights import simulated
+from flowgraph.data.notes import note
 from flowgraph.graphs.benches.endurance import memory
 
 PERIOD_NS, EVERY = 5_000_000, 5
@@ -77,6 +79,7 @@ def two_rates(a: Stream[Scalar], b: Stream[Scalar]):
 def growth(
     *,
     engines: str = "python,numpy,xla,c",
+    parts: str = "whole,streamed,particles",
     least: int = 1,
     most: int = 100_000_000,
     least_particles: int = 1,
@@ -86,7 +89,7 @@ def growth(
     """Time and memory of each engine against ticks, whole and streamed, and against particles.
 
     Args:
-        engines: with commas between.
+        engines, parts: with commas between. A part is "whole", "streamed" (both over ticks) or "particles".
         least, most: ticks, for no more than the numbers between, a power of ten apart, that an engine is
             measured at.
         least_particles, most_particles: of `rbpf_indoor`, likewise.
@@ -95,7 +98,8 @@ def growth(
     Returns:
         A row a run: `engine`, `of` ("ticks" or "particles"), `mode`, `number`, `seconds` of the processor,
         `memory_bytes`; and a row a series of them with `number` None, `time_exponent` (None of fewer than
-        three) and `memory_exponent` (None below 1 MB). Figures `growth.svg` and, as a table, `growth.md`.
+        three) and `memory_exponent` (None below 1 MB). Figures `growth.svg` and, as a table, `growth.md`. A
+        note says how long it took.
     """
     if not (1 <= least <= most and 1 <= least_particles <= most_particles):
         raise DeclarationError(
@@ -103,21 +107,35 @@ def growth(
             got=f"{least} to {most} ticks, {least_particles} to {most_particles} particles",
             fix="write least=10000 and most=1000000",
         )  # fmt: skip
+    chosen = engines.split(","), parts.split(",")
+    for what, names, offered in zip(
+        ("engine", "part"), chosen, (list(RANGES), list(RANGES["c"])), strict=True
+    ):
+        for name in names:
+            if name not in offered:
+                raise UnknownNameError(what, name, offered, path=f"growth.{what}s")
+    begun, busy = perf_counter(), _busy()
     rows: list[dict[str, Any]] = []
-    for engine in engines.split(","):
-        if engine not in RANGES:
-            raise UnknownNameError("engine", engine, RANGES, path="growth.engines")
-        for mode, (low, high) in RANGES[engine].items():
+    for engine in chosen[0]:
+        for mode in chosen[1]:
+            low, high = RANGES[engine][mode]
             of, how = ("particles", "whole") if mode == "particles" else ("ticks", mode)
             ends = (least_particles, most_particles) if mode == "particles" else (least, most)
             for number in _decades(max(low, ends[0]), min(high, ends[1])):
                 rows.append(_apart(of, how, engine, number, duration))
     fits = [_fit(some) for some in _series(rows).values() if len(some) > 1]
     made = [*rows, *fits]
-    return Report(
-        made,
-        {"growth.svg": lambda path: _draw(rows, path), "growth.md": lambda path: _write(made, path)},
+    figures = {"growth.svg": partial(_draw, rows), "growth.md": partial(_write, made)}
+    took = (
+        f"{len(rows)} processes took {perf_counter() - begun:.0f} s, {_busy() - busy:.0f} s of the processor"
     )
+    return Report(made, figures, (note("info", took),))
+
+
+def _busy() -> float:
+    """Seconds of the processor that the processes which have ended took."""
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return spent.ru_utime + spent.ru_stime
 
 
 def _decades(least: int, most: int) -> list[int]:

@@ -24,6 +24,7 @@ from flowgraph.engines.verilog.text import texts
 from flowgraph.engines.verilog.toggles import toggles
 from flowgraph.graphs.benches.fixed import flown
 from flowgraph.graphs.benches.hardware_space import design_space, numbers, taped
+from flowgraph.language.checks import need_count
 from flowgraph.recorder.random import seed_words
 from flowgraph.study.quantise import RELATIVE, quantise
 
@@ -45,6 +46,7 @@ def hardware(
     played: str = "verilog",
     energy: bool = False,
     routed: bool = False,
+    seeds: int = 1,
     space: str = "",
     folder: str = "",
     seed: int = 0,
@@ -57,12 +59,13 @@ def hardware(
         bound: of the difference of the estimate to float64, relative to its size.
         flights: simulated ones, that the formats are found on; one more judges.
         duration: of a flight, s.
-        compared: seconds of it that are played in Verilator.
+        compared: seconds of it that are played in Verilator; with 0 the machine is made and not played.
         particles: of the filters that have some; as many as `bench fixed` takes if left out.
         lanes: of the machine, some between commas; each has a multiplier of 34 bits.
         played: "verilog", or "hls" for the C++ of high-level synthesis, which has no cycles.
         energy: whether to count what the energy of a tick goes with.
         routed: whether to synthesise, place and route each.
+        seeds: of the placer: they are tried until one reaches 100 MHz, and the fastest counts.
         space: widths between commas, such as 16,20,24: then one graph is made in each, and a row is a
             machine, with a picture of the Pareto front. See `hardware_space`.
         folder: where the files of each go; a temporary one if left out.
@@ -73,14 +76,20 @@ def hardware(
         `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
-        the program and `words` of memory; where `energy` is asked for, `energy_estimate_operations` (terms of
-        sums in the longest tick; None of a filter with loops) and `energy_estimate_toggles` (bits that change
-        in a mean tick, block memories left out); `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
-        routed), `us_per_tick` (with all aids, at that clock, or else at 100 MHz), and `reason`, why
-        there is no machine.
+        the program, `words` of memory, and the `memories` of 18 kbit that both want; where `energy` is asked
+        for, `energy_estimate_operations` (terms of sums in the longest tick; None of a filter with loops) and
+        `energy_estimate_toggles` (bits that change in a mean tick, block memories left out); `lut`, `ff`,
+        `dsp`, `bram`, `fmax_hz` (None where it was not routed), `us_per_tick` (with all aids, at that clock,
+        or else at 100 MHz), and `reason`, why there is no machine.
     """
     if played not in ("verilog", "hls"):
         raise UnknownNameError("text to play", played, ("verilog", "hls"), path="played")
+    if compared < 0.0 or (compared == 0.0 and (energy or played == "hls")):
+        raise DeclarationError(
+            "this plays a part of a flight", path="compared", expected="more than 0 s", got=f"{compared:g}",
+            fix="write --set compared=0.5",
+        )  # fmt: skip
+    need_count("hardware", "seeds", seeds, least=1)
     names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
     counts = numbers(lanes, "lanes")
     if space:
@@ -91,7 +100,7 @@ def hardware(
             )  # fmt: skip
         return design_space(
             names[0], numbers(space, "space"), counts, flights=flights, duration=duration,
-            particles=particles, routed=routed, folder=folder, seed=seed,
+            particles=particles, routed=routed, seeds=seeds, folder=folder, seed=seed,
         )  # fmt: skip
     rows: list[dict[str, Any]] = []
     for name, count in product(names, counts):
@@ -112,7 +121,7 @@ def hardware(
             if energy:
                 _weighed(row, pipeline, some[-1], compared)
             if routed:
-                _routed(row, pipeline, some[-1], folder)
+                _routed(row, pipeline, some[-1], folder, seeds)
             clock = row["fmax_hz"] or TARGET_HZ
             row["us_per_tick"] = row["cycles_all_aids"] / clock * 1e6
         except FlowgraphError as error:
@@ -120,30 +129,33 @@ def hardware(
         rows.append(row)
     where = "Verilator" if played == "verilog" else "C++ compiled here"
     note = f"formats from {flights} flights of {duration:g} s; {compared:g} s of another played in {where}"
-    return Report(rows, {}, (note,))
+    tried = (f"place and route with up to {seeds} seeds, the fastest counts",) if routed and seeds > 1 else ()
+    return Report(rows, {}, (note, *tried))
 
 
 _COLUMNS = (
     "graph", "particles", "width", "lanes", "multipliers", "position_difference_rms_m",
     "attitude_difference_rms_deg", "saturations", "values_compared", "values_differing",
-    "cycles", "cycles_all_aids", "steps", "words",
+    "cycles", "cycles_all_aids", "steps", "words", "memories",
     "energy_estimate_operations", "energy_estimate_toggles", "lut", "ff", "dsp", "bram", "fmax_hz",
     "us_per_tick", "reason",
 )  # fmt: skip
 
 
 def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
-    events, start = taped(flight, seconds)
-    player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
-    player.play(events, start.cells, seed_words(flight.seed), None)
+    if seconds:
+        events, start = taped(flight, seconds)
+        player = Simulated(pipeline, events.patterns, check=True, lanes=row["lanes"])
+        player.play(events, start.cells, seed_words(flight.seed), None)
+        image, cycles = player.image, player.cycles
+        row |= {"values_compared": player.compared, "values_differing": player.differing}
+    else:
+        image = Image(pipeline, taped(flight)[0].patterns, row["lanes"])
+        cycles = [e.cycles for e in image.entries]
     row |= {
-        "values_compared": player.compared,
-        "values_differing": player.differing,
-        "cycles": min(player.cycles),
-        "cycles_all_aids": max(player.cycles),
-        "steps": len(player.image.program),
-        "words": player.image.words,
-    }
+        "cycles": min(cycles), "cycles_all_aids": max(cycles), "steps": len(image.program),
+        "words": image.words, "memories": image.memories,
+    }  # fmt: skip
 
 
 def _compiled(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> None:
@@ -161,11 +173,11 @@ def _weighed(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) ->
     row["energy_estimate_toggles"] = round(toggles(image, events, start.cells, seed_words(flight.seed)))
 
 
-def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str) -> None:
+def _routed(row: dict[str, Any], pipeline: Any, flight: Any, folder: str, seeds: int) -> None:
     events, _ = taped(flight, None)
     with tempfile.TemporaryDirectory() as other:
         at = Path(folder or other) / pipeline.name
         at.mkdir(parents=True, exist_ok=True)
         for name, text in texts(Image(pipeline, events.patterns, row["lanes"])).items():
             put(at / name, text)
-        row |= vars(route(at, pipeline.name))
+        row |= vars(route(at, pipeline.name, seeds=seeds))

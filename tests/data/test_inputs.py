@@ -242,6 +242,7 @@ def test_ticks_that_are_none_are_refused():
     with pytest.raises(DataError, match="ticks.until: this time does not fit 64 bits"):
         ticks("100ms", until="1s", start=2**63 - 10)
     assert not len(ticks("5ms", until=0))
+    assert ticks("5ms", until="10ms", start="1s").time.tolist() == [1_000_000_000, 1_005_000_000]
 
 
 def test_seconds_that_are_no_numbers_are_refused():

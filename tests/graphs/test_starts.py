@@ -110,7 +110,6 @@ def scored(made: Flight, **settings: Any) -> tuple[float, Case]:
 
 @pytest.mark.slow
 def test_a_heading_is_found_from_positions_in_a_file(tmp_path):
-    """Of six flights one at most is still off after eight seconds: 10 degrees, of the flight of seed 0."""
     excess = []
     for seed, angle in enumerate((150.0, -60.0, 180.0, 150.0, -60.0, 180.0)):
         made = load_flight(f"euroc:{write_euroc(tmp_path / f'flight{seed}', flight(12.0, seed), angle)}")
@@ -118,8 +117,7 @@ def test_a_heading_is_found_from_positions_in_a_file(tmp_path):
         found, case = scored(made, settle=8.0, start="unknown_yaw")
         assert any("sought in the first" in note for note in case.notes)
         excess.append(found - known)
-    assert sorted(excess)[-2] < 0.7
-    assert np.median(excess) < 0.5
+    assert max(excess) < 0.4
 
 
 @pytest.mark.slow

@@ -256,6 +256,31 @@ def test_the_command_writes_what_run_and_lower_read(tmp_path):
     assert "26 bits, fraction " in shown.output
 
 
+def test_other_flights_may_judge_with_settings_of_their_own(tmp_path):
+    flights = ["--data", "sim", "--set", "duration=1", "--seeds", "1", "--held-out-seeds", "1"]
+    asked = ["--width", "26", "--least", "26", "--bound", "position_difference_rms_m=0.01"]
+    others = ["--held-out-data", "sim", "--held-out-set", "duration=2"]
+
+    def made(*how, to):
+        run = CliRunner().invoke(
+            app, ["quantise", "kalman", *flights, *asked, *how, "-o", str(tmp_path / to), "--json"]
+        )
+        assert run.exit_code == 0, run.output
+        return json.loads(run.stdout)
+
+    alike, elsewhere = made(to="a"), made(*others, to="b")
+    assert alike["held_out_data"] == ["sim"]
+    assert alike["held_out_settings"] == ["duration=1"]
+    assert elsewhere["held_out_data"] == ["sim"]
+    assert elsewhere["held_out_settings"] == ["duration=2"]
+    assert elsewhere["position_difference_rms_m"] != alike["position_difference_rms_m"]
+    refused = CliRunner().invoke(
+        app, ["quantise", "kalman", *flights, *asked, *others[2:], "-o", str(tmp_path / "c")]
+    )
+    assert refused.exit_code != 0
+    assert "--held-out-data" in refused.output
+
+
 def test_lowering_to_fixed_point_needs_formats(tmp_path):
     made = CliRunner().invoke(app, ["lower", "kalman", "--dtype", "fixed", "-o", str(tmp_path)])
     assert made.exit_code != 0

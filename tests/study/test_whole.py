@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowgraph import Case, Flight, find_graph, load_flight, simulate
+from flowgraph import Case, Flight, Stream, Tick, find_graph, graph, load_flight, simulate, ticks
+from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.blocks.models.pose import pose_at_start
+from flowgraph.blocks.sensors import read_imu, read_pose, true_state
+from flowgraph.blocks.world import RoundTrip, world_motion
+from flowgraph.data.experiment import Experiment
+from flowgraph.data.inputs import clocks_of
 from flowgraph.study import Study, run_study, tasks
 from flowgraph.study.whole import whole_case
 
@@ -141,3 +146,53 @@ def test_a_whole_experiment_is_the_same_in_every_engine() -> None:
     for engine in ("reference", "xla", "c"):
         got = case.score(simulate(case.graph, case.inputs, engine=engine, seed=3))
         np.testing.assert_allclose(list(got.values()), list(want.values()), rtol=1e-9, atol=1e-9)
+
+
+@graph
+def own_world(clock: Stream[Tick], seen: Stream[Tick], *, world: RoundTrip):
+    """Its clocks are not called as its streams are."""
+    motion = world_motion(at=clock, world=world)
+    pose = read_pose(world_motion(at=seen, world=world), position_noise=0.01, attitude_noise=0.01)
+    return {
+        "imu": read_imu(motion, gyro=0.01, accelerometer=0.1),
+        "vicon": pose,
+        "truth": true_state(motion),
+    }
+
+
+def flights_of_their_own(made: Experiment) -> list[tuple[Case, Flight]]:
+    known = {"imu_noise": ImuNoise(1e-3, 1e-2, 0.0, 0.0), "position_noise": 0.01, "attitude_noise": 0.01}
+    found = []
+    for seed in (0, 1):
+        run = simulate(made.world.build(**clocks_of(made.ticks), **made.settings), made.ticks, seed=seed)
+        streams = {name: run[name] for name in ("imu", "vicon")}
+        flight = Flight(f"own-{seed}", streams, run["truth"], known, experiment=made)
+        found.append((find_graph("ekf").case(flight), flight))
+    return found
+
+
+def test_a_world_of_ones_own_is_flown_whole_whatever_its_clocks_are_called() -> None:
+    clocks = {"clock": ticks("20ms", until="1.5s"), "seen": ticks("100ms", until="1.5s")}
+    made = Experiment(own_world, clocks, {"world": RoundTrip(2.0, trip=0.4, rest=0.1)})
+    found = flights_of_their_own(made)
+    whole = whole_case(made, *found)
+    assert whole is not None
+    for seed, (case, _) in enumerate(found):
+        got = whole.score(simulate(whole.graph, whole.inputs, seed=seed))
+        want = case.score(simulate(case.graph, case.inputs, seed=seed))
+        assert got == pytest.approx(want, rel=1e-9, abs=1e-9)
+    taken = replace(made, ticks={"imu": clocks["clock"], "vicon": clocks["seen"]}, world=swapped)
+    assert whole_case(taken, *flights_of_their_own(taken)) is None, "of clocks that mean another stream"
+
+
+@graph
+def swapped(imu: Stream[Tick], vicon: Stream[Tick], *, world: RoundTrip):
+    """The pose comes at each other tick of the unit, and nothing at the clock of its name."""
+    motion = world_motion(at=imu, world=world)
+    pose = read_pose(world_motion(at=imu.every(2), world=world), position_noise=0.01, attitude_noise=0.01)
+    return {
+        "imu": read_imu(motion, gyro=0.01, accelerometer=0.1),
+        "vicon": pose,
+        "truth": true_state(motion),
+        "other": world_motion(at=vicon, world=world),
+    }

@@ -7,15 +7,15 @@ is bounded to the first order from the formats of its arguments, and a format fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from flowgraph.data.tape import Tape
+from flowgraph.engines.fixed.abreast import Recorded, abreast, varying
 from flowgraph.engines.fixed.bounds import proven_sizes
 from flowgraph.engines.fixed.shifts import MOVES, READ_WHOLE, Site, moved
-from flowgraph.engines.reference import Interpreter
 from flowgraph.pipeline.format_files import structure_of
 from flowgraph.pipeline.formats import FREE, WIDEST, Formats, fraction_for, fraction_of_constant
 from flowgraph.pipeline.pipeline import Pipeline
@@ -23,8 +23,8 @@ from flowgraph.pipeline.program import needed
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.trace import Instruction
 
-_TOGETHER = 128
-"""Ticks whose values are looked at in one go."""
+_TOGETHER, _AT_ONCE = 1 << 22, 1 << 25
+"""Numbers that are looked at in one go, and in a tick of flights that are played at once."""
 
 _HELD = 16.0
 """Errors of a register, in units of its last place: it gathers those of many ticks."""
@@ -71,73 +71,71 @@ class Sizes:
         }
         self._waiting: dict[int, list[Any]] = {}
         self._idle: dict[int, list[Any]] = {}
+        self._numbers = 0
         self._fits: dict[int, np.ndarray] = {}
         self._wider: dict[int, np.ndarray] = {}
         self._varying: set[int] = set()
         self._proven: dict[int, np.ndarray] | None = None
 
-    def play(self, pipeline: Pipeline, tape: Tape, cells: list[Any], seed: np.ndarray) -> None:
-        """Play one flight, and widen the sizes by what occurs in it.
+    def play(self, flights: Sequence[Recorded]) -> None:
+        """Play some flights, as many at once as memory is for, and widen the sizes by what occurs in them.
 
         Args:
-            pipeline: of the same structure, with the numbers of this flight.
-            tape: its ticks.
-            cells: register cells at the start.
-            seed: (2,) uint32.
+            flights: of pipelines of the same structure, with numbers of their own.
         """
-        self._varying |= {
-            n for n, a in self.pipeline.constants.items() if not np.array_equal(a, pipeline.constants[n])
-        }
+        self._varying |= varying([self.pipeline, *(f.pipeline for f in flights)])
         self._proven = None
-        player = Interpreter(pipeline, cells, np.dtype(np.float64), seed)
-        rows = [zip(*s.leaves.values(), strict=True) for s in tape.series]
-        for cell, value in zip(self._cells, cells, strict=True):
-            self._see(cell.read, cell.dtype, value)
+        most = max(1, _AT_ONCE // sum(math.prod(spec.shape) for spec in self.pipeline.specs.values()))
+        for first in range(0, len(flights), most):
+            self._play(flights[first : first + most])
+
+    def _play(self, flights: Sequence[Recorded]) -> None:
+        for flight in flights:
+            for cell, value in zip(self._cells, flight.cells, strict=True):
+                self._see(cell.read, cell.dtype, np.asarray(value)[..., None])
+        real = [[leaf.value for leaf in port.leaves if leaf.dtype == "real"] for port in self.pipeline.inputs]
         with np.errstate(all="ignore"):
-            for time, key in zip(tape.time.tolist(), tape.key.tolist(), strict=True):
-                values = [next(row) for k, row in enumerate(rows) if key >> k & 1]
-                program, env = player.values(time, key, values)
-                player.cells = [env[n] for n in program.writes]
-                given = [
-                    leaf.value
-                    for k, port in enumerate(pipeline.inputs)
-                    if key >> k & 1
-                    for leaf in port.leaves
-                    if leaf.dtype == "real"
-                ]
-                taken = needed(program, env)
-                for n in (*given, *(i.out for i in program.instructions if i.spec.dtype == "real")):
+            for step in abreast(flights):
+                env, tail = step.values, (len(step.flights),)
+                given = [n for k, leaves in enumerate(real) if step.key >> k & 1 for n in leaves]
+                taken = needed(step.program, env, tail)
+                for n in (*given, *(i.out for i in step.program.instructions if i.spec.dtype == "real")):
                     mask = taken.get(n, False)
                     if mask is not True:
-                        self._idle.setdefault(n, []).append(env[n])
+                        self._keep(self._idle, n, env[n])
                     self._see(n, "real", env[n] if mask is True else np.where(mask, env[n], 0.0))
                 self.absent |= {n for n in given if np.isnan(env[n]).any()}
-                for cell, n in zip(self._cells, program.writes, strict=True):
+                for cell, n in zip(self._cells, step.program.writes, strict=True):
                     self._see(cell.read, cell.dtype, env[n])
-                self.ticks += 1
-                if self.ticks % _TOGETHER == 0:
+                self.ticks += len(step.flights)
+                if self._numbers > _TOGETHER:
                     self._look()
         self._look()
 
     def _see(self, value: int, dtype: str, x: Any) -> None:
         if dtype == "real":
-            self._waiting.setdefault(value, []).append(x)
+            self._keep(self._waiting, value, x)
+
+    def _keep(self, waiting: dict[int, list[Any]], value: int, x: Any) -> None:
+        waiting.setdefault(value, []).append(x)
+        self._numbers += x.size
 
     def _look(self) -> None:
         """Widen the sizes by the values that wait."""
         held = {c.read for c in self._cells}
         for waiting, sizes in ((self._waiting, self.largest), (self._idle, self.untaken)):
             for value, rows in waiting.items():
-                size = np.abs(np.asarray(rows, dtype=np.float64))
-                axes = tuple(a for a, n in enumerate(size.shape[1:]) if n in self._shared)
+                size = np.abs(np.concatenate(rows, axis=-1))
+                axes = tuple(a for a, n in enumerate(size.shape[:-1]) if n in self._shared)
                 finite = np.isfinite(size)
                 if not finite.all():
                     if value in held and np.isnan(size).any():
                         self.absent.add(value)
                     size = np.where(finite, size, 0.0)
-                size = size.max(axis=0).max(axis=axes, keepdims=True, initial=0.0)
+                size = size.max(axis=-1).max(axis=axes, keepdims=True, initial=0.0)
                 sizes[value] = np.maximum(sizes.get(value, 0.0), size)
             waiting.clear()
+        self._numbers = 0
 
     def _size(self, value: int) -> np.ndarray | None:
         """Of what was taken; where an element never was, of what it would have been."""

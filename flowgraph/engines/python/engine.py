@@ -48,6 +48,7 @@ class PythonEngine(BlockEngine):
                 got='engine="python"',
                 fix='use engine="reference" or "xla"',
             )
+        super().check(options)
 
     def run(self, graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
         if options.checkpoint is not None:

@@ -78,6 +78,7 @@ class Image:
         indices: how many of these places are kept.
         element_bits: of the number of an element.
         lanes: how many, and whether the memory is deep.
+        memories: of 18 kbit that memory and program want in an ECP5; a synthesis may leave some out.
     """
 
     def __init__(self, pipeline: Pipeline, keys: Sequence[int], lanes: int = 1) -> None:
@@ -124,6 +125,18 @@ class Image:
         for key, p, s in zip(keys, plans, schedules, strict=True):
             self._append(key, p, s)
         self.step_bits = max(4, len(self.program).bit_length())
+
+    @property
+    def memories(self) -> int:
+        banks = self.lanes.banks
+        copies = 2 * self.lanes.count * banks
+        program = self.lanes.count * self._lane_bits + (6 if self.has_rows else 1)
+        return copies * memories(-(-self.words // banks), 36) + memories(len(self.program), program)
+
+    @property
+    def _lane_bits(self) -> int:
+        """Of a lane's part of a microword."""
+        return 31 + 3 * self.place_bits + 4 * self.has_rows
 
     def _held(self) -> dict[int, np.ndarray]:
         found: dict[int, np.ndarray] = {}
@@ -250,7 +263,7 @@ class Image:
         return int(self.places[held.value].reshape(-1)[held.place * halves + int(held.high)])
 
     def _microword(self, word: Word, at: _At, last: bool) -> int:
-        lane_bits = 31 + 3 * self.place_bits + 4 * self.has_rows
+        lane_bits = self._lane_bits
         code = 0
         repeat, running = word.repeat, False
         if isinstance(word.does, Loop):
@@ -313,6 +326,13 @@ class Image:
             to = UNITS[slot.node.unit] if slot.writes is None else said(slot.writes, slot.nth)
             text += f"  => {slot.mode} >> {slot.node.end} {to}  // {slot.line}"
         return text
+
+
+def memories(words: int, bits: int) -> int:
+    """Memories of 18 kbit for words of so many bits: each holds 2,048 of 9, 1,024 of 18 or 512 of 36."""
+    rest = words % BLOCK
+    wide = 9 if rest > BLOCK // 2 else 18 if rest > BLOCK // 4 else 36
+    return words // BLOCK * -(-bits // 9) + (-(-bits // wide) if rest else 0)
 
 
 _At = Callable[[int, int], tuple[int, bool]]

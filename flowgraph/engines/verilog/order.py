@@ -24,7 +24,7 @@ DEEP = 3
 AHEAD = 4
 """Cycles more until an index can be read: the places of words are worked out before they are read."""
 
-UNIT_LATENCY = {"divide": 47, "root": 47, "logarithm": 195, "angle": 95}
+UNIT_LATENCY = {"divide": 49, "root": 49, "logarithm": 197, "angle": 97}
 """Cycles from the microword that starts a unit to the first that can take what it made."""
 
 COPIES = {"divide": 4, "root": 2, "logarithm": 4, "angle": 2}

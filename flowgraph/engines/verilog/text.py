@@ -142,7 +142,7 @@ def _fractions(fraction: np.ndarray | None) -> str:
 
 _MAKEFILE = """\
 # `make` builds the bench with Verilator; `obj/V{name} SCRIPT` plays a script on it.
-VERILATOR ?= verilator
+VERILATOR ?= $(shell command -v verilator || echo verilator-cli)
 SOURCES = {name}.v {modules}
 
 obj/V{name}: $(SOURCES) bench.cpp

@@ -16,7 +16,8 @@ from flowgraph.data.batch import Runs
 from flowgraph.data.tape import Tape
 from flowgraph.engines.contract import ManyOutcome, ManyRuns, real_leaves
 from flowgraph.engines.options import RunOptions
-from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick, chosen_device
+from flowgraph.engines.xla.devices import Devices, chosen_device
+from flowgraph.engines.xla.scan import Chunk, Scan, bytes_per_tick
 from flowgraph.errors import DataError
 from flowgraph.pipeline.pipeline import Pipeline, Port
 from flowgraph.recorder.random import seed_words
@@ -26,17 +27,23 @@ _CHUNK_BYTES = 64 * 2**20
 
 
 def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:
-    """Play the runs, `options.runs_at_once` in a call."""
-    size, real = options.runs_at_once, np.dtype(options.dtype)
+    """Play the runs, `options.runs_at_once` in a call, or a few more where devices share them."""
     pipeline, first, seeds = _pruned(runs.pipeline, runs.keep), runs.first, runs.seeds
+    devices = Devices(runs.pipeline, options.shard) if options.shard else None
+    size, real = options.runs_at_once, np.dtype(options.dtype)
+    if devices is not None:
+        size = devices.rounded(size)
     keys = first.patterns
     per_tick = size * bytes_per_tick(pipeline)
     ticks = max(1, min(_TICKS_AT_ONCE, len(first.time), _CHUNK_BYTES // max(per_tick, 1)))
-    which = (keys, real.name, ticks, size, runs.shared, repr(runs.keep), passes, chosen_device())
+    shard = tuple((options.shard or {}).items())
+    which = (keys, real.name, ticks, size, runs.shared, repr(runs.keep), passes, chosen_device(), shard)
     # they live as long as the pipeline does
     compiled: dict[Any, Scan] = runs.pipeline.__dict__.setdefault("_batched", {})
     if which not in compiled:
-        compiled[which] = Scan(pipeline, keys, real, ticks, runs=size, shared=runs.shared, passes=passes)
+        compiled[which] = Scan(
+            pipeline, keys, real, ticks, runs=size, shared=runs.shared, passes=passes, devices=devices
+        )
     scan = compiled[which]
     columns_first = _columns([first], True, real)
     chunks: list[list[Chunk]] = []

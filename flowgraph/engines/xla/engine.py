@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any
 
@@ -20,7 +20,9 @@ from flowgraph.engines.forks import refuse_lost_threads
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.stretches import gathered
 from flowgraph.engines.xla.batch import vectorised
-from flowgraph.engines.xla.scan import Scan, chosen_device, chunk_size, import_jax
+from flowgraph.engines.xla.devices import RUNS, Devices, chosen_device, import_jax
+from flowgraph.engines.xla.scan import Scan, chunk_size
+from flowgraph.errors import DeclarationError
 from flowgraph.pipeline.optimise import ARRAYS
 from flowgraph.pipeline.pipeline import Pipeline
 
@@ -54,6 +56,21 @@ class XlaEngine(PipelineEngine):
     name = "xla"
     passes = ARRAYS
     takes_many = True
+    shards = True
+
+    def __init__(self, shard: Mapping[str, int] | None = None) -> None:
+        self._shard = shard or {}
+
+    def with_shard(self, shard: Mapping[str, int] | None) -> XlaEngine:
+        if RUNS in (shard or {}):
+            raise DeclarationError(
+                "a run by itself is no runs to share out",
+                path="shard",
+                expected="axes that the types of the graph name, such as particles",
+                got=str(shard),
+                fix="ask for many runs, or leave runs out; with host blocks a graph runs one by one",
+            )
+        return XlaEngine(shard)
 
     def need(self) -> None:
         refuse_lost_threads()
@@ -63,10 +80,13 @@ class XlaEngine(PipelineEngine):
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
     ) -> Player:
         chunk = chunk_size(pipeline, ticks)
-        which = (tuple(patterns), dtype, chunk, passes, chosen_device())
+        which = (tuple(patterns), dtype, chunk, passes, chosen_device(), tuple(self._shard.items()))
         kept: dict[Any, Scan] = pipeline.__dict__.setdefault("_scans", {})  # as long as the pipeline lives
         if which not in kept:
-            kept[which] = Scan(pipeline, tuple(patterns), np.dtype(dtype), chunk, passes=passes)
+            devices = Devices(pipeline, self._shard) if self._shard else None
+            kept[which] = Scan(
+                pipeline, tuple(patterns), np.dtype(dtype), chunk, passes=passes, devices=devices
+            )
         return _Compiled(kept[which])
 
     def play_many(self, runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> ManyOutcome:

@@ -18,8 +18,8 @@ import numpy as np
 
 from flowgraph.data.tape import Rows, bits
 from flowgraph.engines.xla.buffers import Buffers
+from flowgraph.engines.xla.devices import RUNS, Devices, import_jax
 from flowgraph.engines.xla.namespace import JaxNamespace
-from flowgraph.errors import MissingDependencyError
 from flowgraph.pipeline.optimise import ARRAYS, optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
@@ -31,30 +31,6 @@ _UNROLLED = 4
 _SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
-
-
-def import_jax() -> Any:
-    """The `jax` module.
-
-    Raises:
-        MissingDependencyError: with what to install.
-    """
-    try:
-        import jax  # optional
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the XLA engine needs JAX",
-            path='engine="xla"',
-            expected="an installed jax",
-            got=str(error),
-            fix='pip install "flowgraph-filters[xla]", or use engine="python"',
-        ) from None
-    return jax
-
-
-def chosen_device() -> str:
-    """What `jax.default_device` names now, as a key: a scan is compiled for one device."""
-    return str(import_jax().config.jax_default_device)
 
 
 @dataclass(frozen=True)
@@ -79,11 +55,13 @@ class Scan:
         runs: how many runs go at once, under `vmap`; None for one, without a leading axis.
         shared: with `runs`, whether all runs have the same inputs.
         passes: of the optimiser.
+        devices: among which runs or lanes are shared out; None for the one that is chosen.
     """
 
     def __init__(
         self, pipeline: Pipeline, keys: tuple[int, ...], dtype: Any, chunk: int, *,
         runs: int | None = None, shared: bool = True, passes: Collection[str] = ARRAYS,
+        devices: Devices | None = None,
     ) -> None:  # fmt: skip
         self.jax = import_jax()
         self.pipeline, self.keys, self.dtype, self.chunk = pipeline, keys, dtype, chunk
@@ -99,14 +77,34 @@ class Scan:
         self._unroll = _UNROLLED if self.branches is None and _moved(pipeline) <= _SMALL_TICK else 1
         self._input_axis = 0 if shared or runs is None else 1
         self._output_axis = 0 if runs is None else 1
+        leads = () if runs is None else (RUNS,)
+        placed = {} if devices is None else self._placed(devices, leads, () if shared else leads)
         play = self._chunk
         if runs is not None:
             play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
         self._compiled: Any = None
-        self._play_chunk = self.jax.jit(play)
+        self._play_chunk = self.jax.jit(play, **placed)
 
     def _program(self, key: int | None) -> Program:
         return optimise(specialise(self.pipeline, key), self.passes)
+
+    def _placed(
+        self, devices: Devices, leads: tuple[str, ...], inputs_lead: tuple[str, ...]
+    ) -> dict[str, Any]:
+        """Where the arguments of a chunk and its results lie, for `jit`."""
+        cells = devices.placed([c for r in self.pipeline.registers for c in r.cells], *leads)
+        ticks = (*leads, None)
+        every = devices.at()
+        given = tuple(devices.placed(p.leaves, *inputs_lead, None) for p in self.pipeline.inputs)
+        made = [
+            (None if known is not None else devices.at(*leads), devices.placed(port.leaves, *ticks))
+            for port, known in zip(self.pipeline.outputs, self.follows, strict=True)
+        ]
+        time = every if self._timed else None
+        return {
+            "in_shardings": (cells, devices.at(*leads), (every, time, given)),
+            "out_shardings": (cells, made),
+        }
 
     def compile(self, cells: list[Any], seed: np.ndarray, inputs: list[list[np.ndarray]]) -> None:
         """Compile for these shapes, once."""

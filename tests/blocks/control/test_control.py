@@ -24,10 +24,12 @@ from flowgraph.blocks.control import (
     state_feedback,
     transfer,
 )
+from flowgraph.blocks.filtering import filtered
 from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import geodesic_angle
 from flowgraph.blocks.kalman import LinearModel
 from flowgraph.blocks.signals import FlightCommand
+from flowgraph.blocks.statespace import MeasurementModel, MotionModel, runge_kutta
 from flowgraph.errors import RunError
 from tests.support import MS, all_engines, both_quick, scalars
 
@@ -256,3 +258,85 @@ def test_a_solver_refuses_attitudes_and_what_it_cannot_solve() -> None:
     falls = DormandPrince(StateSpace(euclidean(1)), lambda x, xp: xp.stack([x[..., 0] ** 2]))
     with pytest.raises(RunError, match="could not be solved"):
         falls.after(np.array([1.0]), None, 2.0)
+
+
+DRIFTING = StateSpace(position=euclidean(1), speed=euclidean(1))
+
+
+def dynamics(x: Any, u: Any, t: Any, xp: Any) -> Any:
+    """Pushed by u and by a wind that turns with the time, sin 3t."""
+    return {"position": x.speed, "speed": u + xp.sin(3.0 * t) + 0.0 * x.speed}
+
+
+@graph
+def blown(clock: Stream[Tick], push: Stream[Scalar], *, model: Any):
+    body = plant(model, start=np.zeros(2), command=0.0, at=clock)
+    body.feed(push)
+    return body.output
+
+
+@pytest.mark.parametrize("start", ["0s", "7s"])
+def test_a_plant_that_depends_on_the_time_is_told_it(start: str) -> None:
+    """Whether it is stepped, in every engine, or solved to a tolerance; wherever its clock begins."""
+    clock = ticks("20ms", until="1.2s", start=start)
+    given = {"clock": clock, "push": scalars([int(clock.time[0])], [0.5])}
+    stepped = MotionModel(DRIFTING, runge_kutta(DRIFTING, dynamics, steps=2))
+    found = all_engines(blown.build(model=stepped), given).output.value
+    solved = simulate(blown.build(model=DormandPrince(DRIFTING, dynamics)), given).output.value
+    t, b = clock.time * 1e-9, clock.time[0] * 1e-9
+    s = t - b
+    speed = 0.5 * s + (np.cos(3.0 * b) - np.cos(3.0 * t)) / 3.0
+    place = 0.25 * s**2 + np.cos(3.0 * b) * s / 3.0 - (np.sin(3.0 * t) - np.sin(3.0 * b)) / 9.0
+    for got, least in ((found, 1e-9), (solved, 1e-8)):
+        np.testing.assert_allclose(got, np.c_[place, speed], atol=least)
+    assert np.ptp(np.diff(found[:, 1])) > 0.01, "the wind turns"
+
+
+def test_a_filter_has_no_time_to_tell_a_motion() -> None:
+    def moved(x: Any, w: Any, t: Any, dt: Any, xp: Any) -> Any:
+        return x.place + (xp.sin(t) + w) * dt
+
+    space = StateSpace(place=euclidean(1))
+    car = MotionModel(space, moved, density=[1.0])
+    seen = MeasurementModel(space, lambda x, v, xp: x.place + v, noise=[1.0])
+
+    @graph
+    def tracked(fix: Stream[Scalar]):
+        return filtered(car, {seen: fix}, start=space.gaussian(place=(0.0, 1.0)))
+
+    with pytest.raises(DeclarationError, match="a filter does not tell a motion the time"):
+        tracked.build()
+
+
+def test_a_plant_without_a_state_of_its_own_to_start_from_is_refused() -> None:
+    for model, start in ((dynamics, np.zeros(2)), (LinearModel(*CART, np.zeros(2)), np.zeros(3))):
+
+        @graph
+        def odd(clock: Stream[Tick], *, model: Any = model, start: Any = start):
+            body = plant(model, start=start, command=0.0, at=clock)
+            body.feed(body.output.map(lambda x: x[0]))
+            return body.output
+
+        with pytest.raises(DeclarationError, match=r"this is no plant(.*\n)*.*of shape \("):
+            odd.build()
+
+
+def test_steps_tolerances_and_limits_that_are_none_are_refused() -> None:
+    for steps in (0, -1, 1.5, True):
+        with pytest.raises(DeclarationError, match="a step cannot be taken in so many parts"):
+            runge_kutta(DRIFTING, dynamics, steps=steps)  # type: ignore[arg-type]
+    for kind in ({"relative": 0.0}, {"absolute": -1e-9}, {"relative": np.nan}):
+        with pytest.raises(DeclarationError, match="no step is this good"):
+            DormandPrince(SWING, pendulum, **kind)
+
+    @graph
+    def held(x: Stream[Scalar]):
+        return limited(x, low=1.0, high=-1.0)
+
+    @graph
+    def told(x: Stream[Scalar]):
+        return pid(x, gain=1.0, low=1.0, high=-1.0)
+
+    for one in (held, told):
+        with pytest.raises(DeclarationError, match="nothing between these limits"):
+            one.build()

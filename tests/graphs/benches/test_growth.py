@@ -32,6 +32,9 @@ def test_exponents_are_those_of_what_grew(monkeypatch, tmp_path):
     assert [r["number"] for r in report.rows if r["of"] == "particles" and r["number"]] == [
         10, 100, 1000, 10_000
     ]  # fmt: skip
+    assert report.notes[0].startswith("info: 11 processes took ")
+    parted = growth(engines="c", parts="particles", most_particles=1000)
+    assert {row["of"] for row in parted.rows} == {"particles"}
     for name in ("growth.svg", "growth.md"):
         report.figures[name](tmp_path / name)
     assert (tmp_path / "growth.svg").stat().st_size > 5000
@@ -75,3 +78,5 @@ def test_numbers_that_leave_nothing_are_refused():
 def test_an_engine_without_ranges_is_refused():
     with pytest.raises(UnknownNameError, match="fortran"):
         growth(engines="c,fortran")
+    with pytest.raises(UnknownNameError, match="slice"):
+        growth(parts="whole,slice")

@@ -9,6 +9,7 @@ import pytest
 from flowgraph import DeclarationError, MissingDependencyError, UnknownNameError
 from flowgraph.engines.hls.engine import ENGINE as HLS
 from flowgraph.engines.verilog import place
+from flowgraph.engines.verilog.image import memories
 from flowgraph.engines.verilog.toggles import counted
 from flowgraph.graphs.benches.hardware import hardware
 from flowgraph.graphs.benches.hardware_space import draw, fronted, numbers
@@ -51,6 +52,25 @@ def test_settings_that_fit_nothing_are_refused():
         hardware(space="16,24")
     with pytest.raises(UnknownNameError, match="text to play"):
         hardware(played="vhdl")
+    for given in ({"compared": -1.0}, {"compared": 0.0, "energy": True}, {"compared": 0.0, "played": "hls"}):
+        with pytest.raises(DeclarationError, match="this plays a part of a flight"):
+            hardware(**given)  # type: ignore[arg-type]
+    with pytest.raises(DeclarationError, match="needs a whole number as 'seeds'"):
+        hardware(seeds=0, routed=True)
+
+
+def test_a_machine_that_is_not_played_has_its_size():
+    (found,) = hardware(graphs="gyro_integration", flights=1, duration=1.0, compared=0.0, bound=1.0).rows
+    assert found["values_compared"] is None
+    assert found["steps"] >= found["cycles"] > 100
+    assert found["memories"] == 2 + memories(found["steps"], 31 + 3 * 7 + 1)  # two copies of few words
+    assert found["lut"] is None
+
+
+def test_memories_are_of_three_shapes():
+    assert memories(0, 36) == 0
+    assert [memories(n, 36) for n in (1, 512, 513, 1024, 1025, 2048, 2049)] == [1, 1, 2, 2, 4, 4, 5]
+    assert memories(2048, 56) == 7
 
 
 def test_toggles_are_the_sum_of_what_verilator_counted():

@@ -260,7 +260,7 @@ module fg_lane #(
           .DIVIDES(DIVIDES), .ROOTS(ROOTS), .LOGARITHMS(LOGARITHMS), .ANGLES(ANGLES)
       ) units (
           .clk(clk), .hold(mode22 == HOLD), .start(mode22 == START), .unit(line[`AT(22, D)+:4]), .x(whole22),
-          .below(below22), .length(length22), .asked(line[`AT(8, B)+:4]), .made(made9), .by(made_by9),
+          .below(below22), .length(length22), .asked(line[`AT(7, B)+:4]), .made(made9), .by(made_by9),
           .whole(made_whole9), .minus(made_minus9)
       );
     end else begin : none_beside

@@ -51,24 +51,49 @@ module fg_machine #(
   localparam FETCH = 5;  // registers from the number of a step to its microword
 
   // -- the program ------------------------------------------------------------------------------------------
-  wire [CODE-1:0] fetched;
+  wire [CODE-1:0] arrived, fetched;
   reg [STEP-1:0] step;
   reg [CODE-1:0] code;
   reg running;
   reg [FETCH-1:0] live;
   reg [5:0] draining;
-  wire hold, jump;
+  wire go, jump;  // without `go` the program stands still
   wire [STEP-1:0] back;
   assign ready = !running && draining == 6'd0;
   fg_memory #(
       .WIDTH(CODE), .PLACE(STEP), .WORDS(STEPS), .DEEP(1), .READS(1), .FILE(PROGRAM)
   ) steps (
-      .clk(clk), .go(!hold), .place(step), .word(fetched), .write(1'b0), .to({STEP{1'b0}}), .written({CODE{1'b0}})
+      .clk(clk), .place(step), .word(arrived), .write(1'b0), .to({STEP{1'b0}}), .written({CODE{1'b0}})
   );
-  wire halts = !hold && live[FETCH-1] && code[HALT];
+  // The program's memory never stands still: what arrives while the machine does is kept, to be taken in its order.
+  generate
+    if (ROWS != 0) begin : keeps
+      reg [CODE-1:0] kept[0:7];
+      reg [2:0] kept_to, kept_from;
+      reg [FETCH-2:0] went;
+      initial begin
+        kept_to = 3'd0;
+        kept_from = 3'd0;
+        went = {FETCH - 1{1'b1}};
+      end
+      always @(posedge clk) begin
+        went <= {went[FETCH-3:0], go};
+        if (went[FETCH-2]) begin
+          kept[kept_to] <= arrived;
+          kept_to <= kept_to + 3'd1;
+        end
+        if (go) kept_from <= kept_from + 3'd1;
+      end
+      assign fetched = kept_from == kept_to ? arrived : kept[kept_from];
+    end else begin : keeps_none
+      assign fetched = arrived;
+    end
+  endgenerate
+  wire halts = go && live[FETCH-1] && code[HALT];
+  wire takes = live[FETCH-2] && !halts;
   always @(posedge clk) begin
-    if (!hold) begin
-      code <= live[FETCH-2] && !halts ? fetched : {CODE{1'b0}};
+    if (go) begin
+      code <= takes ? fetched : {CODE{1'b0}};
       live <= {live[FETCH-2:0], running};
     end
     if (reset) begin
@@ -81,7 +106,7 @@ module fg_machine #(
       step <= from;
       draining <= 6'd32 + AHEAD;
     end else if (running) begin
-      if (!hold) step <= jump ? back : step + 1'b1;
+      if (go) step <= jump ? back : step + 1'b1;
       if (halts) begin
         running <= 1'b0;
         live <= {FETCH{1'b0}};
@@ -103,23 +128,35 @@ module fg_machine #(
       localparam A_MOVES = 31 + 3 * PLACE, B_MOVES = A_MOVES + 1, D_MOVES = A_MOVES + 2;
       localparam KIND = 0, FIRST = 13, MODE = 27;
       localparam [3:0] GET = 13;
-      reg [ELEMENT-1:0] first, last, by;
-      reg at_last;
+      // `second` is the element after `first`. Whether they are the last is worked out a cycle ahead, and so is `go`.
+      reg [ELEMENT-1:0] first, second, last, by;
+      reg at_last, second_last, one, two;  // the latter: whether there is but one round, or two
+      reg goes;
       reg [STEP-1:0] begins;
-      wire [ELEMENT-1:0] next = first + by;
-      assign hold = code[REPEAT] && !at_last;
+      wire [ELEMENT-1:0] third = second + by;
+      wire advances = code[REPEAT] || code[ENDS];
+      wire last_next = code[LOOP] ? code[A+:ELEMENT] == {ELEMENT{1'b0}} : !advances ? at_last : at_last ? one : second_last;
+      wire repeats_next = goes ? takes && fetched[REPEAT] : 1'b1;
+      initial goes = 1'b1;
+      assign go = goes;
       assign jump = code[BACK] && !at_last;
       assign back = begins;
       always @(posedge clk) begin
+        goes <= reset || !repeats_next || last_next;
+        at_last <= last_next;
         if (code[LOOP]) begin
           first <= {ELEMENT{1'b0}};
+          second <= code[B+:ELEMENT];
           last <= code[A+:ELEMENT];
           by <= code[B+:ELEMENT];
-          at_last <= code[A+:ELEMENT] == {ELEMENT{1'b0}};
+          second_last <= code[A+:ELEMENT] == code[B+:ELEMENT];
+          one <= code[A+:ELEMENT] == {ELEMENT{1'b0}};
+          two <= code[A+:ELEMENT] == code[B+:ELEMENT];
           begins <= step - {{STEP-3{1'b0}}, 3'd4};
-        end else if (code[REPEAT] || code[ENDS]) begin
-          first <= at_last ? {ELEMENT{1'b0}} : next;
-          at_last <= at_last ? last == {ELEMENT{1'b0}} : next == last;
+        end else if (advances) begin
+          first <= at_last ? {ELEMENT{1'b0}} : second;
+          second <= at_last ? by : third;
+          second_last <= at_last ? two : third == last;
         end
       end
 
@@ -163,7 +200,7 @@ module fg_machine #(
       end
       assign placed = code4;
     end else begin : no_rows
-      assign hold = 1'b0;
+      assign go = 1'b1;
       assign jump = 1'b0;
       assign back = {STEP{1'b0}};
       assign placed = code[LANES*LANE-1:0];
@@ -196,12 +233,12 @@ module fg_machine #(
       fg_memory #(
           .PLACE(PLACE), .WORDS(WORDS), .BANKS(BANKS), .DEEP(DEEP), .FILE(MEMORY)
       ) memory_a (
-          .clk(clk), .go(1'b1), .place(a_place), .word(a), .write(bank_write), .to(bank_to), .written(bank_word)
+          .clk(clk), .place(a_place), .word(a), .write(bank_write), .to(bank_to), .written(bank_word)
       );
       fg_memory #(
           .PLACE(PLACE), .WORDS(WORDS), .BANKS(BANKS), .DEEP(DEEP), .FILE(MEMORY)
       ) memory_b (
-          .clk(clk), .go(1'b1), .place(b_place), .word(b), .write(bank_write), .to(bank_to), .written(bank_word)
+          .clk(clk), .place(b_place), .word(b), .write(bank_write), .to(bank_to), .written(bank_word)
       );
       if (LATER != 0) begin : later
         reg [LANE-1:0] code1, code2;

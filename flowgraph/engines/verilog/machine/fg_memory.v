@@ -1,8 +1,8 @@
 // A memory of blocks with one reader and a writer for each of its banks. A word lies in the bank of its place's
 // lowest bits, so that a cycle writes a word to each bank. Of a deep memory each block has its own registers
-// behind it, before one block is chosen.
+// before and behind it, and then one block is chosen.
 //
-// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP; nothing moves without `go`.
+// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP.
 // A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later.
 module fg_memory #(
     parameter WIDTH = 36,
@@ -14,7 +14,6 @@ module fg_memory #(
     parameter FILE = "memory"  // begin of the files' names, one for each block: FILE_00.hex and so on
 ) (
     input wire clk,
-    input wire go,
     // verilator lint_off UNUSEDSIGNAL
     input wire [PLACE-1:0] place,
     input wire [BANKS-1:0] write,
@@ -50,18 +49,28 @@ module fg_memory #(
       reg [WIDTH-1:0] read, out;
       assign found[k*WIDTH+:WIDTH] = out;
       wire [IN-1:0] at;
+      // Of a deep memory a block takes only places of its own, and gives zeros where another is asked: registers that
+      // were alike in all blocks would be made one, and its wires cross the whole memory.
+      wire asked;
       if (DEEP != 0) begin : deep
         reg [IN-1:0] near;
-        always @(posedge clk) if (go) near <= place[LOW+:IN];
+        reg asked1, asked2;
+        wire mine = block_of(place) == k[PICK-1:0];
+        always @(posedge clk) begin
+          if (mine) near <= place[LOW+:IN];
+          asked1 <= mine;
+          asked2 <= asked1;
+        end
         assign at = near;
+        assign asked = asked2;
       end else begin : shallow
         assign at = place[LOW+:IN];
+        assign asked = 1'b1;
       end
-      always @(posedge clk)
-        if (go) begin
-          read <= words[at];
-          out <= read;
-        end
+      always @(posedge clk) begin
+        read <= words[at];
+        out <= asked ? read : {WIDTH{1'b0}};
+      end
       if (READS == 0 && DEEP != 0) begin : deep_write
         reg here;
         reg [IN-1:0] near;
@@ -69,8 +78,10 @@ module fg_memory #(
         wire [PICK-1:0] chosen = block_of(to[k%BANKS*PLACE+:PLACE]);
         always @(posedge clk) begin
           here <= write[k%BANKS] && chosen == k[PICK-1:0];
-          near <= to[k%BANKS*PLACE+LOW+:IN];
-          given <= written[k%BANKS*WIDTH+:WIDTH];
+          if (chosen == k[PICK-1:0]) begin
+            near <= to[k%BANKS*PLACE+LOW+:IN];
+            given <= written[k%BANKS*WIDTH+:WIDTH];
+          end
           if (here) words[near] <= given;
         end
       end else if (READS == 0) begin : shallow_write
@@ -78,15 +89,13 @@ module fg_memory #(
       end
     end
     if (DEEP != 0) begin : choice
-      reg [PICK-1:0] pick1, pick2, pick3;
-      reg [WIDTH-1:0] picked;
-      always @(posedge clk)
-        if (go) begin
-          pick1 <= block_of(place);
-          pick2 <= pick1;
-          pick3 <= pick2;
-          picked <= found[pick3*WIDTH+:WIDTH];
-        end
+      reg [WIDTH-1:0] any, picked;
+      integer n;
+      always @* begin
+        any = {WIDTH{1'b0}};
+        for (n = 0; n < COUNT; n = n + 1) any = any | found[n*WIDTH+:WIDTH];
+      end
+      always @(posedge clk) picked <= any;
       assign word = picked;
     end else begin : alone
       assign word = found;
