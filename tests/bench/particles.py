@@ -5,7 +5,7 @@ indices it resamples with must be those of the engines before anything is timed.
 
 The library filters with something simpler: nine plain states (position, velocity and acceleration of a point
 in space, constant acceleration), a measured position at each step, a bootstrap proposal, and systematic
-resampling. Beside it, `rbpf_indoor` gets a measured pose at each tick. `bootstrap` has one filter on both sides.
+resampling. Beside it, `rbpf_indoor` gets a measured pose at each tick. `bootstrap` has one on both.
 A library that is not installed gives a row without a peer.
 """
 
