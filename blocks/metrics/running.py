@@ -33,6 +33,7 @@ from flowgraph.blocks.signals import (
     Settling,
     Tally,
 )
+from flowgraph.errors import DeclarationError
 from flowgraph.language.clock import nanoseconds
 from flowgraph.types import leaves_of
 
@@ -291,8 +292,19 @@ def nis_score(
         end: when the figures are wanted.
         probability: of the band of each.
         name: of the nodes.
+
+    Raises:
+        DeclarationError: where nobody has said yet of how many numbers an innovation is.
     """
-    width = int(dict(leaves_of(innovation.type))["residual"].shape[-1])
+    width = dict(leaves_of(innovation.type))["residual"].shape[-1]
+    if not isinstance(width, int):
+        raise DeclarationError(
+            "these innovations are of an unknown size",
+            path=name,
+            expected="a residual of so many numbers",
+            got=f"{innovation.label}: residual ({width})",
+            fix=f"build the graph with sizes={{{width!r}: 3}}",
+        )
     tail, parts = 0.5 * (1.0 - probability), np.maximum(np.arange(width + 1), 1)
     limits = np.stack([chi_square(tail, parts), chi_square(1.0 - tail, parts)])
     sums = nis_sums(innovation, limits=limits, name=f"{name}_sums")

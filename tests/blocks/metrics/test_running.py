@@ -19,6 +19,7 @@ from flowgraph.blocks.metrics import (
     settle_time,
 )
 from flowgraph.blocks.signals import KalmanInnovation, NavigationState, PoseBelief
+from flowgraph.errors import DeclarationError
 from tests.support import MS, all_engines, both_quick, same
 
 TICKS = 60
@@ -139,3 +140,13 @@ def test_a_score_of_many_seeds_returns_a_row_each() -> None:
     given = {"belief": belief, "truth": truth, "end": at(int(belief.time[-1]))}
     batch = simulate(scored.build(), given, seeds=[1, 2], engine="c")
     assert batch["score"].position_rmse_m.shape == (2, 1)
+
+
+def test_innovations_of_an_unknown_size_are_refused() -> None:
+    @graph
+    def scored(innovation: Stream[KalmanInnovation], end: Stream[Tick]):
+        return nis_score(innovation, end=end)
+
+    with pytest.raises(DeclarationError, match=r"of an unknown size(.*\n)*.*sizes=\{'m': 3\}"):
+        scored.build()
+    assert scored.build(sizes={"m": 3}).sources
