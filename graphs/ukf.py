@@ -37,6 +37,7 @@ from flowgraph.blocks.models.unscented_pose import (
     named_pose,
     see_pose,
     start_state,
+    state_at_start,
     unscented_steps,
 )
 from flowgraph.blocks.scoring.capture import on_capture
@@ -135,5 +136,6 @@ def for_flight(
     """
     return on_capture(
         on, filter, start=start_state, believed=lambda start: start, steps=unscented_steps,
-        smoothing=filter.smoothed, points=SigmaPoints(alpha, beta, kappa, mean),
+        begin=lambda first, at: {"belief": state_at_start(first("vicon"), at=at)}, smoothing=filter.smoothed,
+        points=SigmaPoints(alpha, beta, kappa, mean),
     )  # fmt: skip

@@ -18,9 +18,18 @@ from flowgraph.blocks.geometry.manifold import StateSpace, euclidean, quaternion
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, multiply, rotate
 from flowgraph.blocks.inertial.imu import GRAVITY, ImuNoise
 from flowgraph.blocks.kalman.smoothing import Steps, steps_of
-from flowgraph.blocks.signals import Gaussian, Imu, PoseBelief
+from flowgraph.blocks.signals import Gaussian, Imu, Pose, PoseBelief
 
-__all__ = ["STATE", "carry_pose", "imu_density", "named_pose", "see_pose", "start_state", "unscented_steps"]
+__all__ = [
+    "STATE",
+    "carry_pose",
+    "imu_density",
+    "named_pose",
+    "see_pose",
+    "start_state",
+    "state_at_start",
+    "unscented_steps",
+]
 
 STATE = StateSpace(euclidean(6), quaternion())
 """Position, velocity, attitude."""
@@ -74,8 +83,20 @@ def start_state(
     """A belief over (p, v, q) to start from, with standard deviations in m, m/s and rad (about each body
     axis)."""
     mean = np.concatenate([np.asarray(part, dtype=float) for part in (position, velocity, attitude)])
-    deviations = np.repeat([position_deviation, velocity_deviation, attitude_deviation], 3)
-    return Gaussian(mean=mean, covariance=np.diag(deviations**2))
+    return Gaussian(mean=mean, covariance=_apart(position_deviation, velocity_deviation, attitude_deviation))
+
+
+def _apart(*deviations: float) -> np.ndarray:
+    return np.diag(np.repeat(deviations, 3) ** 2)
+
+
+@block
+def state_at_start(
+    pose: Pose, *, deviations: tuple[float, float, float] = (0.7, 0.7, 0.3), xp: Any
+) -> Gaussian:
+    """`start_state` at a measured pose and at rest; deviations in m, m/s and rad."""
+    mean = xp.concat([pose.position, 0.0 * pose.position, pose.attitude])
+    return Gaussian(mean=mean, covariance=xp.asarray(_apart(*deviations), dtype=mean.dtype))
 
 
 @block

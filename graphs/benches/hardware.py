@@ -76,10 +76,11 @@ def hardware(
         `multipliers` (of 34 bits),
         `position_difference_rms_m`, `attitude_difference_rms_deg`, `saturations`, `values_compared`,
         `values_differing`, `cycles` (of the shortest tick) and `cycles_all_aids` (of the longest), `steps` of
-        the program, `words` of memory, and the `memories` of 18 kbit that both want; where `energy` is asked
-        for, `energy_estimate_operations` (terms of sums in the longest tick; None of a filter with loops) and
-        `energy_estimate_toggles` (bits that change in a mean tick, block memories left out); `lut`, `ff`,
-        `dsp`, `bram`, `fmax_hz` (None where it was not routed), `us_per_tick` (with all aids, at that clock,
+        the program and how many are different (`steps_different`), `words` of memory, and the `memories` of
+        18 kbit that both want; where `energy` is asked for, `energy_estimate_operations` (terms of sums in
+        the longest tick; None of a filter with loops) and `energy_estimate_toggles` (bits that change in a
+        mean tick, block memories left out); `lut`, `ff`, `dsp`, `bram`, `fmax_hz` (None where it was not
+        routed), `us_per_tick` (with all aids, at that clock,
         or else at 100 MHz), and `reason`, why there is no machine.
     """
     if played not in ("verilog", "hls"):
@@ -136,7 +137,7 @@ def hardware(
 _COLUMNS = (
     "graph", "particles", "width", "lanes", "multipliers", "position_difference_rms_m",
     "attitude_difference_rms_deg", "saturations", "values_compared", "values_differing",
-    "cycles", "cycles_all_aids", "steps", "words", "memories",
+    "cycles", "cycles_all_aids", "steps", "steps_different", "words", "memories",
     "energy_estimate_operations", "energy_estimate_toggles", "lut", "ff", "dsp", "bram", "fmax_hz",
     "us_per_tick", "reason",
 )  # fmt: skip
@@ -154,6 +155,7 @@ def _played(row: dict[str, Any], pipeline: Any, flight: Any, seconds: float) -> 
         cycles = [e.cycles for e in image.entries]
     row |= {
         "cycles": min(cycles), "cycles_all_aids": max(cycles), "steps": len(image.program),
+        "steps_different": len(set(image.program)),
         "words": image.words, "memories": image.memories,
     }  # fmt: skip
 

@@ -104,7 +104,9 @@ def test_what_hangs_on_the_recording_has_no_whole_case(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "more"), [("ekf", {}), ("ins_eskf", {}), ("rbpf_indoor", {"particles": 8})])
+@pytest.mark.parametrize(
+    ("name", "more"), [("ekf", {}), ("ukf", {}), ("ins_eskf", {}), ("rbpf_indoor", {"particles": 8})]
+)
 def test_a_start_that_follows_from_the_flight_is_made_in_the_graph(name: str, more: dict[str, Any]) -> None:
     found = cases_of(name, {}, more)
     experiment = found[0][1].experiment

@@ -63,6 +63,7 @@ def test_a_machine_that_is_not_played_has_its_size():
     (found,) = hardware(graphs="gyro_integration", flights=1, duration=1.0, compared=0.0, bound=1.0).rows
     assert found["values_compared"] is None
     assert found["steps"] >= found["cycles"] > 100
+    assert 100 < found["steps_different"] < found["steps"]
     assert found["memories"] == 2 + memories(found["steps"], 31 + 3 * 7 + 1)  # two copies of few words
     assert found["lut"] is None
 
