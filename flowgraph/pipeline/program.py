@@ -79,7 +79,7 @@ def specialise(pipeline: Pipeline, key: int | None, open: int = 0) -> Program:
     """The program for the pattern `key` (bit k: input k is present), or for any pattern with None.
 
     Args:
-        open: inputs, a bit each, whose presence stays one.
+        open: inputs, a bit each, whose presence is not known all the same.
     """
     known: dict[int, bool] = {
         n: bool(a) for n, a in pipeline.constants.items() if a.dtype == bool and a.shape == ()
