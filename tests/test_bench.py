@@ -6,12 +6,14 @@ Each bench compares the numbers of ours and the peer before it times anything, a
 from __future__ import annotations
 
 import json
+import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from flowgraph import simulate
-from tests.bench import gpu, imports, particles, toy
+from tests.bench import bootstrap, gpu, imports, particles, toy
 from tests.bench.__main__ import BENCHES, main, show
 
 NEEDS = {
@@ -51,13 +53,23 @@ def test_the_table_says_what_is_missed(capsys):
 def test_a_missing_library_gives_a_row_without_a_peer(monkeypatch):
     """The other libraries' rows stay, and the table can be shown."""
     absent = "a_library_that_is_not_there"
-    make = particles.LIBRARIES["particles"][1]
-    monkeypatch.setattr(particles, "LIBRARIES", {"particles": (absent, make)})
+    make = particles.LIBRARIES["Stone Soup"][1]
+    monkeypatch.setattr(particles, "LIBRARIES", {"Stone Soup": (absent, make)})
     (row,) = particles.libraries(sizes=(20,), steps=3, repeats=1)
     assert row.ours > 0.0
     assert (row.peer, row.ratio, row.met) == (None, None, None)
-    assert row.against == f"none: particles is not to be had (No module named {absent!r})"
+    assert row.against == f"none: Stone Soup is not to be had (No module named {absent!r})"
     show([row])
+
+
+def test_an_interpreter_without_particles_gives_a_row_that_says_so(monkeypatch, tmp_path):
+    for python, why in ((sys.executable, "has no particles that works"), (tmp_path / "none", "pip install")):
+        if python == sys.executable and find_spec("particles"):
+            continue
+        monkeypatch.setenv("FLOWGRAPH_PARTICLES", str(python))
+        (row,) = bootstrap.rows(sizes=(50,), steps=3, repeats=1)
+        assert (row.peer, row.met) == (None, None)
+        assert why in row.against
 
 
 def test_the_plain_model_of_the_libraries_moves_as_its_states_say():

@@ -67,15 +67,15 @@ def _fine(draw: Any, n: int) -> Array:
 
 def _strata(parts: Array, offset: Array, xp: Any) -> Array:
     """One place in each of n equal parts of the line, `offset` (0 to 1) of the way through it."""
-    n = parts.shape[-1]
-    total = xp.sum(parts)
+    n, ends = parts.shape[-1], xp.cumulative_sum(parts)
+    total = ends[-1]
     places = (xp.arange(n, dtype=xp.int64) * total + _scaled(offset, total, xp)) // n
-    return _search(parts, places, xp)
+    return xp.searchsorted(ends, places, side="right")
 
 
 def systematic(parts: Array, *, draw: Any, xp: Any) -> Array:
     """Places (j + u)/n with one u for all: the fewest draws, and the least variance in practice."""
-    return _strata(parts, draw.uniform("place", (1,)), xp)
+    return _strata(parts, draw.uniform("place", ()), xp)
 
 
 def stratified(parts: Array, *, draw: Any, xp: Any) -> Array:

@@ -75,13 +75,18 @@ class Program:
         return sum(work(i, self.specs) for i in self.instructions)
 
 
-def specialise(pipeline: Pipeline, key: int | None) -> Program:
-    """The program for the pattern `key` (bit k: input k is present), or for any pattern with None."""
+def specialise(pipeline: Pipeline, key: int | None, open: int = 0) -> Program:
+    """The program for the pattern `key` (bit k: input k is present), or for any pattern with None.
+
+    Args:
+        open: inputs, a bit each, whose presence is not known all the same.
+    """
     known: dict[int, bool] = {
         n: bool(a) for n, a in pipeline.constants.items() if a.dtype == bool and a.shape == ()
     }
     if key is not None:
-        known.update({port.present: bool(key >> k & 1) for k, port in enumerate(pipeline.inputs)})
+        ports = [(k, port) for k, port in enumerate(pipeline.inputs) if not open >> k & 1]
+        known.update({port.present: bool(key >> k & 1) for k, port in ports})
     same: dict[int, int] = {}
     kept: list[Instruction] = []
     for i in pipeline.instructions:

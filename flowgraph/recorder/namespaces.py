@@ -91,6 +91,23 @@ class NumpyNamespace:
         return ranges.cast(np, found, dtype) if found.dtype != dtype else np.asarray(found, copy=copy)
 
     @staticmethod
+    def sum(x: Any, /, *, axis: Any = None, dtype: Any = None, keepdims: bool = False) -> Any:
+        """`numpy.sum`."""
+        return np.add.reduce(x, axis, dtype, None, keepdims)  # type: ignore[call-overload]
+
+    @staticmethod
+    def cumulative_sum(x: Any, /, *, axis: int | None = None, dtype: Any = None, **more: Any) -> Any:
+        """`numpy.cumulative_sum`."""
+        if type(x) is np.ndarray and not more and (axis is not None or x.ndim == 1):
+            return x.cumsum(axis, dtype)
+        return np.cumulative_sum(x, axis=axis, dtype=dtype, **more)
+
+    @staticmethod
+    def searchsorted(x: Any, values: Any, /, *, side: Any = "left", sorter: Any = None) -> Any:
+        """`numpy.searchsorted`."""
+        return np.asarray(x).searchsorted(values, side, sorter)
+
+    @staticmethod
     def argsort(x: Any, /, *, axis: int = -1) -> Any:
         """`numpy.argsort`, with equal values in their order, as the array API has it."""
         return np.argsort(x, axis=axis, stable=True)

@@ -9,6 +9,7 @@ over a short array costs as much as all of its arithmetic.
 from __future__ import annotations
 
 import sys
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -62,21 +63,27 @@ def _mixed(even: np.ndarray, odd: np.ndarray, seed: np.ndarray, rounds: int) -> 
 
 def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> list[int]:
     """The same as Python's integers."""
-    low, high, key = time & _WORD, (time >> 32) & _WORD, (int(seed[0]), int(seed[1]))
-    made = [_one(k, name, low, high, key, rounds) for k in range(-(-count // 4))]
+    low, high, keys = time & _WORD, (time >> 32) & _WORD, _keys(*seed.tolist(), rounds)
+    if count <= 4:
+        return list(_one(0, name, low, high, keys)[:count])
+    made = [_one(k, name, low, high, keys) for k in range(-(-count // 4))]
     return [w for part in zip(*made, strict=True) for w in part][:count]
 
 
+@lru_cache
+def _keys(k: int, q: int, rounds: int) -> list[tuple[int, int]]:
+    """The keys of each round."""
+    return [((k + WEYL[0] * r) & _WORD, (q + WEYL[1] * r) & _WORD) for r in range(rounds)]
+
+
 def _one(
-    index: int, name: int, low: int, high: int, key: tuple[int, int], rounds: int
+    index: int, name: int, low: int, high: int, keys: list[tuple[int, int]]
 ) -> tuple[int, int, int, int]:
     """The four words of one counter, those of even numbers first."""
     a, b, c, d = index, name, low, high
-    k, q = key
-    for _ in range(rounds):
+    for k, q in keys:
         left, right = a * MULTIPLIERS[0], c * MULTIPLIERS[1]
         a, b, c, d = (right >> 32) ^ b ^ k, right & _WORD, (left >> 32) ^ d ^ q, left & _WORD
-        k, q = (k + WEYL[0]) & _WORD, (q + WEYL[1]) & _WORD
     return a, c, b, d
 
 

@@ -149,7 +149,7 @@ def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.
     count = math.prod(shape)
     if kind == "uniform" and count <= numpy_random.FEW:
         few = [(w >> 8) * 2.0**-24 for w in numpy_random.few_words(count, name, int(time), seed, ROUNDS)]
-        return np.array(few).reshape(shape)
+        return np.array(few).reshape(shape) if shape else np.float64(few[0])
     bits = numpy_random.words(count, name, time, seed, ROUNDS)
     if kind == "uniform":
         return uniform_from(bits, xp=NUMPY).reshape(shape)

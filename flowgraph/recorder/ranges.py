@@ -21,24 +21,32 @@ def cast(xp: Any, x: Any, dtype: Any) -> Any:
     return _whole(xp, x, kind) if x.dtype.kind == "f" and kind.kind in "iu" else x.astype(kind)
 
 
-_limits = lru_cache(np.iinfo)
-
-
 def _whole(xp: Any, x: Any, kind: np.dtype[Any]) -> Any:
-    limits = _limits(kind)
+    least, beyond, square = _ends(kind, x.dtype)
     if isinstance(x, np.generic | np.ndarray) and not x.ndim:  # one number, as one meets it most
-        number = float(x)
+        limits, number = _limits(kind), float(x)
         if not limits.min <= number < 2.0 ** (limits.bits - (kind.kind == "i")):
             number = limits.min if number < 0.0 else limits.max if number > 0.0 else 0
         return kind.type(int(number))
-    least, beyond = x.dtype.type(limits.min), x.dtype.type(2.0 ** (limits.bits - (kind.kind == "i")))
-    if isinstance(x, np.ndarray) and x.size and _within(x, least, beyond):
+    if isinstance(x, np.ndarray) and x.size and (np.vdot(x, x) < square or _within(x, least, beyond)):
         return x.astype(kind)  # as nearly always
     fits = (x >= least) & (x < beyond)  # False for NaN
     inside = xp.where(fits, x, x.dtype.type(0)).astype(kind)
-    low, high = kind.type(limits.min), kind.type(limits.max)
+    low, high = kind.type(_limits(kind).min), kind.type(_limits(kind).max)
     found = xp.where(x >= beyond, high, xp.where(x < least, low, inside))
     return found[()] if isinstance(found, np.ndarray) and not found.ndim else found
+
+
+_limits = lru_cache(np.iinfo)
+
+
+@lru_cache
+def _ends(kind: np.dtype[Any], real: np.dtype[Any]) -> tuple[Any, Any, Any]:
+    """The least real that fits, the first beyond, and below which sum of squares every number surely fits."""
+    limits = _limits(kind)
+    signed = kind.kind == "i"
+    beyond = 2.0 ** (limits.bits - signed)
+    return real.type(limits.min), real.type(beyond), real.type(0.25 * beyond * beyond * signed)
 
 
 def _within(x: np.ndarray, least: Any, beyond: Any) -> bool:

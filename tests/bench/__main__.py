@@ -16,6 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.bench import (
+    bootstrap,
+    compiling,
     derived_c,
     further_run,
     generated_c,
@@ -46,8 +48,10 @@ BENCHES: dict[str, tuple[Bench, dict[str, Any]]] = {
     "derived-c": (derived_c.rows, {"duration": 0.5, "repeats": 1}),
     "eskf-c": (generated_c.eskf, {"duration": 0.5, "repeats": 1}),
     "rbpf-c": (generated_c.rbpf, {"particles_": 50, "duration": 1.5, "repeats": 1}),
+    "compile-c": (compiling.rows, {"repeats": 1}),
     "rbpf-engines": (particles.engines, {"sizes": (50,), "duration": 1.5, "repeats": 1}),
     "rbpf-libraries": (particles.libraries, {"sizes": (1000,), "steps": 10, "repeats": 1}),
+    "bootstrap-python": (bootstrap.rows, {"sizes": (200,), "steps": 10, "repeats": 1}),
     "resampling": (particles.resampling, {"sizes": (100,), "repeats": 1}),
     "lgssm-xla": (lgssm.rows, {"steps": 50, "repeats": 1}),
     "normals-xla": (random.in_xla, {"ticks": 20, "repeats": 1}),

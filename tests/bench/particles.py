@@ -3,13 +3,10 @@
 The hand-written loop (`direct_rbpf.py`) has the same equations, layout and random numbers; its poses and the
 indices it resamples with must be those of the engines before anything is timed.
 
-The libraries filter with something simpler: nine plain states (position, velocity and acceleration of a point
+The library filters with something simpler: nine plain states (position, velocity and acceleration of a point
 in space, constant acceleration), a measured position at each step, a bootstrap proposal, and systematic
-resampling below half of the particles. Beside them, `rbpf_indoor` gets a measured pose at each tick.
-
-A library that is not installed gives a row without a peer. The extra `bench` leaves out `particles` 0.4: it
-asks for NumPy < 2, although it runs with newer ones (`pip install --no-deps particles`, and its numba, joblib
-and scikit-learn).
+resampling. Beside it, `rbpf_indoor` gets a measured pose at each tick. `bootstrap` has one on both.
+A library that is not installed gives a row without a peer.
 """
 
 from __future__ import annotations
@@ -30,9 +27,11 @@ from flowgraph.graphs.rbpf_indoor import rbpf_indoor
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.random import NumpyDraw, seed_words
 from tests.bench import direct_eskf, direct_rbpf
-from tests.bench.rows import Row, interleaved, missing, seconds
+from tests.bench.bootstrap import JERK, SEEN, START_SPREAD, STEP_S, plain_model
+from tests.bench.rows import Row, interleaved, missing, seconds, worked
 
 SIZES = (100, 1000, 10_000)
+SEED = seed_words(0)
 LIMIT_MS = 0.6
 """At most, in XLA with 1,000 particles."""
 
@@ -99,49 +98,6 @@ def engines(*, sizes: tuple[int, ...] = SIZES, duration: float = 2.55, repeats: 
 
 # What the libraries filter.
 
-STEP_S = 0.005
-JERK, SEEN = 1.0, 0.05
-
-
-def plain_model(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """F (9, 9), Q (9, 9), H (3, 9), true states (steps, 9) and measured positions (steps, 3); by axis."""
-    h = STEP_S
-    F = np.kron(np.eye(3), [[1.0, h, h * h / 2], [0.0, 1.0, h], [0.0, 0.0, 1.0]])
-    Q = np.kron(
-        np.eye(3),
-        np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2], [h**3 / 6, h**2 / 2, h]]),
-    )
-    Q *= JERK**2
-    H = np.kron(np.eye(3), [[1.0, 0.0, 0.0]])
-    generator = np.random.default_rng(0)
-    factor = np.linalg.cholesky(Q)
-    x, states = np.zeros(9), []
-    for _ in range(steps):
-        x = F @ x + factor @ generator.normal(size=9)
-        states.append(x)
-    truth = np.stack(states)
-    return F, Q, H, truth, truth @ H.T + SEEN * generator.normal(size=(steps, 3))
-
-
-START_SPREAD = 0.05
-
-
-def with_particles(n: int, steps: int) -> Callable[[], np.ndarray]:
-    """The plain filter of `particles` (N. Chopin): the estimate (9) after the last step."""
-    smc = import_module("particles")
-    models, kalman = import_module("particles.state_space_models"), import_module("particles.kalman")
-    F, Q, H, _, seen = plain_model(steps)
-    model = kalman.MVLinearGauss(F=F, G=H, covX=Q, covY=SEEN**2 * np.eye(3), cov0=START_SPREAD**2 * np.eye(9))
-    data = list(seen)
-
-    def run() -> np.ndarray:
-        proposal = models.Bootstrap(ssm=model, data=data)
-        filter_ = smc.SMC(fk=proposal, N=n, resampling="systematic", ESSrmin=0.5)
-        filter_.run()
-        return np.asarray(filter_.W @ filter_.X)
-
-    return run
-
 
 def with_stone_soup(n: int, steps: int) -> Callable[[], np.ndarray]:
     """The plain filter of Stone Soup: the estimate (9) after the last step."""
@@ -174,7 +130,6 @@ def with_stone_soup(n: int, steps: int) -> Callable[[], np.ndarray]:
 
 
 LIBRARIES: dict[str, tuple[str, Callable[[int, int], Callable[[], np.ndarray]]]] = {
-    "particles": ("particles", with_particles),
     "Stone Soup": ("stonesoup", with_stone_soup),
 }
 
@@ -206,7 +161,7 @@ def libraries(*, sizes: tuple[int, ...] = SIZES, steps: int = 100, repeats: int 
 
 
 def resampling(*, sizes: tuple[int, ...] = SIZES, repeats: int = 15) -> list[Row]:
-    """Microseconds of one systematic resampling in NumPy, the draw included, beside filterpy's loop."""
+    """Microseconds of work of a systematic resampling in NumPy, draw included, beside filterpy's loop."""
     rows = []
     for n in sizes:
         weight = np.random.default_rng(n).exponential(size=n) ** 3
@@ -214,13 +169,13 @@ def resampling(*, sizes: tuple[int, ...] = SIZES, repeats: int = 15) -> list[Row
         name = f"systematic resampling of {n:,}, python"
 
         def ours(time: int = 0, weight: np.ndarray = weight) -> np.ndarray:
-            draw = NumpyDraw("bench", seed_words(0), time)
+            draw = NumpyDraw("bench", SEED, time)
             parts = quantised(weight, xp=NUMPY)
             return np.asarray(SCHEMES["systematic"](parts, draw=draw, xp=NUMPY))
 
-        calls = max(1, 2_000 // n)  # both as often, so that both meet as much of what else the machine does
+        calls = max(1, 20_000 // n)
         mine = lambda ours=ours, calls=calls: (  # type: ignore[misc]
-            seconds(lambda: [ours(k) for k in range(calls)]) * 1e6 / calls
+            worked(lambda: [ours(k) for k in range(calls)]) * 1e6 / calls
         )
         try:
             theirs = import_module("filterpy.monte_carlo").systematic_resample
@@ -234,7 +189,7 @@ def resampling(*, sizes: tuple[int, ...] = SIZES, repeats: int = 15) -> list[Row
             copies = np.bincount(found, minlength=n)
             assert np.all(np.abs(copies - n * weight) < 1.0 + 1e-6)
         peer = lambda theirs=theirs, weight=weight, calls=calls: (  # type: ignore[misc]
-            seconds(lambda: [theirs(weight) for _ in range(calls)]) * 1e6 / calls
+            worked(lambda: [theirs(weight) for _ in range(calls)]) * 1e6 / calls
         )
         figures = interleaved(mine, peer, repeats)
         met = figures[2] <= 1.0

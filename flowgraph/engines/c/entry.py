@@ -11,39 +11,55 @@ from collections.abc import Iterator, Sequence
 
 from flowgraph.engines.c.header import NOT_FINITE, OVERFLOW, react_signature
 from flowgraph.engines.c.names import Names, given, made
+from flowgraph.engines.c.patterns import Pattern
 from flowgraph.pipeline.pipeline import Pipeline
 
 
-def reaction_name(key: int | None) -> str:
-    """Of the function for one pattern of present inputs, or for all."""
-    return "fg_react" if key is None else f"fg_react_{key}"
+def reaction_name(pattern: Pattern) -> str:
+    """Of the function for these patterns of present inputs."""
+    return f"fg_react_{pattern.inputs}"
+
+
+def parameters(names: Names, pattern: Pattern) -> list[tuple[str, str]]:
+    """The type and the name of each that the function has."""
+    m = names.module
+    inputs = zip(names.inputs, given(names), strict=True)
+    return [
+        (f"{m}_state *restrict", "s"),
+        ("int64_t", "time"),
+        *([("uint64_t", "present")] if pattern.open else []),
+        *((f"const {m}_{n} *restrict", g) for k, (n, g) in enumerate(inputs) if pattern.inputs >> k & 1),
+        *((f"{m}_{n} *restrict", g) for n, g in zip(names.outputs, made(names), strict=True)),
+    ]
 
 
 def entry_text(
-    pipeline: Pipeline, names: Names, real: str, patterns: Sequence[int] | None, *, checked: bool
+    pipeline: Pipeline, names: Names, real: str, patterns: Sequence[Pattern], *, checked: bool
 ) -> str:
     """The function that a program calls; with `checked` it returns the bits of what went wrong, too."""
     checks = list(_checks(pipeline, names)) if checked else []
     lines = [*(_FINITE.format(real=real).splitlines() if any("fg_finite" in c for c in checks) else [])]
     lines += [*react_signature(names, "restrict ").splitlines(), "{"]
-    outputs = list(made(names))
     ends = "made = {};" if checks else "return {};"
     if checks:
         lines.append("    uint64_t made;")
-    if patterns is None:
-        pointers = []
-        for k, (n, p) in enumerate(zip(names.inputs, given(names), strict=True)):
+    for k, n in enumerate(names.inputs):
+        if any(p.open >> k & 1 for p in patterns):
             lines.append(f"    static const {names.module}_{n} no_{n} = FG_ZERO;")
-            pointers.append(f"((present >> {k}) & 1u) ? {p} : &no_{n}")
-        call = ", ".join(["s", "time", "present", *pointers, *outputs])
-        lines.append("    " + ends.format(f"{reaction_name(None)}({call})"))
+    maybe = {g: f"((present >> {k}) & 1u) ? {g} : &no_{n}" for k, (n, g) in enumerate(
+        zip(names.inputs, given(names), strict=True))}  # fmt: skip
+    calls = []
+    for p in patterns:
+        there = {g for k, g in enumerate(given(names)) if not p.open >> k & 1}
+        passed = [g if g in there else maybe.get(g, g) for _, g in parameters(names, p)]
+        calls.append(ends.format(f"{reaction_name(p)}({', '.join(passed)})"))
+    if any(p.every for p in patterns):
+        lines.append(f"    {calls[0]}")
     else:
         lines.append("    switch (present) {")
-        for key in patterns:
-            inputs = [n for k, n in enumerate(given(names)) if key >> k & 1]
-            call = ", ".join(["s", "time", *inputs, *outputs])
-            said = ends.format(f"{reaction_name(key)}({call})")
-            lines.append(f"    case {key}: {said}{' break;' if checks else ''}")
+        for p, call in zip(patterns, calls, strict=True):
+            lines += [f"    case {key}:" for key in p.keys]
+            lines[-1] += f" {call}{' break;' if checks else ''}"
         lines += ["    default: return 0;", "    }"]
     if checks:
         lines += [*(f"    {c}" for c in checks), "    return made;"]

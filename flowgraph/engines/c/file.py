@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.entry import entry_text, reaction_name
+from flowgraph.engines.c.entry import entry_text, parameters, reaction_name
 from flowgraph.engines.c.expand import Expander
 from flowgraph.engines.c.expressions import Expressions
 from flowgraph.engines.c.header import header
 from flowgraph.engines.c.helpers import helper_text, own_text
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
+from flowgraph.engines.c.patterns import Pattern, shared
 from flowgraph.engines.c.preamble import MACROS, PACK, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
@@ -49,7 +50,8 @@ class Source:
         names: of everything in it.
         real: "double" or "float".
         header, source: the texts of the two files.
-        patterns: the keys that have a reaction of their own, or None where one serves all.
+        patterns: the keys that have a reaction, or None where one serves all.
+        reactions: the names of their functions.
         presence: by key, or None for all, the outputs that are present for certain and those that can be, a
             bit each.
         longest: turns of the longest loop.
@@ -60,6 +62,7 @@ class Source:
     header: str
     source: str
     patterns: tuple[int, ...] | None
+    reactions: tuple[str, ...]
     presence: Mapping[int | None, tuple[int, int]]
     longest: int
 
@@ -91,7 +94,9 @@ class File:
 
     def source(self) -> Source:
         m = self.names.module
-        reactions = [self.reaction(key) for key in ([None] if self.patterns is None else self.patterns)]
+        whole = self.patterns is None
+        patterns = [Pattern.all(self.pipeline)] if whole else shared(self.pipeline, self.patterns or ())
+        reactions = [self.reaction(pattern) for pattern in patterns]
         reset = self._reset()
         parts = [
             f'#include "{m}.h"',
@@ -108,7 +113,7 @@ class File:
             *(text for _, text in self.expressions.functions.values()),
             *reactions,
             reset,
-            entry_text(self.pipeline, self.names, self.real, self.patterns, checked=self.checked),
+            entry_text(self.pipeline, self.names, self.real, patterns, checked=self.checked),
         ]
         text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
         head = partial(header, self.pipeline, self.names, self.real, self.patterns, self.pool)
@@ -119,6 +124,7 @@ class File:
             head(said),
             text,
             None if self.patterns is None else tuple(self.patterns),
+            tuple(map(reaction_name, patterns)),
             self.presence,
             self.longest,
         )
@@ -130,13 +136,13 @@ class File:
         program = self.tidy(program)
         return join_tables(program) if self.real == "double" else program
 
-    def reaction(self, key: int | None) -> str:
-        """The function of one pattern of present inputs."""
+    def reaction(self, pattern: Pattern) -> str:
+        """The function of these patterns of present inputs."""
         pipeline, tape = self.pipeline, Tape()
         sites = {site.value: site for site in pipeline.random}
-        program, choices = put_aside(specialise(pipeline, key), sites)
+        program, choices = put_aside(specialise(pipeline, pattern.inputs, pattern.open), sites)
         program = self.tidied(program)
-        values = self._given(tape, program, key)
+        values = self._given(tape, program, pattern)
         expander = Expander(tape, values)
         places = self._in_place(program)
         for i in program.instructions:
@@ -174,12 +180,12 @@ class File:
         must = may = 0
         for k, present in flags:
             must, may = must | (writer.ref(present) == "true") << k, may | 1 << k
-        self.presence[key] = must, may
+        self.presence.update({key: (must, may) for key in pattern.keys or (None,)})
         body += self.told(writer, flags)
         all_text = re.sub(r"/\*.*?\*/", "", "\n".join(body))
-        unused = [n for n in self._parameters(key) if not _names_it(all_text, n)]
+        unused = [n for _, n in parameters(self.names, pattern) if not _names_it(all_text, n)]
         head = [f"    (void){n};" for n in unused]
-        return "\n".join([self.signature(key), "{", *head, *local, *body, "}", ""])
+        return "\n".join([self.signature(pattern), "{", *head, *local, *body, "}", ""])
 
     def told(self, writer: Writer, flags: list[tuple[int, Node]]) -> list[str]:
         """The end of a reaction: which outputs are there."""
@@ -267,22 +273,15 @@ class File:
         unused = [n for n in ("s", *inputs.values()) if not _names_it("\n".join(body), n)]
         return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
 
-    def signature(self, key: int | None) -> str:
-        return f"static uint64_t {reaction_name(key)}({self._typed(key)})"
+    def signature(self, pattern: Pattern) -> str:
+        return f"static uint64_t {self.called(pattern)}"
 
-    def _parameters(self, key: int | None) -> list[str]:
-        inputs = [n for k, n in enumerate(given(self.names)) if key is None or key >> k & 1]
-        return ["s", "time", *(["present"] if key is None else []), *inputs, *made(self.names)]
-
-    def _typed(self, key: int | None) -> str:
-        m = self.names.module
-        parts = [f"{m}_state *restrict s", "int64_t time"] + (["uint64_t present"] if key is None else [])
-        parts += [
-            f"const {m}_{n} *restrict in_{n}"
-            for k, n in enumerate(self.names.inputs)
-            if key is None or key >> k & 1
-        ]
-        return ", ".join(parts + [f"{m}_{n} *restrict out_{n}" for n in self.names.outputs])
+    def called(self, pattern: Pattern) -> str:
+        """The name of a reaction with its parameters."""
+        typed = (
+            f"{type_}{'' if type_[-1] == '*' else ' '}{n}" for type_, n in parameters(self.names, pattern)
+        )
+        return f"{reaction_name(pattern)}({', '.join(typed)})"
 
     def _cell_names(self) -> list[str]:
         return [n for names in self.names.registers for n in names]
@@ -290,7 +289,7 @@ class File:
     def _place(self, name: str, kind: str, leaf: Leaf | Cell) -> Buffer:
         return Buffer(name, leaf.dtype, math.prod(leaf.shape), kind, bare=leaf.shape == ())
 
-    def _given(self, tape: Tape, program: Program, key: int | None) -> dict[int, Value]:
+    def _given(self, tape: Tape, program: Program, pattern: Pattern) -> dict[int, Value]:
         """The values that no instruction makes."""
         pipeline = self.pipeline
         values: dict[int, Value] = {}
@@ -308,8 +307,8 @@ class File:
             self.state[name] = self._place(f"s->{name}", "state", cell)
             values[cell.read] = _whole(self.state[name], cell.shape)
         for k, port in enumerate(pipeline.inputs):
-            here = key is None or key >> k & 1
-            if key is None:
+            here = pattern.inputs >> k & 1
+            if pattern.open >> k & 1:
                 scalar(port.present, tape.given(f"((present >> {k}) & 1u)", "bool"))
             for name, leaf in zip(self.names.input_leaves[k], port.leaves, strict=True):
                 if here:

@@ -6,10 +6,9 @@ all that any may need, of which a compiler leaves out what is not used; reset an
 
 from __future__ import annotations
 
-from flowgraph.engines.c.entry import reaction_name
 from flowgraph.engines.c.source import Source
 
-MOST, LARGE = 4, 3_000
+MOST, LARGE = 4, 2_000
 """Into how many files, and with how many lines to each at least: what they share is read for each."""
 
 _HIDDEN = '__attribute__((visibility("hidden")))'
@@ -17,21 +16,21 @@ _HIDDEN = '__attribute__((visibility("hidden")))'
 
 def units(source: Source) -> dict[str, str]:
     """The text by file name: one file where it is small or has one reaction."""
-    module, text, keys = source.names.module, source.source, source.patterns or ()
-    count = min(MOST, len(keys), text.count("\n") // LARGE)
+    module, text, names = source.names.module, source.source, source.reactions
+    count = min(MOST, len(names), text.count("\n") // LARGE)
     if count < 2:
         return {f"{module}.c": text}
-    starts = {key: f"static uint64_t {reaction_name(key)}(" for key in keys}
-    shared, rest = text[: text.index(starts[keys[0]])], text[text.index(starts[keys[0]]) :]
-    reactions: dict[int, str] = {}
-    for key in keys:
-        reactions[key], rest = _function(rest)
-    made = {key: text.replace("static", _HIDDEN, 1) for key, text in reactions.items()}
+    start = text.index(f"static uint64_t {names[0]}(")
+    shared, rest = text[:start], text[start:]
+    made: dict[str, str] = {}
+    for name in names:
+        reaction, rest = _function(rest)
+        made[name] = reaction.replace("static", _HIDDEN, 1)
     declared = "".join(f"{text[: text.index('{')].rstrip()};\n" for text in made.values())
-    parts: list[list[int]] = [[] for _ in range(count)]
-    for key in sorted(keys, key=lambda k: -len(made[k])):
-        min(parts, key=lambda part: sum(len(made[k]) for k in part)).append(key)
-    first, *others = ("\n".join([shared, *(made[k] for k in part)]) for part in parts)
+    parts: list[list[str]] = [[] for _ in range(count)]
+    for name in sorted(names, key=lambda n: -len(made[n])):
+        min(parts, key=lambda part: sum(len(made[n]) for n in part)).append(name)
+    first, *others = ("\n".join([shared, *(made[n] for n in part)]) for part in parts)
     files = {f"{module}.c": f"{declared.join(_after_includes(first))}\n{rest}"}
     return files | {f"{module}_part_{n}.c": other for n, other in enumerate(others, 1)}
 

@@ -14,6 +14,7 @@ from flowgraph.engines.c.lanes.expressions import TYPES, LaneExpressions, no_lan
 from flowgraph.engines.c.lanes.writer import LaneWriter
 from flowgraph.engines.c.names import Names, given, made
 from flowgraph.engines.c.nodes import Node
+from flowgraph.engines.c.patterns import Pattern
 from flowgraph.engines.c.preamble import MACROS, REFUSED
 from flowgraph.engines.c.source import MOST_PATTERNS, every_pattern
 from flowgraph.engines.c.statements import Writer
@@ -75,12 +76,12 @@ class _LaneFile(File):
                 lines.append(f"    made |= fg_mask_of(INT64_C({1 << k}));")
         return [*lines, "    return made;"]
 
-    def signature(self, key: int | None) -> str:
-        return f"static fg_mask {reaction_name(key)}({self._typed(key)})"
+    def signature(self, pattern: Pattern) -> str:
+        return f"static fg_mask {self.called(pattern)}"
 
     def text(self) -> str:
         assert self.patterns is not None
-        reactions = [self.reaction(key) for key in self.patterns]
+        reactions = [self.reaction(Pattern.of(key)) for key in self.patterns]
         parts = [
             "#include <math.h>",
             "#include <stdbool.h>",
@@ -139,7 +140,7 @@ class _LaneFile(File):
         for key in self.patterns or ():
             inputs = [f"in{k}++" for k in range(len(given(names))) if key >> k & 1]
             call = ", ".join(["s", "time[t]", *inputs, *made(names)])
-            lines.append(f"        case {key}: there = {reaction_name(key)}({call}); break;")
+            lines.append(f"        case {key}: there = {reaction_name(Pattern.of(key))}({call}); break;")
         lines += [
             "        default: there = fg_mask_of(0);",
             "        }",

@@ -1,0 +1,63 @@
+"""NumPy's functions by a shorter way: what they give, and of which kind, is NumPy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowgraph.recorder import ranges
+from flowgraph.recorder.namespaces import NUMPY
+
+GIVEN = [
+    np.array([True, False, True]),
+    np.array([3, 1, 2], np.int32),
+    np.array([3, 1, 2], np.uint32),
+    np.arange(6.0).reshape(2, 3),
+    np.ones(4, np.float32),
+    np.zeros((0,)),
+]
+
+
+@pytest.mark.parametrize("x", GIVEN, ids=lambda x: f"{x.dtype}{x.shape}")
+@pytest.mark.parametrize("more", [{}, {"axis": 0}, {"axis": -1, "dtype": np.float64}])
+def test_sums_are_those_of_numpy(x, more):
+    for keepdims in (False, True):
+        found, wanted = NUMPY.sum(x, keepdims=keepdims, **more), np.sum(x, keepdims=keepdims, **more)
+        assert type(found) is type(wanted)
+        assert found.dtype == wanted.dtype
+        np.testing.assert_array_equal(found, wanted)
+    if x.ndim == 1 or "axis" in more:
+        found, wanted = NUMPY.cumulative_sum(x, **more), np.cumulative_sum(x, **more)
+        assert found.dtype == wanted.dtype
+        np.testing.assert_array_equal(found, wanted)
+        more = {**more, "include_initial": True}
+        np.testing.assert_array_equal(NUMPY.cumulative_sum(x, **more), np.cumulative_sum(x, **more))
+    else:
+        with pytest.raises(ValueError, match="axis"):
+            NUMPY.cumulative_sum(x)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_places_are_those_of_numpy(side):
+    ends, values = [1, 2, 2, 5], np.array([[0, 2], [5, 9]])
+    found = NUMPY.searchsorted(ends, values, side=side)
+    np.testing.assert_array_equal(found, np.searchsorted(ends, values, side=side))
+    assert NUMPY.searchsorted(np.array(ends), 2, side=side) == np.searchsorted(ends, 2, side=side)
+
+
+@pytest.mark.parametrize("kind", ["int32", "uint32", "int64", "uint64"])
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_reals_become_whole_numbers_without_a_word(kind, real):
+    """Many small ones, which are told by their squares, and each that does not fit, wherever it stands."""
+    ends = np.iinfo(kind)
+    edges = (-1.0, 2.0**31, -(2.0**31), 2.0**62, 2.0**63, -(2.0**63), 2.0**64, 1e30, -1e300)
+    for one in (np.nan, np.inf, -np.inf, *edges):
+        with np.errstate(over="ignore"):
+            x = np.array([[0.5, 3.7], [one, 2.0]], real)
+        with np.errstate(all="raise"):
+            found = ranges.cast(np, x, kind)
+        number = float(x[1, 0])
+        exact = int(number) if np.isfinite(number) else number
+        want = 0 if exact != exact else min(max(exact, int(ends.min)), int(ends.max))
+        assert found.dtype == kind
+        assert [int(v) for v in found.ravel()] == [0, 3, want, 2], (one, kind)
