@@ -18,7 +18,7 @@ from flowgraph.engines.verilog.plan import Plan
 LATENCY = 25
 """Cycles from the microword that writes a word to the first that can read it."""
 
-DEEP = 3
+DEEP = 4
 """Cycles more where the memory is several blocks deep, or has banks."""
 
 AHEAD = 4

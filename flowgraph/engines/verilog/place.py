@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from flowgraph.errors import MissingDependencyError
 
@@ -81,10 +82,83 @@ def synthesise(folder: Path, name: str) -> Figures:
     need_tools()
     sources = " ".join(sorted(p.name for p in folder.glob("*.v")))
     _run(folder, "synthesis.log", ["-c", _SYNTHESIS.format(sources=sources, name=name)])
-    netlist = json.loads((folder / f"{name}.json").read_text())
-    cells = Counter(c["type"] for c in netlist["modules"][name]["cells"].values())
-    lut = cells["LUT4"] + 2 * cells["CCU2C"] + 4 * cells["TRELLIS_DPR16X4"]
-    return Figures(lut, cells["TRELLIS_FF"], cells["MULT18X18D"], cells["DP16KD"], None)
+    at = folder / f"{name}.json"
+    netlist = json.loads(at.read_text())
+    module = netlist["modules"][name]
+    take_own_registers(module)
+    at.write_text(json.dumps(netlist))
+    kinds = Counter(c["type"] for c in module["cells"].values())
+    lut = kinds["LUT4"] + 2 * kinds["CCU2C"] + 4 * kinds["TRELLIS_DPR16X4"]
+    return Figures(lut, kinds["TRELLIS_FF"], kinds["MULT18X18D"], kinds["DP16KD"], None)
+
+
+def take_own_registers(module: dict[str, Any]) -> int:
+    """Put registers behind block memories into the blocks, which have some that Yosys leaves unused.
+
+    A port of a block takes them where all that is read of it goes into plain registers of its clock and
+    nowhere else. The words are the same in each cycle; from its own register a block answers sooner.
+
+    Args:
+        module: of a flattened netlist in Yosys's JSON; changed.
+
+    Returns:
+        How many registers are in blocks now.
+    """
+    cells = module["cells"]
+    readers: dict[int | str, list[tuple[str, str]]] = {}
+    for outside in module["ports"].values():
+        for bit in outside["bits"]:
+            readers.setdefault(bit, []).append(("", ""))
+    for name, cell in cells.items():
+        for pin, bits in cell["connections"].items():
+            if cell["port_directions"][pin] == "input":
+                for bit in bits:
+                    readers.setdefault(bit, []).append((name, pin))
+    taken = 0
+    for block in [c for c in cells.values() if c["type"] == "DP16KD"]:
+        for port in "AB":
+            pins = {
+                pin: readers[bits[0]]
+                for pin, bits in block["connections"].items()
+                if pin.startswith(f"DO{port}") and bits and bits[0] in readers
+            }
+            clock = block["connections"].get(f"CLK{port}", [])
+            if not (pins and _always_reads(block, port)) or not all(
+                len(to) == 1 and to[0][1] == "DI" and _plain(cells[to[0][0]], clock) for to in pins.values()
+            ):
+                continue
+            for pin, to in pins.items():
+                block["connections"][pin] = cells.pop(to[0][0])["connections"]["Q"]
+            block["parameters"][f"REGMODE_{port}"] = "OUTREG"
+            block["connections"][f"OCE{port}"] = ["1"]
+            taken += len(pins)
+    return taken
+
+
+def _always_reads(block: dict[str, Any], port: str) -> bool:
+    """Whether a port of a block reads at each edge of its clock, without its own register."""
+    pins, said = block["connections"], block["parameters"]
+    return (
+        said.get(f"CLK{port}MUX") == f"CLK{port}"
+        and said.get(f"REGMODE_{port}") == "NOREG"
+        and pins.get(f"CE{port}") == ["1"]
+        and pins.get(f"RST{port}") == ["0"]
+    )
+
+
+def _plain(cell: dict[str, Any], clock: list[int]) -> bool:
+    """Whether a cell is a register that takes what comes at each edge of a clock, and begins with 0."""
+    pins, said = cell["connections"], cell["parameters"]
+    return (
+        cell["type"] == "TRELLIS_FF"
+        and pins["CLK"] == clock
+        and said.get("CLKMUX", "CLK") == "CLK"
+        and said.get("CEMUX", "1").strip() == "1"
+        and said.get("REGSET", "RESET") == "RESET"
+        and said.get("LSRMUX", "LSR") == "LSR"
+        and pins.get("LSR", ["0"]) in (["0"], [])
+        and "M" not in pins
+    )
 
 
 def route(folder: Path, name: str, *, clock: float = TARGET_HZ, seeds: int = 1) -> Figures:

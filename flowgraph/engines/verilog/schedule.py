@@ -23,7 +23,7 @@ from flowgraph.engines.verilog.order import (
 from flowgraph.engines.verilog.places import bank_of_row, give_places
 from flowgraph.engines.verilog.plan import Plan, Stage
 
-FETCH = 5
+FETCH = 6
 """Cycles from the number of a step to its microword."""
 
 _LEAST = FETCH + 1

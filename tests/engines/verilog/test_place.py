@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
 
     def run(folder, log, arguments):
         if "--seed" not in arguments:
-            netlist = {"modules": {"tank": {"cells": {}}}}
+            netlist = {"modules": {"tank": {"cells": {}, "ports": {}}}}
             return (folder / "tank.json").write_text(json.dumps(netlist))
         ran.append(int(arguments[arguments.index("--seed") + 1]))
         clock = clocks[len(ran) - 1]
@@ -76,6 +77,67 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
     assert ran == list(range(1, tried + 1))
     assert (tmp_path / "tank.config").read_text() == f"{best}"
     assert json.loads((tmp_path / "tank_report.json").read_text())["fmax"]["clk"]["achieved"] == best
+
+
+def block_with(*, outside=(), words=None, first=None, reader=None):
+    """A block of which two bits are read at its second port, each with a register behind it, changed."""
+    cells = {
+        "words": {
+            "type": "DP16KD",
+            "parameters": {"CLKBMUX": "CLKB", "REGMODE_A": "NOREG", "REGMODE_B": "NOREG"},
+            "port_directions": dict.fromkeys(("CLKB", "CEB", "OCEB", "RSTB"), "input")
+            | dict.fromkeys(("DOB0", "DOB1", "DOB2"), "output"),
+            "connections": {"CLKB": [2], "CEB": ["1"], "OCEB": ["0"], "RSTB": ["0"]}
+            | {f"DOB{k}": [10 + k] for k in range(3)},
+        }
+    }
+    for k in range(2):
+        cells[f"own{k}"] = {
+            "type": "TRELLIS_FF",
+            "parameters": {"CEMUX": "1 ", "CLKMUX": "CLK", "LSRMUX": "LSR", "REGSET": "RESET"},
+            "port_directions": dict.fromkeys(("CLK", "DI", "M", "LSR", "CE"), "input") | {"Q": "output"},
+            "connections": {"CLK": [2], "LSR": ["0"], "DI": [10 + k], "Q": [20 + k]},
+        }
+    for changed, parts in (("words", words), ("own0", first)):
+        for part, values in (parts or {}).items():
+            cells[changed][part] |= values
+    if reader:
+        cells["other"] = {"type": "LUT4", "port_directions": {"A": "input"}, "connections": {"A": [reader]}}
+    return {"ports": {"q": {"direction": "output", "bits": [20, 21, *outside]}}, "cells": cells}
+
+
+def test_registers_behind_a_block_become_its_own():
+    module = block_with(reader=20)
+    assert place.take_own_registers(module) == 2
+    assert sorted(module["cells"]) == ["other", "words"]
+    words = module["cells"]["words"]
+    assert (words["parameters"]["REGMODE_A"], words["parameters"]["REGMODE_B"]) == ("NOREG", "OUTREG")
+    assert words["connections"]["OCEB"] == ["1"]
+    assert [words["connections"][f"DOB{k}"] for k in range(3)] == [[20], [21], [12]]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"outside": [11]},  # a word is seen before its register
+        {"reader": 11},
+        {"words": {"connections": {"CEB": [7]}}},  # the block does not read in each cycle
+        {"words": {"connections": {"RSTB": [7]}}},
+        {"words": {"parameters": {"CLKBMUX": "INV"}}},
+        {"first": {"connections": {"CLK": [3]}}},  # of another clock
+        {"first": {"parameters": {"CLKMUX": "INV"}}},  # or of its other edge
+        {"first": {"parameters": {"CEMUX": "CE"}, "connections": {"CE": [4]}}},  # not in each cycle
+        {"first": {"parameters": {"REGSET": "SET"}}},  # not 0 at first
+        {"first": {"connections": {"LSR": [5]}}},
+        {"first": {"parameters": {"LSRMUX": "INV"}}},
+        {"first": {"connections": {"M": [10], "DI": [6]}}},
+    ],
+)
+def test_a_register_that_does_more_stays_where_it_is_with_those_beside_it(changes):
+    module = block_with(**changes)
+    before = copy.deepcopy(module)
+    assert place.take_own_registers(module) == 0
+    assert module == before
 
 
 def test_figures_are_those_of_the_report():

@@ -8,7 +8,7 @@
 // a term.
 //
 // While `ready` is 1 the host writes words (`put`) and reads them (`word` is what lies at `at` three cycles
-// earlier, five where the memory is DEEP), and starts a run at a place of the program.
+// earlier, six where the memory is DEEP), and starts a run at a place of the program.
 module fg_machine #(
     parameter WIDTH = 24,  // bits of a word of a real number
     parameter WIDE = 24,  // and of one that is held in a wider word
@@ -47,8 +47,8 @@ module fg_machine #(
   localparam D = 31, B = 31 + PLACE, A = 31 + 2 * PLACE;
   localparam HALT = LANES * LANE;
   localparam AHEAD = ROWS != 0 ? 4 : 0;
-  localparam LATER = DEEP != 0 ? 2 : 0;  // registers more until a word is read
-  localparam FETCH = 5;  // registers from the number of a step to its microword
+  localparam LATER = DEEP != 0 ? 3 : 0;  // registers more until a word is read
+  localparam FETCH = 6;  // registers from the number of a step to its microword
 
   // -- the program ------------------------------------------------------------------------------------------
   wire [CODE-1:0] arrived, fetched;
@@ -152,7 +152,7 @@ module fg_machine #(
           second_last <= code[A+:ELEMENT] == code[B+:ELEMENT];
           one <= code[A+:ELEMENT] == {ELEMENT{1'b0}};
           two <= code[A+:ELEMENT] == code[B+:ELEMENT];
-          begins <= step - {{STEP-3{1'b0}}, 3'd4};
+          begins <= step - {{STEP-3{1'b0}}, 3'd5};  // FETCH - 1
         end else if (advances) begin
           first <= at_last ? {ELEMENT{1'b0}} : second;
           second <= at_last ? by : third;
@@ -241,12 +241,13 @@ module fg_machine #(
           .clk(clk), .place(b_place), .word(b), .write(bank_write), .to(bank_to), .written(bank_word)
       );
       if (LATER != 0) begin : later
-        reg [LANE-1:0] code1, code2;
+        reg [LANE-1:0] code1, code2, code3;
         always @(posedge clk) begin
           code1 <= mine;
           code2 <= code1;
+          code3 <= code2;
         end
-        assign now = code2;
+        assign now = code3;
       end else begin : at_once
         assign now = mine;
       end

@@ -1,9 +1,10 @@
 // A memory of blocks with one reader and a writer for each of its banks. A word lies in the bank of its place's
 // lowest bits, so that a cycle writes a word to each bank. Of a deep memory each block has its own registers
-// before and behind it, and then one block is chosen.
+// before and behind it, and then one block is chosen. The first register behind a block is the block's own.
 //
-// The word lies there 2 cycles after its place, 4 cycles where the memory is DEEP.
-// A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later.
+// The word lies there 2 cycles after its place, 5 cycles where the memory is DEEP.
+// A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later. In the
+// cycle before nobody may ask for it: a block does not say which word, the old one or the new, it would give.
 module fg_memory #(
     parameter WIDTH = 36,
     parameter PLACE = 12,  // bits of an address
@@ -41,35 +42,37 @@ module fg_memory #(
   generate
     for (k = 0; k < COUNT; k = k + 1) begin : blocks
       localparam LEFT = EACH - k / BANKS * DEPTH;
-      localparam SIZE = LEFT < DEPTH ? LEFT : DEPTH;
+      // So many that no block of a chip is put behind another: then nothing is chosen before the block's own register.
+      localparam SIZE = LEFT <= 512 ? LEFT : LEFT <= 1024 ? 1024 : DEPTH;
       localparam IN = SIZE > 1 ? $clog2(SIZE) : 1;  // bits of a place in it
       localparam [7:0] TENS = 8'd48 + k / 10, ONES = 8'd48 + k % 10;
-      (* ram_style = "block" *) reg [WIDTH-1:0] words[0:SIZE-1];
+      (* ram_style = "block", no_rw_check *) reg [WIDTH-1:0] words[0:SIZE-1];
       initial $readmemh({FILE, "_", TENS, ONES, ".hex"}, words);
-      reg [WIDTH-1:0] read, out;
-      assign found[k*WIDTH+:WIDTH] = out;
+      reg [WIDTH-1:0] read, own;
       wire [IN-1:0] at;
       // Of a deep memory a block takes only places of its own, and gives zeros where another is asked: registers that
       // were alike in all blocks would be made one, and its wires cross the whole memory.
-      wire asked;
       if (DEEP != 0) begin : deep
         reg [IN-1:0] near;
-        reg asked1, asked2;
+        reg asked1, asked2, asked3;
+        reg [WIDTH-1:0] out;
         wire mine = block_of(place) == k[PICK-1:0];
         always @(posedge clk) begin
           if (mine) near <= place[LOW+:IN];
           asked1 <= mine;
           asked2 <= asked1;
+          asked3 <= asked2;
+          out <= asked3 ? own : {WIDTH{1'b0}};
         end
         assign at = near;
-        assign asked = asked2;
+        assign found[k*WIDTH+:WIDTH] = out;
       end else begin : shallow
         assign at = place[LOW+:IN];
-        assign asked = 1'b1;
+        assign found[k*WIDTH+:WIDTH] = own;
       end
       always @(posedge clk) begin
         read <= words[at];
-        out <= asked ? read : {WIDTH{1'b0}};
+        own <= read;
       end
       if (READS == 0 && DEEP != 0) begin : deep_write
         reg here;
