@@ -11,6 +11,9 @@ Navigation", 2001, sec. 5.4.2.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -23,9 +26,9 @@ from flowgraph.blocks.geometry.rotations import (
     tilt_and_heading,
     to_matrix,
     to_rotation_vector,
-    world_error,
 )
 from flowgraph.blocks.metrics.chi_square import chi_square_band, inside
+from flowgraph.blocks.metrics.terms import FIGURES, attitude_terms, place_terms, turn_error
 from flowgraph.blocks.metrics.truth import interpolate, interpolate_pose, within_truth
 
 __all__ = [
@@ -74,7 +77,7 @@ def state_error(
     parts = [p - position, _true_velocity(truth, time) - velocity]
     if attitude is not None:
         q = interpolate(truth, "attitude", time)
-        parts.append(_turn(attitude, np.broadcast_to(q, attitude.shape)))
+        parts.append(turn_error(attitude, np.broadcast_to(q, attitude.shape), np))
     return np.concatenate(parts, axis=-1)
 
 
@@ -130,29 +133,31 @@ def pose_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict
     chosen = within_truth(estimate, truth, settle)
     has, whole = set(truth.leaves), "covariance" in chosen.leaves and chosen["covariance"].shape[-1] >= 9
     moving = "velocity" in has and "velocity" in chosen.leaves
-    P = chosen["covariance"][:, :9, :9] if whole else np.empty((len(chosen), 0, 0))
-    found: dict[str, float] = {}
+    P = chosen["covariance"][:, :9, :9] if whole else None
+    terms: dict[str, np.ndarray] = {}
     parts = []
     if "position" in has:
         error = chosen["position"] - interpolate(truth, "position", chosen.time)
-        found.update({f"position_{name}_m": value for name, value in error_summary(error).items()})
-        if whole:
-            at = np.sqrt(np.einsum("nii->ni", P[:, :3, :3]))
-            found["position_3sigma"] = float(np.mean(np.abs(error) <= 3.0 * at))
+        terms |= place_terms(error, None if P is None else P[:, :3, :3], np)
         parts.append(-error)
     if moving:
         speed = chosen["velocity"] - _true_velocity(truth, chosen.time)
-        found["velocity_rmse_mps"] = error_summary(speed)["rmse"]
+        terms |= place_terms(speed, None, np, of="velocity")
         parts.append(-speed)
     if "attitude" in has:
         attitude = interpolate(truth, "attitude", chosen.time)
-        found.update(_angles(chosen["attitude"], attitude))
-        if whole:
-            found.update(_turn_3sigma(chosen["attitude"], attitude, P[:, 6:9, 6:9]))
-        parts.append(_turn(chosen["attitude"], attitude))
-    if whole and len(parts) == 3:
+        terms |= attitude_terms(chosen["attitude"], attitude, None if P is None else P[:, 6:9, 6:9], np)
+        parts.append(turn_error(chosen["attitude"], attitude, np))
+    found = _figures(terms)
+    if P is not None and len(parts) == 3:
         found.update(nees_summary(np.concatenate(parts, axis=-1), P))
     return found | {"compared_ticks": float(len(chosen))} if parts else {}
+
+
+def _figures(terms: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Those of `FIGURES` whose terms (n,) there are."""
+    reduced: dict[str, Callable[[np.ndarray], Any]] = {"mean": np.mean, "root": _rms, "most": np.max}
+    return {name: float(reduced[how](terms[term])) for name, term, how in FIGURES if term in terms}
 
 
 def plane_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> dict[str, float]:
@@ -191,39 +196,16 @@ def attitude_errors(estimate: Series, truth: Series, *, settle: float = 1.0) -> 
         return {}
     chosen = within_truth(estimate, truth, settle)
     q, attitude = chosen["attitude"], interpolate(truth, "attitude", chosen.time)
+    P = chosen["covariance"] if "covariance" in chosen.leaves else None
     found = {
-        **_angles(q, attitude),
+        **_figures(attitude_terms(q, attitude, P, np)),
         **_axes_and_parts(q, attitude),
         "attitude_end_deg": float(geodesic_angle(q[-1:], attitude[-1:])[0]),
         "compared_ticks": float(len(chosen)),
     }
-    if "covariance" in chosen.leaves:
-        found.update(_turn_3sigma(q, attitude, chosen["covariance"]))
-        found.update(nees_summary(_turn(q, attitude), chosen["covariance"]))
+    if P is not None:
+        found.update(nees_summary(turn_error(q, attitude, np), P))
     return found
-
-
-def _angles(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    tilt, heading = tilt_and_heading(estimate, truth)
-    whole = error_summary(geodesic_angle(estimate, truth))
-    return {
-        **{f"attitude_{name}_deg": value for name, value in whole.items()},
-        "tilt_rmse_deg": error_summary(tilt)["rmse"],
-        "heading_rmse_deg": error_summary(heading)["rmse"],
-    }
-
-
-def _turn_3sigma(estimate: np.ndarray, truth: np.ndarray, P: np.ndarray) -> dict[str, float]:
-    """How often tilt and heading are within three deviations, given the covariance (n, 3, 3) in the body."""
-    R = to_matrix(estimate, xp=np)
-    sigma = np.sqrt(((R @ P) * R).sum(axis=-1))  # the diagonal of R P R^T
-    held = np.abs(world_error(estimate, truth)) <= 3.0 * sigma
-    return {"tilt_3sigma": float(np.mean(held[:, :2])), "heading_3sigma": float(np.mean(held[:, 2]))}
-
-
-def _turn(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Log(q^-1 q_true), rad, body."""
-    return np.asarray(to_rotation_vector(multiply(conjugate(estimate, xp=np), truth, xp=np), xp=np))
 
 
 def _true_velocity(truth: Series, time: np.ndarray) -> np.ndarray:

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Scalar, Stream, block, latest
-from flowgraph.blocks.geometry.rotations import conjugate, multiply, parted, to_matrix, to_rotation_vector
 from flowgraph.blocks.metrics.chi_square import chi_square, chi_square_band
+from flowgraph.blocks.metrics.terms import FIGURES, attitude_terms, place_terms, turn_error
 from flowgraph.blocks.signals import (
     Bounds,
     Extremes,
@@ -48,7 +48,8 @@ __all__ = [
 ]
 
 _NEVER = -(2**63)
-_DEGREES = 180.0 / np.pi
+_SUMMED = [figure for figure in FIGURES if figure[2] != "most"]
+_MOST = [figure for figure in FIGURES if figure[2] == "most"]
 
 
 def _tallied(seen: Tally, value: Array) -> Tally:
@@ -130,7 +131,7 @@ def pose_sums(
     """Add the errors of a tick that has both, `settle` ns after the first estimate or later.
 
     With e_p = p - p_true, e_v = v - v_true and phi = Log(q^-1 q_true): the NEES is |L^-1 (-e_p, -e_v, phi)|^2
-    with L L^T the covariance of these nine. The covariance of the turn in the world is R P R^T."""
+    with L L^T the covariance of these nine."""
     if estimate is None:
         return seen, seen
     first = xp.where(seen.first == _NEVER, t, seen.first)
@@ -140,36 +141,30 @@ def pose_sums(
     p, v, q = estimate.position, estimate.velocity, estimate.attitude
     P = estimate.covariance[..., :9, :9]
     place, speed = p - truth.position, v - truth.velocity
-    back = conjugate(q, xp=xp)
-    turn = to_rotation_vector(multiply(back, truth.attitude, xp=xp), xp=xp)
-    off = multiply(q, conjugate(truth.attitude, xp=xp), xp=xp)
-    root = lambda a, b: xp.sqrt(a * a + b * b)  # of a unit quaternion, which needs no more care
-    tilt, heading = (_DEGREES * angle for angle in parted(off, xp=xp, hypot=root))
-    R = to_matrix(q, xp=xp)
-    variances = xp.concat([_diagonal(P[:3, :3], xp), xp.sum((R @ P[6:9, 6:9]) * R, axis=-1)])
-    offs = xp.concat([place, (R @ turn[:, None])[:, 0]])
-    held = xp.astype(offs * offs <= 9.0 * variances, p.dtype)
-    error = xp.concat([-place, -speed, turn])
+    error = xp.concat([-place, -speed, turn_error(q, truth.attitude, xp)])
     white = _forward(xp.linalg.cholesky(P), error, xp)
     nees = xp.linalg.vecdot(white, white)
-    square, angle = xp.linalg.vecdot(place, place), _DEGREES * xp.sqrt(xp.linalg.vecdot(turn, turn))
-    sizes = xp.stack([xp.sqrt(square), angle])
+    found = {
+        **place_terms(place, P[:3, :3], xp),
+        **place_terms(speed, None, xp, of="velocity"),
+        **attitude_terms(q, truth.attitude, P[6:9, 6:9], xp),
+    }
+    sizes = xp.stack([found[term] for _, term, _ in _MOST])
+    squared = {"mean": lambda x: x, "root": lambda x: x * x}
     terms = xp.stack(
         [
-            *(square, sizes[0], xp.sum(held[:3]) / 3.0, xp.linalg.vecdot(speed, speed)),
-            *(angle * angle, angle, tilt * tilt, heading * heading),
-            *(xp.sum(held[3:5]) / 2.0, held[5]),
+            *(squared[how](found[term]) for _, term, how in _SUMMED),
             *(nees, xp.astype((nees >= band[0]) & (nees <= band[1]), p.dtype)),
         ]
     )
     counts = t - first >= settle
-    found = PoseSums(
+    added = PoseSums(
         first=first,
         count=seen.count + xp.astype(counts, p.dtype),
         sums=seen.sums + xp.where(counts, terms, 0.0),
         most=xp.where(counts, xp.maximum(seen.most, sizes), seen.most),
     )
-    return found, found
+    return added, added
 
 
 def _no_sums() -> PoseSums:
@@ -179,10 +174,6 @@ def _no_sums() -> PoseSums:
 @pose_sums.init
 def _(estimate: Any = None, truth: Any = None, *, settle: int, band: Array) -> PoseSums:
     return _no_sums()
-
-
-def _diagonal(P: Array, xp: Any) -> Array:
-    return xp.sum(P * xp.eye(P.shape[-1], dtype=P.dtype), axis=-1)
 
 
 def _forward(L: Array, e: Array, xp: Any) -> Array:
@@ -197,25 +188,10 @@ def _forward(L: Array, e: Array, xp: Any) -> Array:
 @block
 def pose_figures(sums: PoseSums, *, xp: Any) -> PoseFigures:
     """The figures from their sums: means, and roots of means of squares."""
-    mean = sums.sums / sums.count
-    root = xp.sqrt(mean)
-    return PoseFigures(
-        position_rmse_m=root[0],
-        position_mean_m=mean[1],
-        position_max_m=sums.most[0],
-        position_3sigma=mean[2],
-        velocity_rmse_mps=root[3],
-        attitude_rmse_deg=root[4],
-        attitude_mean_deg=mean[5],
-        attitude_max_deg=sums.most[1],
-        tilt_rmse_deg=root[6],
-        heading_rmse_deg=root[7],
-        tilt_3sigma=mean[8],
-        heading_3sigma=mean[9],
-        nees_mean=mean[10],
-        nees_inside=mean[11],
-        compared_ticks=sums.count,
-    )
+    mean, root = sums.sums / sums.count, {"mean": lambda x: x, "root": xp.sqrt}
+    found = {name: root[how](mean[k]) for k, (name, _, how) in enumerate(_SUMMED)}
+    found |= {name: sums.most[k] for k, (name, _, _) in enumerate(_MOST)}
+    return PoseFigures(**found, nees_mean=mean[-2], nees_inside=mean[-1], compared_ticks=sums.count)
 
 
 def pose_score(
