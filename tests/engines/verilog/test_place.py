@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
 
     def run(folder, log, arguments):
         if "--seed" not in arguments:
-            netlist = {"modules": {"tank": {"cells": {}}}}
+            netlist: dict[str, Any] = {"modules": {"tank": {"cells": {}}}}
             return (folder / "tank.json").write_text(json.dumps(netlist))
         ran.append(int(arguments[arguments.index("--seed") + 1]))
         clock = clocks[len(ran) - 1]
