@@ -74,11 +74,11 @@ def test_an_interpreter_without_particles_gives_a_row_that_says_so(monkeypatch, 
 
 def test_the_plain_model_of_the_libraries_moves_as_its_states_say():
     """Each state is F times the last and a jerk's noise, of the size that Q says; positions are seen."""
-    F, Q, H, states, seen = particles.plain_model(2000)
+    F, Q, H, states, seen = bootstrap.plain_model(2000)
     errors = states[1:] - states[:-1] @ F.T
     whitened = np.linalg.solve(np.linalg.cholesky(Q), errors.T)
     assert abs(whitened.var() - 1.0) < 0.05
-    assert abs((seen - states @ H.T).std() - particles.SEEN) < 0.05 * particles.SEEN
+    assert abs((seen - states @ H.T).std() - bootstrap.SEEN) < 0.05 * bootstrap.SEEN
 
 
 def test_the_import_bench_names_the_heaviest_modules(capsys):

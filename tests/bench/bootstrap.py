@@ -84,9 +84,9 @@ def peer(n: int, steps: int) -> Iterator[Any]:
     covariances = {"covX": Q, "covY": SEEN**2 * np.eye(3), "cov0": START_SPREAD**2 * np.eye(9)}
     model = {name: a.tolist() for name, a in {"F": F, "G": H, "seen": seen, **covariances}.items()}
     command = [str(python), str(HERE.parent / "floor" / "bootstrap.py")]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    pipe = subprocess.PIPE
     one = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # threads that wait would count
-    with subprocess.Popen(command, env=one, **pipes) as process:
+    with subprocess.Popen(command, env=one, stdin=pipe, stdout=pipe, text=True) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         say, hear = process.stdin, process.stdout

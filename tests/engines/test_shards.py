@@ -232,4 +232,4 @@ def test_a_graph_with_a_host_block_shares_no_runs_out():
     """Its runs go one by one, so that there are none to share."""
     with pytest.raises(DeclarationError, match="a run by itself is no runs") as caught:
         simulate_many(hosted.build(), GIVEN, [0], shard={"runs": 1})
-    assert "with host blocks a graph runs one by one" in caught.value.fix
+    assert "with host blocks a graph runs one by one" in str(caught.value.fix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
 
     def run(folder, log, arguments):
         if "--seed" not in arguments:
-            netlist = {"modules": {"tank": {"cells": {}, "ports": {}}}}
+            netlist: dict[str, Any] = {"modules": {"tank": {"cells": {}, "ports": {}}}}
             return (folder / "tank.json").write_text(json.dumps(netlist))
         ran.append(int(arguments[arguments.index("--seed") + 1]))
         clock = clocks[len(ran) - 1]
@@ -81,7 +82,7 @@ def test_the_fastest_of_the_seeds_that_are_tried_is_kept(monkeypatch, tmp_path, 
 
 def block_with(*, outside=(), words=None, first=None, reader=None):
     """A block of which two bits are read at its second port, each with a register behind it, changed."""
-    cells = {
+    cells: dict[str, Any] = {
         "words": {
             "type": "DP16KD",
             "parameters": {"CLKBMUX": "CLKB", "REGMODE_A": "NOREG", "REGMODE_B": "NOREG"},
