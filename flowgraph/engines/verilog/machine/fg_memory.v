@@ -3,8 +3,8 @@
 // before and behind it, and then one block is chosen. The first register behind a block is the block's own.
 //
 // The word lies there 2 cycles after its place, 5 cycles where the memory is DEEP.
-// A word that is written can be read by a place that comes as late as it, of a deep memory one cycle later. In the
-// cycle before nobody may ask for it: a block does not say which word, the old one or the new, it would give.
+// A word that is written can be read by a place that comes a cycle later than it. Nobody may need what lies there
+// in the same cycle: a block of a chip does not say whether it would give the old word or the new.
 module fg_memory #(
     parameter WIDTH = 36,
     parameter PLACE = 12,  // bits of an address
