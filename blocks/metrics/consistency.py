@@ -120,12 +120,14 @@ def _too_often(name: str, innovation: Series) -> tuple[str, ...]:
     refused = judged & ~innovation["accepted"]
     if not refused.any():
         return ()
-    rare = float(gammaincc(0.5 * parts[refused], 0.5 * values[refused]).max())
-    count, usual = int(refused.sum()), rare * float(judged.sum())
-    if gammainc(count, usual) >= CHANCE:  # the chance of as many, where so many are usual
+    rare = np.sort(gammaincc(0.5 * parts[refused], 0.5 * values[refused]))
+    counts, usual = np.arange(1, len(rare) + 1), rare * float(judged.sum())
+    chances = gammainc(counts, usual)  # of as many, where so many are usual
+    k = int(chances.argmin())  # some that are far off are no better for one beside them that is not
+    if len(rare) * chances[k] >= CHANCE:
         return ()
-    front = f"{name}: " if name else ""
-    said = f"{front}{count} of {judged.sum()} measurements; chance has {usual:.2g} as far off"
+    front, some = f"{name}: " if name else "", "" if k + 1 == len(rare) else f" as {k + 1} of them"
+    said = f"{front}{len(rare)} of {judged.sum()} measurements; chance has {usual[k]:.2g} as far off{some}"
     return (note("refused", said),)
 
 
