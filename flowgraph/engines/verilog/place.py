@@ -138,7 +138,7 @@ def take_own_registers(module: dict[str, Any]) -> int:
 def _always_reads(block: dict[str, Any], port: str) -> bool:
     """Whether a port of a block reads at each edge of its clock, without its own register."""
     pins, said = block["connections"], block["parameters"]
-    return (
+    return bool(
         said.get(f"CLK{port}MUX") == f"CLK{port}"
         and said.get(f"REGMODE_{port}") == "NOREG"
         and pins.get(f"CE{port}") == ["1"]
