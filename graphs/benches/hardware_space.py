@@ -180,11 +180,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                         label=f"{said}, {'on the front' if on else 'bettered by another'}",
                     )  # fmt: skip
             for a, b, r in zip(x, y, some, strict=True):
-                panel.annotate(f"{r['width']}", (a, b), textcoords="offset points", xytext=(7, 5), fontsize=9)
+                panel.annotate(
+                    f"{r['width']}", (a, b), textcoords="offset points", xytext=(7, 5 + 11 * k), fontsize=9,
+                    color=f"C{k}",
+                )  # fmt: skip
         panel.set_yscale("log")
         panel.set_xlabel(label)
         panel.grid(alpha=0.3)
-        panel.margins(y=0.12)
+        panel.margins(y=0.2)
         panel.set_xlim(0.0, 1.2 * max((r[column] for r in whole), default=1.0))
     panels[0].set_ylabel("difference to float64, relative")
     if whole:
