@@ -10,7 +10,7 @@ from flowgraph.engines.c.expressions import Expressions
 from flowgraph.engines.c.lines import Lines
 from flowgraph.engines.c.macros import write_macro
 from flowgraph.engines.c.nodes import Buffer, Macro, Node, Space, Store
-from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
+from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat
 from flowgraph.engines.c.syntax import comment, number
 from flowgraph.recorder.ops import FUNCTIONS
 
@@ -138,7 +138,7 @@ class Writer(Lines):
             else:
                 self._compute(item, self.local)
         for node in [n for n in items if isinstance(n, Node) and n in self.plan.spills]:
-            if not self.plan.spills[node].writers:
+            if not self.plan.spills[node].buffer.writers:
                 self.line(f"{self._spilled(node)} = {self.local[node]};")
         for item in late:
             self._store(item)
@@ -215,7 +215,8 @@ class Writer(Lines):
         self.line(f"{self.at(buffer, self.index(item.offset, item.strides))} = {self.stored(item)};")
 
     def _spilled(self, node: Node) -> str:
-        return self.at(self.plan.spills[node], self.index(0, strides_of(node.space)))
+        buffer, offset, strides = self.plan.spills[node]
+        return self.at(self.plan.late.get(buffer, buffer), self.index(offset, strides))
 
     def _copy(self, buffer: Buffer, stand_in: Buffer) -> None:
         """Carry over the places that were written."""
