@@ -171,7 +171,7 @@ class File:
                 roots += places[n].writers
             elif n != cell.read:
                 roots += self._write(expander, self.state[name], values[n])
-        plan = schedule(tape, roots)
+        plan = schedule(tape, roots, blocks=self.writer.blocks)
         work, local = self.memory.placed(plan.span)
         writer = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
         body = writer.body()
@@ -266,7 +266,7 @@ class File:
                 expander.play(i)
         after = values[program.writes[0]]
         place = Buffer(result, "real", math.prod(after.shape), "output")
-        plan = schedule(tape, self._write(expander, place, after))
+        plan = schedule(tape, self._write(expander, place, after), blocks=self.writer.blocks)
         work, local = self.memory.placed(plan.span, whose)
         body = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
         unused = [n for n in ("s", *inputs.values()) if not _names_it("\n".join(body), n)]

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from flowgraph.engines.c.blocks import in_blocks
 from flowgraph.engines.c.nodes import Buffer, Item, Macro, Node, Space, Store, Tape
 from flowgraph.engines.c.values import row_major
 
@@ -40,6 +41,7 @@ class Schedule:
             new value is, or in memory of its own.
         late: state buffers that cannot be written in place, with the work buffer that stands in.
         span: first and last level at which a work buffer is in use.
+        blocks: loops that go block by block, with the product that takes each block.
     """
 
     items: list[Item] = field(default_factory=list)
@@ -47,6 +49,7 @@ class Schedule:
     spills: dict[Node, Place] = field(default_factory=dict)
     late: dict[Buffer, Buffer] = field(default_factory=dict)
     span: dict[Buffer, tuple[int, int]] = field(default_factory=dict)
+    blocks: dict[Group, Macro] = field(default_factory=dict)
     levels: int = 1
 
 
@@ -71,8 +74,8 @@ def group_of(item: Item) -> Group:
     return item.level, () if isinstance(item, Macro) else item.space
 
 
-def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
-    """Order what the roots need."""
+def schedule(tape: Tape, roots: Iterable[Item], *, blocks: bool = False) -> Schedule:
+    """Order what the roots need; with `blocks`, products over many places go with the loops before them."""
     live = _live(roots)
     made = Schedule(sorted(live, key=lambda i: i.order))
     for item in made.items:
@@ -93,6 +96,8 @@ def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
             own = Buffer("", node.dtype, _size(node.space), "work")
             made.spills[node] = kept.get(node) or Place(own, 0, row_major(node.space))
     _write_state(made, users)
+    if blocks:
+        made.blocks = in_blocks(made.items, [place.buffer for place in made.spills.values()])
     _spans(made, users)
     return made
 
