@@ -138,6 +138,20 @@ class NumpyNamespace:
         return np.asarray(x).take(indices, axis, None, mode)
 
     @staticmethod
+    def where(condition: Any, x: Any, y: Any, /) -> Any:
+        """`numpy.where`; of a single condition what is taken, as it lies, whoever asks and however."""
+        if type(condition) is not np.ndarray or not condition.ndim:
+            first, second = type(x) is np.ndarray and x.ndim > 0, type(y) is np.ndarray and y.ndim > 0
+            if first and second:
+                if x.shape == y.shape and x.dtype == y.dtype:
+                    return x if condition else y
+            elif (first and np.ndim(y) == 0) or (second and np.ndim(x) == 0):
+                whole, taken = x if first else y, x if condition else y
+                if np.result_type(x, y) == whole.dtype:
+                    return taken if taken is whole else np.full(whole.shape, taken, whole.dtype)
+        return np.where(condition, x, y)
+
+    @staticmethod
     def float32_bits(x: Any) -> Any:
         """The bits of the IEEE binary32 number nearest to each int32, as int32: octave and leading bits."""
         return np.asarray(x).astype(np.float32).view(np.int32)

@@ -202,7 +202,7 @@ class _Which:
         known = index, id(step)
         if known not in self._texts:
             state = None if call.state is None else self.graph.nodes[call.state].type  # type: ignore[union-attr]
-            made = written(step, [self.type(a) for a in call.arguments], state, index)
+            made = written(step, [self.type(a) for a in call.arguments], state)
             if made is None:
                 return None
             self._texts[known] = made

@@ -103,8 +103,8 @@ class Written:
         constants: as text, by value number.
         lines: in their order.
         numbers: the values that are Python's numbers; all others are NumPy's.
-        names: what the text needs, with the number of the call in them; operations have names by what they
-            do, alike in all calls.
+        names: what the text needs. Operations are named by what they do and arrays by what they are, alike in
+            all steps, and in all variants of one.
         scalars: the values of NumPy's without axes.
         shapes: of the values.
         sites: what is drawn, by the name of the function that gives it at a time.
@@ -124,8 +124,8 @@ def single(type_: ArrayType) -> bool:
     return not type_.shape and type_.dtype in KINDS
 
 
-def written(step: Any, arguments: Sequence[Type | None], state: Type | None, call: int) -> Written | None:
-    """A recorded step as text; None where it has to be called. `call` is its number, for the names."""
+def written(step: Any, arguments: Sequence[Type | None], state: Type | None) -> Written | None:
+    """A recorded step as text; None where it has to be called."""
     if not isinstance(step, StepTrace):
         return None
     trace = step.trace
@@ -138,7 +138,7 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
                 made.numbers.add(n)
     known: dict[int, np.ndarray] = {}
     for n, array in trace.constants.items():
-        _know(n, array, known, kinds, made, call)
+        _know(n, array, known, kinds, made)
     ends = {n for o in step.outputs for n in (*o.leaves, o.presence) if isinstance(n, int)}
     ends |= set(step.next_state)
     wanted = set(ends)
@@ -154,7 +154,7 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
         if whole.out in wanted:
             i = replace(whole, args=tuple(same.get(a, a) for a in whole.args))
             if all(a in known for a in i.args):
-                _know(i.out, np.asarray(evaluate(i, *(known[a] for a in i.args))), known, kinds, made, call)
+                _know(i.out, np.asarray(evaluate(i, *(known[a] for a in i.args))), known, kinds, made)
                 continue
             kinds[i.out], made.shapes[i.out] = i.spec.dtype, tuple(i.spec.shape)
             again = first.setdefault((i.op, i.args, repr(i.attrs), i.spec), i.out)
@@ -169,11 +169,11 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None, cal
                 made.numbers.add(i.out)
             elif not i.spec.shape:
                 made.scalars.add(i.out)
-            elif (chosen := _chosen(i, known, kinds, made, call)) is not None:
+            elif (chosen := _chosen(i, known, kinds, made)) is not None:
                 made.lines.append(chosen)
                 continue
             else:
-                i = _with_arrays(i, kinds, made, call)
+                i = _with_arrays(i, kinds, made)
             made.lines.append(Line(i, form or _array(i, kinds, made)))
     return replace(made, lines=_under(made.lines, ends))
 
@@ -190,7 +190,7 @@ def _drawn(site: Site, n: int, kinds: dict[int, str], made: Written) -> None:
 
 
 def _know(
-    n: int, array: np.ndarray, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written, call: int
+    n: int, array: np.ndarray, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written
 ) -> None:
     """Note a value that is known before the run."""
     known[n], kinds[n], made.shapes[n] = array, dtype_name(array), array.shape
@@ -199,12 +199,18 @@ def _know(
         made.constants[n] = f"({value!r})"
         made.numbers.add(n)
     else:
-        made.constants[n] = f"k{call}_{n}"
-        made.names[made.constants[n]] = array
+        _name(n, array, made)
+
+
+def _name(n: int, array: np.ndarray, made: Written) -> None:
+    """Name a known array by what it is: a number of a value would mean another in a step's other variants."""
+    which = repr((array.dtype.str, array.shape, array.strides)).encode() + array.tobytes()
+    made.constants[n] = f"k_{blake2b(which, digest_size=12).hexdigest()}"
+    made.names[made.constants[n]] = array
 
 
 def _chosen(
-    i: Instruction, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written, call: int
+    i: Instruction, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written
 ) -> Line | None:
     """A selection of whole arrays by a single number: one of them as it is; None where it is another."""
     if i.op != "where" or i.args[0] not in made.numbers:
@@ -214,11 +220,10 @@ def _chosen(
         if kinds[a] != i.spec.dtype:
             return None
         if made.shapes[a] != tuple(i.spec.shape):
-            if a not in known:
+            if a not in known or known[a].shape:
                 return None
             lifted = a + _LIFTED * (i.out + 2)
-            whole = np.broadcast_to(known[a], i.spec.shape).copy()
-            _know(lifted, whole, known, kinds, made, call)
+            _know(lifted, np.full(i.spec.shape, known[a]), known, kinds, made)
             a = lifted
         args.append(a)
     return Line(replace(i, args=tuple(args)), "{1} if {0} else {2}", ([], []))
@@ -272,7 +277,7 @@ def _number(i: Instruction, kinds: dict[int, str]) -> str | None:
     return None if whole is None else f"({whole} + {half}) % {2 * half} - {half}"
 
 
-def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written, call: int) -> Instruction:
+def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written) -> Instruction:
     """The instruction, with arrays of no axes for the Python numbers that an array is combined with: NumPy
     takes twice as long over the others."""
     if i.op not in _ARRAYS or not i.spec.shape:
@@ -282,8 +287,7 @@ def _with_arrays(i: Instruction, kinds: dict[int, str], made: Written, call: int
         if a in made.numbers and kinds[a] == "real":
             lifted = a + _LIFTED
             if a in made.constants:
-                made.constants[lifted] = f"k{call}_{lifted}"
-                made.names[made.constants[lifted]] = np.asarray(ast.literal_eval(made.constants[a]))
+                _name(lifted, np.asarray(ast.literal_eval(made.constants[a])), made)
             elif lifted not in kinds:
                 spec = i.spec._replace(shape=())
                 line = replace(i, op="asarray", args=(a,), attrs={}, out=lifted, spec=spec)
@@ -316,7 +320,9 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written) -> str:
     if i.op == "concat":
         return f"concatenate(({', '.join(places)},), {i.attrs['axis']})"
     called = i.op in _CALLED and not i.attrs
-    if called:
+    if i.op == "where" and made.shapes[i.args[0]]:
+        name, made.names["o_each"] = "o_each", np.where
+    elif called:
         made.names[name] = NUMPY.linalg.vecdot if i.op == "vecdot" else getattr(NUMPY, i.op)
     else:
         made.names[name] = partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, np.float64))
