@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.data.by_name import ByName
 from flowgraph.data.series import Series
-from flowgraph.errors import UnknownNameError
 from flowgraph.types import ArrayType, StructType, dtype_name
 from flowgraph.verbs import verb
 
 
 @dataclass(frozen=True)
-class Runs:
+class Runs(ByName[np.ndarray]):
     """One collected stream of many runs.
 
     Args:
@@ -31,22 +31,8 @@ class Runs:
     present: np.ndarray
     leaves: Mapping[str, np.ndarray]
 
-    def __getitem__(self, leaf: str) -> np.ndarray:
-        if leaf not in self.leaves:
-            raise UnknownNameError("field", leaf, self.leaves, path=self.name)
-        return self.leaves[leaf]
-
-    def __getattr__(self, leaf: str) -> np.ndarray:
-        if leaf.startswith("_") or "leaves" not in self.__dict__:
-            raise AttributeError(leaf)
-        try:
-            return self[leaf]
-        except UnknownNameError as error:
-            raise AttributeError(str(error)) from None
-
-    def __dir__(self) -> list[str]:
-        """The fields are attributes too."""
-        return sorted({*super().__dir__(), *(name for name in self.leaves if name.isidentifier())})
+    def _parts(self) -> tuple[str, Mapping[str, np.ndarray], str]:
+        return "field", self.leaves, self.name
 
     def __repr__(self) -> str:
         runs, count = self.present.shape
@@ -63,7 +49,7 @@ class Runs:
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(ByName[Runs]):
     """The outcome of many runs: `batch.pose.position`, or `batch["pose"]["position"]`, is (runs, n, 3).
 
     Args:
@@ -84,22 +70,8 @@ class Batch:
     wall_s: float
     diverged: Mapping[int, str] = field(default_factory=dict)
 
-    def __getitem__(self, name: str) -> Runs:
-        if name not in self.series:
-            raise UnknownNameError("output", name, self.series, path=self.graph)
-        return self.series[name]
-
-    def __getattr__(self, name: str) -> Runs:
-        if name.startswith("_") or "series" not in self.__dict__:
-            raise AttributeError(name)
-        try:
-            return self[name]
-        except UnknownNameError as error:
-            raise AttributeError(str(error)) from None
-
-    def __dir__(self) -> list[str]:
-        """The streams are attributes too."""
-        return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})
+    def _parts(self) -> tuple[str, Mapping[str, Runs], str]:
+        return "output", self.series, self.graph
 
     def _repr_html_(self) -> str:
         return str(verb("Batch._repr_html_")(self))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flowgraph.data.by_name import ByName
 from flowgraph.data.export.mcap_file import write_mcap
 from flowgraph.data.export.rerun_file import write_rerun
 from flowgraph.data.export.tables import write_parquet
@@ -14,7 +15,7 @@ from flowgraph.data.export.text import write_table
 from flowgraph.data.export.trees import to_xarray
 from flowgraph.data.flight import Flight
 from flowgraph.data.series import Series
-from flowgraph.errors import DeclarationError, UnknownNameError
+from flowgraph.errors import DeclarationError
 from flowgraph.language.graph import Graph
 from flowgraph.verbs import verb
 
@@ -35,7 +36,7 @@ def statistics(graph: Graph, state: Mapping[str, Any]) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class Result:
+class Result(ByName[Series]):
     """The outcome of a run.
 
     Args:
@@ -57,18 +58,8 @@ class Result:
     wall_s: float
     notes: tuple[str, ...] = ()
 
-    def __getitem__(self, name: str) -> Series:
-        if name not in self.series:
-            raise UnknownNameError("output", name, self.series, path=self.graph)
-        return self.series[name]
-
-    def __getattr__(self, name: str) -> Series:
-        if name.startswith("_") or "series" not in self.__dict__:
-            raise AttributeError(name)
-        try:
-            return self[name]
-        except UnknownNameError as error:
-            raise AttributeError(str(error)) from None
+    def _parts(self) -> tuple[str, Mapping[str, Series], str]:
+        return "output", self.series, self.graph
 
     def plot(self, file: str | Path | None = None, *, outputs: list[str] | None = None) -> Any:
         """A matplotlib figure with a panel a field; written to `file` if given."""
@@ -139,10 +130,6 @@ class Result:
 
     def _repr_html_(self) -> str:
         return str(verb("Result._repr_html_")(self))
-
-    def __dir__(self) -> list[str]:
-        """The outputs are attributes too."""
-        return sorted({*super().__dir__(), *(name for name in self.series if name.isidentifier())})
 
     def __repr__(self) -> str:
         return f"<Result of {self.graph} ({self.engine}): {self.ticks} ticks, {', '.join(self.series)}>"

@@ -6,12 +6,13 @@ run gives back. Signals are batch-first: each leaf has the time axis in front.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from flowgraph.data.by_name import ByName
 from flowgraph.data.frames import frame_of, signal_of, stamps_of
 from flowgraph.data.stamps import extreme_steps, from_dates, settled
 from flowgraph.errors import DataError, UnknownNameError
@@ -30,7 +31,7 @@ from flowgraph.types import (
 from flowgraph.verbs import verb
 
 
-class Series:
+class Series(ByName[Any]):
     """`n` values of one signal with their times.
 
     Args:
@@ -224,18 +225,8 @@ class Series:
         stamp = None if self._stamp is None else self._stamp[key]
         return Series(self.time[key], part, type=self.type, name=self.name, gaps=self.gaps, stamp=stamp)
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        try:
-            return self[name]
-        except UnknownNameError as error:
-            raise AttributeError(str(error)) from None
-
-    def __dir__(self) -> list[str]:
-        """The fields are attributes too."""
-        fields = {name.partition(".")[0] for name in self.leaves}
-        return sorted({*super().__dir__(), *(name for name in fields if name.isidentifier())})
+    def _names(self) -> Iterable[str]:
+        return {name.partition(".")[0] for name in self.leaves}
 
     def _repr_html_(self) -> str:
         return str(verb("Series._repr_html_")(self))

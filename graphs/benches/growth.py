@@ -35,7 +35,6 @@ from flowgraph import (
     Scalar,
     Series,
     Stream,
-    UnknownNameError,
     find_graph,
     graph,
     latest,
@@ -47,6 +46,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.flights import simulated
 from flowgraph.data.notes import note
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.endurance import memory
 
 PERIOD_NS, EVERY = 5_000_000, 5
@@ -107,13 +107,10 @@ def growth(
             got=f"{least} to {most} ticks, {least_particles} to {most_particles} particles",
             fix="write least=10000 and most=1000000",
         )  # fmt: skip
-    chosen = engines.split(","), parts.split(",")
-    for what, names, offered in zip(
-        ("engine", "part"), chosen, (list(RANGES), list(RANGES["c"])), strict=True
-    ):
-        for name in names:
-            if name not in offered:
-                raise UnknownNameError(what, name, offered, path=f"growth.{what}s")
+    chosen = (
+        lists.names(engines, RANGES, what="engine", path="growth.engines"),
+        lists.names(parts, RANGES["c"], what="part", path="growth.parts"),
+    )
     begun, busy = perf_counter(), _busy()
     rows: list[dict[str, Any]] = []
     for engine in chosen[0]:

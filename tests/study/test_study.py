@@ -219,12 +219,11 @@ def test_parameters_that_change_shapes_are_grouped():
     assert all({r.key for r in t.runs} <= {r.key for r in o.runs} for t, o in zip(later, made, strict=True))
 
 
-@pytest.mark.slow
 def test_runs_of_several_shapes_are_those_of_one_at_a_time(tmp_path):
     pytest.importorskip("jax")
     study = Study(
-        graphs=["rbpf_indoor"], data=["sim"], seeds=2, engine="xla", chunk=4,
-        parameters={"duration": 1.2, "imu.rate": 50, "particles": [10, 20], "position_noise": [0.01, 0.02]},
+        graphs=["particle"], data=["sim:plane"], seeds=2, engine="xla", chunk=4,
+        parameters={"duration": 1.2, "particles": [10, 20], "position_noise": [0.1, 0.2]},
     )  # fmt: skip
     done = run_study(study, tmp_path)
     assert [r["error"] for r in done.rows] == [None] * 8

@@ -20,6 +20,7 @@ from flowgraph.engines.c.header import port_types, react_signature
 from flowgraph.engines.c.names import given, made, names_of
 from flowgraph.engines.c.syntax import comment
 from flowgraph.engines.verilog.image import Entry, Image
+from flowgraph.engines.verilog.latency import READ_DEEP
 from flowgraph.pipeline.formats import FREE
 from flowgraph.pipeline.pipeline import Leaf
 
@@ -279,7 +280,7 @@ class Driver:
     def _stream(self) -> str:
         name, bits = self.pipeline.name, max(1, len(self.pipeline.inputs))
         return _STREAM.format(name=name, bits=bits, top=bits - 1, place=self.image.place_bits - 1,
-                              places=self.image.place_bits)  # fmt: skip
+                              places=self.image.place_bits, wait=f"4'd{READ_DEEP + 1}")  # fmt: skip
 
     def _host(self, shipped: str) -> str:
         m = self.module
@@ -392,7 +393,7 @@ module {name}_stream (
   wire [35:0] put_word, word;
   wire [31:0] cut;
   fg_stream #(
-      .KEY({bits}), .PLACE({places})
+      .KEY({bits}), .PLACE({places}), .WAIT({wait})
   ) stream (
       .clk(clk), .reset(reset), .s_tdata(s_tdata), .s_tvalid(s_tvalid), .s_tready(s_tready),
       .m_tdata(m_tdata), .m_tvalid(m_tvalid), .m_tready(m_tready), .ready(ready), .start(start), .key(key),

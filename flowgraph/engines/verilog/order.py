@@ -12,20 +12,9 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flowgraph.engines.verilog.latency import AHEAD, DEEP, LATENCY, UNIT_LATENCY
 from flowgraph.engines.verilog.nodes import PAIRED, UNITS, Sum, Term
 from flowgraph.engines.verilog.plan import Plan
-
-LATENCY = 25
-"""Cycles from the microword that writes a word to the first that can read it."""
-
-DEEP = 4
-"""Cycles more where the memory is several blocks deep, or has banks."""
-
-AHEAD = 4
-"""Cycles more until an index can be read: the places of words are worked out before they are read."""
-
-UNIT_LATENCY = {"divide": 49, "root": 49, "logarithm": 197, "angle": 97}
-"""Cycles from the microword that starts a unit to the first that can take what it made."""
 
 COPIES = {"divide": 4, "root": 2, "logarithm": 4, "angle": 2}
 """How many units of a kind there are at most: a unit takes no number before its last result was taken."""
@@ -338,12 +327,8 @@ def _first_lane(node: Sum) -> bool:
 
 
 __all__ = [
-    "AHEAD",
     "ALL",
     "COPIES",
-    "DEEP",
-    "LATENCY",
-    "UNIT_LATENCY",
     "Item",
     "Lanes",
     "Order",

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from flowgraph.engines.verilog.latency import FETCH
 from flowgraph.engines.verilog.nodes import Constant, Held
 from flowgraph.engines.verilog.order import (
     ALL,
-    UNIT_LATENCY,
     Item,
     Lanes,
     Order,
@@ -22,9 +22,6 @@ from flowgraph.engines.verilog.order import (
 )  # fmt: skip
 from flowgraph.engines.verilog.places import bank_of_row, give_places
 from flowgraph.engines.verilog.plan import Plan, Stage
-
-FETCH = 6
-"""Cycles from the number of a step to its microword."""
 
 _LEAST = FETCH + 1
 """Microwords of a loop, since its end is decoded so much earlier."""
@@ -159,7 +156,7 @@ def _words(plan: Plan, stage: Stage, made: Schedule, ready: dict[int, int], held
             idle += 1
             continue
         times = step[0].term.times if step[0] is not None else 0
-        if times and last != times - 1:
+        if times and (last != times - 1 or idle >= _LEAST):  # a wait that is repeated has a head of its own
             last = times - 1
             _wait(made, idle - 1)
             made.words.append(Word(Loop(last)))
@@ -241,6 +238,6 @@ def _round(plan: Plan, stage: Stage, lanes: Lanes, held: Mapping[Held, int]) -> 
 
 
 __all__ = [
-    "FETCH", "UNIT_LATENCY", "Constant", "Held", "Lanes", "Loop", "Plan", "Schedule", "Slot", "Word",
+    "Constant", "Held", "Lanes", "Loop", "Plan", "Schedule", "Slot", "Word",
     "schedule",
 ]  # fmt: skip

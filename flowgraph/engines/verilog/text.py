@@ -7,6 +7,7 @@ from importlib.resources import files
 import numpy as np
 
 from flowgraph.engines.verilog.image import BLOCK, Image
+from flowgraph.engines.verilog.latency import FETCH, READ_DEEP, drained
 from flowgraph.engines.verilog.nodes import UNITS
 from flowgraph.pipeline.formats import FREE
 
@@ -35,7 +36,8 @@ def texts(image: Image) -> dict[str, str]:
         f"{name}_memory", image.memory, image.lanes.banks
     )
     found[f"{name}.lst"] = "\n".join(image.listing) + "\n"
-    found["bench.cpp"] = (shipped / "bench.cpp").read_text().replace("TOP", f"V{name}")
+    bench = (shipped / "bench.cpp").read_text()
+    found["bench.cpp"] = bench.replace("TOP", f"V{name}").replace("READ", str(READ_DEEP))
     found["Makefile"] = _MAKEFILE.format(name=name, modules=" ".join(f"{m}.v" for m in MODULES))
     return found
 
@@ -85,6 +87,7 @@ def _top(image: Image) -> str:
         f"      .PLACE({image.place_bits}), .STEP({image.step_bits}),",
         f"      .WORDS({len(image.memory)}), .STEPS({len(image.program)}),",
         f"      .LANES({image.lanes.count}), .BANKS({image.lanes.banks}), .DEEP({int(image.lanes.deep)}),",
+        f"      .FETCH({FETCH}), .DRAIN({drained(image.has_rows)}),",
         f"      .ROWS({int(image.has_rows)}), .INDICES({max(image.indices, 2)}),",
         f"      .ELEMENT({image.element_bits}),",
         "      "

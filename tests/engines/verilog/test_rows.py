@@ -11,9 +11,10 @@ from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.engines.verilog import simulate as simulation
 from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.latency import FETCH
 from flowgraph.engines.verilog.nodes import Sum
 from flowgraph.engines.verilog.plan import Plan
-from flowgraph.engines.verilog.schedule import FETCH, Lanes, Loop, schedule
+from flowgraph.engines.verilog.schedule import Lanes, Loop, schedule
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.tick import Tick
 from flowgraph.pipeline.format_files import with_formats
@@ -202,6 +203,7 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
         repeated = any(slot is not None and slot.term.times for slot in word.does)
         assert not repeated or sum(slot is not None for slot in word.does) == 1
         times = head.last + 1 if word.repeat or repeated else 1
+        assert not repeated or {times} == {slot.term.times for slot in word.does if slot is not None}
         for lane in range(times):
             for slot in word.does:
                 if slot is None:
@@ -217,6 +219,41 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
             now += 1
         k += 1
     assert now == found.cycles
+
+
+@block
+def twice_read(cloud: Cloud, z: Scalar, *, xp) -> Scalar:
+    """A sum along a row that waits for another of as many terms, and for nothing else."""
+    first = cloud.place[0] @ cloud.weight
+    return z + cloud.weight @ xp.broadcast_to(first, (N,))
+
+
+@graph
+def waits(z: Stream[Scalar]):
+    cloud = delay(start(), name="cloud")
+    cloud.feed(moved(cloud, z, at=z))
+    return {"sum": twice_read(cloud, z)}
+
+
+def test_a_term_is_repeated_as_often_as_it_says_behind_a_wait_that_is_repeated():
+    built = waits.build()
+    inputs = {"z": (np.arange(9, dtype=np.int64) * MS, np.linspace(0.2, 1.4, 9))}
+    subject = LoweredGraph(built)
+    pipeline = with_formats(subject.pipeline, sizes_of(built, inputs).formats(28, 2.0))
+    found = schedule(plan_of((built, pipeline, subject.tape(inputs))), rows=True)
+    terms, waiting = 0, False
+    head = Loop(-1)
+    for word in found.words:
+        if isinstance(word.does, Loop):
+            head = word.does
+            continue
+        for slot in word.does:
+            if slot is not None and slot.term.times:
+                assert slot.term.times == head.last + 1
+                terms += 1
+        waiting |= word.repeat and not word.does
+    assert terms > 2
+    assert waiting
 
 
 def test_where_nothing_is_a_row_the_machine_has_none():

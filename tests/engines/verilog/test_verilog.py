@@ -30,8 +30,9 @@ from flowgraph.engines.verilog import ENGINE as VERILOG
 from flowgraph.engines.verilog import simulate as simulation
 from flowgraph.engines.verilog.bounds import most_of, need_room
 from flowgraph.engines.verilog.image import Image
+from flowgraph.engines.verilog.latency import UNIT_LATENCY
 from flowgraph.engines.verilog.nodes import Constant, Held, Nodes, Sum, Term, shifted
-from flowgraph.engines.verilog.schedule import UNIT_LATENCY, Lanes, Plan, schedule
+from flowgraph.engines.verilog.schedule import Lanes, Plan, schedule
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.text import texts
 from flowgraph.engines.verilog.tick import Tick

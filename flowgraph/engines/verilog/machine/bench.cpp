@@ -25,7 +25,7 @@ static void tick() {
 
 static int64_t read_word(unsigned place) {
   top->at = place;
-  for (int k = 0; k < 6; ++k) tick();
+  for (int k = 0; k < READ; ++k) tick();
   return (int64_t)((uint64_t)top->word << 28) >> 28;
 }
 

@@ -2,7 +2,7 @@
 //
 // Each microword holds for each lane a term of a sum: two words of the memory, what is made of them (`kind`), a
 // shift, a sign. The last term of a sum (`mode` is not 0) shifts the whole, cuts it to a word and writes it. One term
-// a cycle and lane; a word can be read by the microword LATENCY after that which writes it. With ROWS a loop of the
+// a cycle and lane; a word can be read by the microword LATENCY after that which writes it (`latency.py`). With ROWS a loop of the
 // program goes over the elements of rows, a term is repeated for each of them, and a row is read at a place that was
 // computed. Quotients, roots, logarithms and angles are made beside, in units that are started by a sum and asked by
 // a term.
@@ -16,6 +16,8 @@ module fg_machine #(
     parameter STEP = 12,  // bits of an address of the program
     parameter WORDS = 2048,
     parameter STEPS = 4096,
+    parameter FETCH = 0,  // registers from the number of a step to its microword: as NAME.v says
+    parameter DRAIN = 0,  // cycles until all is written that the last microword has begun: likewise
     parameter LANES = 1,
     parameter BANKS = 1,  // words that are written in a cycle, at most
     parameter DEEP = 0,  // whether the memory has several blocks
@@ -46,9 +48,7 @@ module fg_machine #(
   localparam CODE = LANES * LANE + (ROWS != 0 ? 6 : 1);
   localparam D = 31, B = 31 + PLACE, A = 31 + 2 * PLACE;
   localparam HALT = LANES * LANE;
-  localparam AHEAD = ROWS != 0 ? 4 : 0;
   localparam LATER = DEEP != 0 ? 3 : 0;  // registers more until a word is read
-  localparam FETCH = 6;  // registers from the number of a step to its microword
 
   // -- the program ------------------------------------------------------------------------------------------
   wire [CODE-1:0] arrived, fetched;
@@ -104,7 +104,7 @@ module fg_machine #(
     end else if (start && ready) begin
       running <= 1'b1;
       step <= from;
-      draining <= 6'd32 + AHEAD;
+      draining <= DRAIN[5:0];
     end else if (running) begin
       if (go) step <= jump ? back : step + 1'b1;
       if (halts) begin
@@ -152,7 +152,7 @@ module fg_machine #(
           second_last <= code[A+:ELEMENT] == code[B+:ELEMENT];
           one <= code[A+:ELEMENT] == {ELEMENT{1'b0}};
           two <= code[A+:ELEMENT] == code[B+:ELEMENT];
-          begins <= step - {{STEP-3{1'b0}}, 3'd5};  // FETCH - 1
+          begins <= step - FETCH[STEP-1:0] + 1'b1;
         end else if (advances) begin
           first <= at_last ? {ELEMENT{1'b0}} : second;
           second <= at_last ? by : third;
@@ -178,6 +178,9 @@ module fg_machine #(
         code2 <= code1;
         first2 <= first1;
         index_read <= index_[index_place];
+`ifdef VERILATOR
+        if (write_index && index_to[INDEX_BITS-1:0] == index_place) index_read <= ~index_[index_place];  // as of the memory
+`endif
         code3 <= code2;
         first3 <= first2;
         index3 <= index_read;

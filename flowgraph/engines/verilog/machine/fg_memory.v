@@ -4,7 +4,8 @@
 //
 // The word lies there 2 cycles after its place, 5 cycles where the memory is DEEP.
 // A word that is written can be read by a place that comes a cycle later than it. Nobody may need what lies there
-// in the same cycle: a block of a chip does not say whether it would give the old word or the new.
+// in the same cycle: a block of a chip does not say whether it would give the old word or the new. In Verilator it
+// gives a wrong one, so that a program that needs it is seen.
 module fg_memory #(
     parameter WIDTH = 36,
     parameter PLACE = 12,  // bits of an address
@@ -70,25 +71,44 @@ module fg_memory #(
         assign at = place[LOW+:IN];
         assign found[k*WIDTH+:WIDTH] = own;
       end
+      // verilator lint_off UNUSEDSIGNAL
+      wire here;
+      wire [IN-1:0] into;
+      wire [WIDTH-1:0] given;
+      // verilator lint_on UNUSEDSIGNAL
       always @(posedge clk) begin
         read <= words[at];
+`ifdef VERILATOR
+        if (here && into == at) read <= ~words[at];
+`endif
         own <= read;
       end
-      if (READS == 0 && DEEP != 0) begin : deep_write
-        reg here;
+      if (READS == 0) begin : written_to
+        always @(posedge clk) if (here) words[into] <= given;
+      end
+      if (READS != 0) begin : never_written
+        assign here = 1'b0;
+        assign into = {IN{1'b0}};
+        assign given = {WIDTH{1'b0}};
+      end else if (DEEP != 0) begin : deep_write
+        reg mine;
         reg [IN-1:0] near;
-        reg [WIDTH-1:0] given;
+        reg [WIDTH-1:0] came;
         wire [PICK-1:0] chosen = block_of(to[k%BANKS*PLACE+:PLACE]);
         always @(posedge clk) begin
-          here <= write[k%BANKS] && chosen == k[PICK-1:0];
+          mine <= write[k%BANKS] && chosen == k[PICK-1:0];
           if (chosen == k[PICK-1:0]) begin
             near <= to[k%BANKS*PLACE+LOW+:IN];
-            given <= written[k%BANKS*WIDTH+:WIDTH];
+            came <= written[k%BANKS*WIDTH+:WIDTH];
           end
-          if (here) words[near] <= given;
         end
-      end else if (READS == 0) begin : shallow_write
-        always @(posedge clk) if (write[0]) words[to[IN-1:0]] <= written;
+        assign here = mine;
+        assign into = near;
+        assign given = came;
+      end else begin : shallow_write
+        assign here = write[0];
+        assign into = to[IN-1:0];
+        assign given = written;
       end
     end
     if (DEEP != 0) begin : choice

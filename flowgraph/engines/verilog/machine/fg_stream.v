@@ -10,7 +10,7 @@
 module fg_stream #(
     parameter KEY = 1,  // bits of a pattern of present inputs
     parameter PLACE = 12,  // bits of an address of the memory
-    parameter [3:0] WAIT = 4'd8  // cycles from an address to its word, or more
+    parameter [3:0] WAIT = 4'd0  // cycles from a command to the word that it asks for, or more: as NAME_stream.v says
 ) (
     input wire clk,
     input wire reset,
