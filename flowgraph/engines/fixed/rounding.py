@@ -18,8 +18,9 @@ from flowgraph.pipeline.formats import FREE
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.trace import Instruction
 
-_SAMPLES = 6
-"""Ticks of each pattern of present inputs that are looked at: the first, the last and some between."""
+_SAMPLES, _EARLY = 5, 7
+"""Ticks of each pattern of present inputs that are looked at: some from the first to the last at equal
+distances, and some more at the start, where a filter finds its biases and its gains are large."""
 
 _WINDOWS = 3
 """Stretches over which what a register does is followed."""
@@ -119,7 +120,10 @@ def _sampled(flight: Recorded) -> tuple[list[Step], list[tuple[int, list[Any]]]]
     for key in np.unique(keys):
         at = np.flatnonzero(keys == key)
         rarest = at if not rarest.size or at.size < rarest.size else rarest
-        chosen.update(at[np.unique(np.linspace(0, at.size - 1, _SAMPLES).astype(int))].tolist())
+        places = np.concatenate(
+            [np.linspace(0, at.size - 1, _SAMPLES), np.geomspace(1, at.size, _EARLY) - 1.0]
+        )
+        chosen.update(at[np.unique(places.astype(int))].tolist())
     begun = rarest[np.unique(np.linspace(0, max(rarest.size - 2, 0), _WINDOWS).astype(int))].tolist()
     steps, after = [], []
     for n, step in enumerate(abreast([flight])):
