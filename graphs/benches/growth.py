@@ -338,7 +338,7 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     for k, ((of, _), title) in enumerate(zip(columns, titles, strict=True)):
         panels[0, k].set_title(title, fontsize=10)
         panels[1, k].set_xlabel(of)
-        for panel in panels[:, k]:
+        for panel in (p for p in panels[:, k] if p.lines):
             (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
             linear = [top * low / high, top]  # to the upper corner: what is steeper is not linear
             panel.loglog([low, high], linear, color="0.75", linewidth=1.0, zorder=0, label="linear")

@@ -15,7 +15,7 @@ from flowgraph.engines.c.nodes import Buffer, Item, Macro, Node, Space, Store, V
 
 BLOCK = 120
 """Particles to a block: what they fill stays in a processor's own cache. No power of two, by which rows of a
-factor would push each other out: with 512, all of the filter took a fifth longer."""
+factor would push each other out: with 512, all of the filter took a quarter longer."""
 _LEAST_ROWS, _MOST_COLUMNS = 4, 32
 """Of a product that is summed in vectors, with room on the stack for the factors of a block."""
 

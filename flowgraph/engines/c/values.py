@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.engines.c.constants import without_repeats
+from flowgraph.engines.c.constants import WRITTEN, without_repeats
 from flowgraph.engines.c.nodes import Buffer, Node, Space, Tape, View
 from flowgraph.recorder.ops import Spec
 
@@ -143,8 +143,8 @@ class Values:
         view = self.stored(v)
         if _same_strides(view, wanted):
             return View(view.buffer, v.shape, view.offset, wanted)
-        if view.buffer.kind == "const":
-            return self._in_work(v)
+        if view.buffer.kind == "const" and math.prod(v.shape) > WRITTEN:
+            return self._in_work(v)  # it was kept without what repeats
         return self.put(Value(v.spec, self.elements(v)), wanted)
 
     def own(self, v: Value) -> View:
