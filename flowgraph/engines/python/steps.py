@@ -79,7 +79,8 @@ _REDUCED = {
     "any": np.logical_or.reduce, "all": np.logical_and.reduce,
 }  # fmt: skip
 _LIFTED = 1_000_000  # added to the number of a value, for the same as an array
-_CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | {"vecdot"}
+_LINEAR = {"vecdot", "cholesky", "solve"}
+_CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | _LINEAR
 
 
 @dataclass(frozen=True)
@@ -323,7 +324,7 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written) -> str:
     if i.op == "where" and made.shapes[i.args[0]]:
         name, made.names["o_each"] = "o_each", np.where
     elif called:
-        made.names[name] = NUMPY.linalg.vecdot if i.op == "vecdot" else getattr(NUMPY, i.op)
+        made.names[name] = getattr(NUMPY.linalg if i.op in _LINEAR else NUMPY, i.op)
     else:
         made.names[name] = partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, np.float64))
     given = [
