@@ -16,9 +16,9 @@ part of NumPy's interface: where it is missing, the wrappers are called."""
 _DOUBLE = np.dtype(np.float64)
 
 
-def _direct(*matrices: Any) -> bool:
-    """Whether LAPACK can be called without the wrapper, which would do nothing but hand these on."""
-    return _LAPACK is not None and all(type(m) is np.ndarray and m.dtype == _DOUBLE for m in matrices)
+def _direct(x: Any) -> bool:
+    """Whether LAPACK can be called without the wrapper, which would do nothing but hand this on."""
+    return _LAPACK is not None and type(x) is np.ndarray and x.dtype == _DOUBLE
 
 
 class _LinearAlgebra:
@@ -40,7 +40,7 @@ class _LinearAlgebra:
     @staticmethod
     def solve(a: Any, b: Any, /) -> Any:
         """`numpy.linalg.solve`; NaN where a matrix is singular."""
-        if _direct(a, b):
+        if _direct(a) and _direct(b):
             with np.errstate(all="ignore"):
                 return (_LAPACK.solve1 if b.ndim == 1 else _LAPACK.solve)(a, b)
         try:

@@ -214,7 +214,7 @@ def _chosen(
     i: Instruction, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written
 ) -> Line | None:
     """A selection of whole arrays by a single number: one of them as it is; None where it is another."""
-    if i.op != "where" or i.args[0] not in made.numbers:
+    if i.op != "where" or made.shapes[i.args[0]]:
         return None
     args = [i.args[0]]
     for a in i.args[1:]:
