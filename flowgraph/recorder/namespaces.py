@@ -157,7 +157,7 @@ class NumpyNamespace:
     @staticmethod
     def where(condition: Any, x: Any, y: Any, /) -> Any:
         """`numpy.where`; of a single condition what is taken, as it lies, whoever asks and however."""
-        if type(condition) is not np.ndarray or not condition.ndim:
+        if not (condition.ndim if type(condition) is np.ndarray else np.ndim(condition)):
             first, second = type(x) is np.ndarray and x.ndim > 0, type(y) is np.ndarray and y.ndim > 0
             if first and second:
                 if x.shape == y.shape and x.dtype == y.dtype:

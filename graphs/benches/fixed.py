@@ -24,7 +24,8 @@ from flowgraph.language.checks import need_count
 from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.plain import plain
 from flowgraph.recorder.random import seed_words
-from flowgraph.study.quantise import MARGIN, RELATIVE, Flown, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import MARGIN, Flown, quantise
 
 __all__ = ["FLIGHTS", "fixed", "flown"]
 

@@ -27,7 +27,8 @@ from flowgraph.graphs.benches.fixed import flown
 from flowgraph.graphs.benches.hardware_space import design_space, taped
 from flowgraph.language.checks import need_count
 from flowgraph.recorder.random import seed_words
-from flowgraph.study.quantise import RELATIVE, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import quantise
 
 __all__ = ["hardware"]
 

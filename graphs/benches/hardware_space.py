@@ -23,7 +23,8 @@ from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.place import TARGET_HZ, route, synthesise
 from flowgraph.engines.verilog.text import texts
 from flowgraph.graphs.benches.fixed import flown
-from flowgraph.study.quantise import RELATIVE, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import quantise
 
 __all__ = ["design_space", "draw", "fronted", "taped"]
 

@@ -25,7 +25,8 @@ from flowgraph.engines.c.names import given, made
 from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fixed import FLIGHTS
 from flowgraph.pipeline.optimise import COMPILED, optimise
-from flowgraph.study.quantise import RELATIVE, Flown, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import Flown, quantise
 
 __all__ = ["microcontroller"]
 

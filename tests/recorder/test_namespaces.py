@@ -98,7 +98,9 @@ def test_factors_are_those_of_numpy_and_nan_where_it_refuses(monkeypatch, direct
             assert np.isnan(NUMPY.linalg.solve(bad, b[:, 0])).all()
 
 
-@pytest.mark.parametrize("condition", [True, np.False_, np.array(True), np.array([True, False, True])])
+@pytest.mark.parametrize(
+    "condition", [True, np.False_, np.array(True), np.array([True, False, True]), [True, False, True]]
+)
 def test_a_selection_is_that_of_numpy(condition):
     whole = np.arange(12.0).reshape(4, 3)
     turned = whole.mT

@@ -13,7 +13,7 @@ from flowgraph.engines.verilog.image import memories
 from flowgraph.engines.verilog.toggles import counted
 from flowgraph.graphs.benches.hardware import hardware
 from flowgraph.graphs.benches.hardware_space import draw, fronted
-from flowgraph.study.quantise import RELATIVE
+from flowgraph.study.differences import RELATIVE
 from tests.engines.verilog.test_verilog import need_verilator
 
 
