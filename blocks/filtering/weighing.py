@@ -84,10 +84,10 @@ def log_density(residual: Array, R: Array, present: Array, xp: Any) -> Array:
     """The logarithm (n) of the density of N(0, R) at each residual (n, m), of the entries present."""
     L = xp.linalg.cholesky(R)
     white = xp.linalg.solve(L, residual[..., None])[..., 0] if len(R.shape) == 3 else None
-    white = xp.linalg.solve(L, residual.mT).mT if white is None else white
+    white = residual @ xp.linalg.solve(L, xp.eye(R.shape[-1], dtype=R.dtype)).mT if white is None else white
     determinant = 2.0 * xp.sum(xp.log(xp.sum(L * xp.eye(R.shape[-1], dtype=R.dtype), axis=-1)), axis=-1)
     parts = xp.sum(xp.astype(present, residual.dtype))
-    return -0.5 * (xp.sum(white * white, axis=-1) + determinant + math.log(2.0 * math.pi) * parts)
+    return -0.5 * (xp.linalg.vecdot(white, white) + determinant + math.log(2.0 * math.pi) * parts)
 
 
 def likelihoods(x: Array, message: Any, measurement: Measurement, xp: Any) -> Array:

@@ -328,7 +328,7 @@ class StateSpace:
         return xp.concat([j if found is None else found @ j for found, j in parts], axis=-2)
 
     def mean(self, points: Array, weights: Array, xp: Any, *, rounds: int = 8) -> Array:
-        """The weighted mean (..., size) of points (..., n, size); weights (n) add up to 1.
+        """The weighted mean (..., size) of points (..., n, size); weights (n) or (..., n) add up to 1.
 
         Starts from the first point and moves, `rounds` times, by the weighted mean of the differences; on
         vectors once is exact. The points should lie within half a turn of each other.
@@ -336,7 +336,7 @@ class StateSpace:
         middle = points[..., 0, :]
         for _ in range(1 if self._flat else rounds):
             apart = self.minus(points, middle[..., None, :], xp)
-            middle = self.plus(middle, xp.sum(apart * weights[..., :, None], axis=-2), xp)
+            middle = self.plus(middle, (weights[..., None, :] @ apart)[..., 0, :], xp)
         return middle
 
     def reset(self, d: Array, xp: Any) -> Array | None:

@@ -200,7 +200,8 @@ class LinearMeasurement(Measurement):
         return xp.asarray(given, dtype=kind)
 
     def seen(self, x: Array, v: Array | None, message: Any, xp: Any) -> Array:
-        return (self._matrix(message, x.dtype, xp) @ x[..., None])[..., 0]
+        H = self._matrix(message, x.dtype, xp)
+        return (H @ x[..., None])[..., 0] if len(x.shape) == 1 else x @ H.mT  # many in one product
 
     def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
         return self._noise.matrix(message, kind, xp, m)

@@ -204,11 +204,14 @@ class DiscreteModel:
 
     def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
         F, pushed, _ = self._step(control, dt, x.dtype, xp)
-        d = (x @ F.mT) - x if w is None else (x @ F.mT) - x + w
-        return self.space.plus(x, d if pushed is None else d + pushed, xp)
+        after = x @ F.mT
+        after = after if w is None else after + w
+        after = after if pushed is None else after + pushed
+        return after if self.space.flat else self.space.plus(x, after - x, xp)
 
     def noise_root(self, control: Any, dt: Any, kind: Any, xp: Any) -> Array | None:
-        return semidefinite_root(self._step(control, dt, kind, xp)[2], xp=xp)
+        root = semidefinite_root(self._Q.matrix(control, kind, xp), xp=xp)  # of no step's it is 0
+        return xp.where(xp.asarray(dt, dtype=kind) > 0.0, root, 0.0)
 
     def linearised(self, x: Array, control: Any, dt: Any, xp: Any) -> tuple[Array, Array, Array | None]:
         F, pushed, Q = self._step(control, dt, x.dtype, xp)

@@ -37,6 +37,12 @@ def quantise(
     held_width: Annotated[
         int, typer.Option(help="Bits of inputs, registers and what is added up in them, where they are more.")
     ] = 0,
+    widen: Annotated[
+        int,
+        typer.Option(
+            help="Bits of as few other values as keep the bounds, where --width is too few for all."
+        ),
+    ] = 0,
     least: Annotated[int, typer.Option(help="Bits below which none is tried.")] = 8,
     bound: Annotated[
         list[str] | None,
@@ -84,7 +90,7 @@ def quantise(
     held_out = flown(*others, first_seed + seeds, held_out_seeds)
     found = search(
         flown(data, given, first_seed, seeds), held_out, width=width, bounds=bounds, margin=margin,
-        least=least, say=say, held_width=held_width,
+        least=least, say=say, held_width=held_width, widen=widen,
     )  # fmt: skip
     report = {
         "graph": graph, "data": data, "settings": given, "seeds": seeds, "held_out_seeds": held_out_seeds,

@@ -18,7 +18,7 @@ def formats_by_path(pipeline: Pipeline) -> dict[str, str]:
     formats = pipeline.formats
     if formats is None:
         return {}
-    found = {"": f"words of {formats.width} bits" + f", held ones {formats.held_width}" * bool(formats.held)}
+    found = {"": f"words of {formats.width} bits" + wider_words(formats)}
     for port in pipeline.inputs:
         found[port.name] = _words(formats, (leaf.value for leaf in port.leaves))
     for stage in pipeline.stages:
@@ -26,6 +26,12 @@ def formats_by_path(pipeline: Pipeline) -> dict[str, str]:
     for register in pipeline.registers:
         found[register.path] = _words(formats, (c.read for c in register.cells))
     return {path: words for path, words in found.items() if words}
+
+
+def wider_words(formats: Formats) -> str:
+    """How many values have wider words, by bits: ", 97 values of 32, 337 of 44"; empty where none has."""
+    rows = [f"{len(values)} of {bits}" for bits, values in formats.by_width().items()]
+    return f", wider ones: {', '.join(rows)}" if rows else ""
 
 
 def _words(formats: Formats, values: Iterable[int]) -> str:

@@ -1,10 +1,11 @@
 """Number formats: how each real value of a pipeline is kept as a whole number.
 
 A value x is kept as the whole number nearest to x 2^f. All words have one width, sign included, but for
-those of registers and of what is added up in them, which may be wider: what is held gathers the rounding of
-many ticks, and an adder costs less than a multiplier. A product takes no more than the upper 32 bits of one.
-The fraction f is chosen for each element from the
-largest size that the element takes, since the entries of one covariance differ by many powers of ten.
+those that are said to be wider: registers and what is added up in them, since what is held gathers the
+rounding of many ticks and an adder costs less than a multiplier; and values whose rounding moves most what a
+filter is judged by. A product takes no more than the upper 32 bits of one. The fraction f is chosen for each
+element from the largest size that the element takes, since the entries of one covariance differ by many
+powers of ten.
 Elements along an axis of particles share one. Values that are only moved (an element, a row, a transpose)
 keep the formats that they had.
 """
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ NARROWEST, WIDEST = 8, 32
 """Bits of a word: two of the widest, multiplied, fit 64."""
 
 WIDEST_HELD = 48
-"""Bits of a word that is held: it is added and compared as it is, and multiplied by its upper `WIDEST`."""
+"""Bits of a word that is wider: it is added and compared as it is, and multiplied by its upper `WIDEST`."""
 
 FREE = 1 << 20
 """The fraction of a constant zero, which has every format."""
@@ -48,8 +49,7 @@ class Formats:
         margin: by how much the sizes were widened that the fractions were chosen from.
         absent: the inputs and registers that may be NaN: readings that are not there.
         structure: a digest of the plain pipeline that they are for; empty where nobody asks.
-        held: the inputs, registers and values that are kept in wider words.
-        held_width: bits of those; 0 where there are none.
+        wider: bits of the inputs, registers and values that are kept in wider words.
         proven: the values whose size is proven; that of the others was seen on flights.
 
     Raises:
@@ -61,17 +61,15 @@ class Formats:
     margin: float = 1.0
     absent: frozenset[int] = frozenset()
     structure: str = ""
-    held: frozenset[int] = frozenset()
-    held_width: int = 0
+    wider: Mapping[int, int] = field(default_factory=dict)
     proven: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
-        wide = self.held_width or self.width
-        for name, width, least, most in (
-            ("width", self.width, NARROWEST, WIDEST),
-            ("held_width", wide, self.width, WIDEST_HELD),
+        for name, widths, least, most in (
+            ("width", (self.width,), NARROWEST, WIDEST),
+            ("wider", sorted(set(self.wider.values())), self.width, WIDEST_HELD),
         ):
-            if not least <= width <= most:
+            for width in (w for w in widths if not least <= w <= most):
                 raise DeclarationError(
                     "no word has this width",
                     path=name,
@@ -82,10 +80,23 @@ class Formats:
 
     def width_of(self, value: int) -> int:
         """Bits of the words of a value that is no move of another."""
-        return self.held_width if value in self.held else self.width
+        return self.wider.get(value, self.width)
+
+    @property
+    def widest(self) -> int:
+        """Bits of the widest words."""
+        return max(self.wider.values(), default=self.width)
+
+    def by_width(self) -> dict[int, list[int]]:
+        """The values that have wider words, by bits."""
+        found: dict[int, list[int]] = {}
+        for value, bits in sorted(self.wider.items(), key=lambda one: (one[1], one[0])):
+            found.setdefault(bits, []).append(value)
+        return found
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
+        wider = [{"width": bits, "values": values} for bits, values in self.by_width().items()]
         return {
             "width": self.width,
             "rounding": "nearest, half up",
@@ -94,7 +105,7 @@ class Formats:
             "absent": sorted(self.absent),
             "structure": self.structure,
             **({"proven": sorted(self.proven)} if self.proven else {}),
-            **({"held": {"width": self.held_width, "values": sorted(self.held)}} if self.held else {}),
+            **({"held": wider} if wider else {}),
             "fractions": [
                 {"value": n, "fraction": np.asarray(f).tolist()} for n, f in sorted(self.fractions.items())
             ],
@@ -116,15 +127,15 @@ class Formats:
             if found.dtype.kind != "i":
                 raise ValueError(f"the fraction of value {one['value']} is no array of integers")
             fractions[int(one["value"])] = found.astype(np.int64)
-        held = data.get("held", {"width": 0, "values": []})
+        wider = data.get("held", [])
+        wider = [wider] if isinstance(wider, Mapping) else wider  # as it was while there was one width
         return cls(
             int(data["width"]),
             fractions,
             float(data["margin"]),
             frozenset(map(int, data["absent"])),
             str(data["structure"]),
-            frozenset(map(int, held["values"])),
-            int(held["width"]),
+            {int(n): int(some["width"]) for some in wider for n in some["values"]},
             frozenset(map(int, data.get("proven", ()))),
         )
 

@@ -96,6 +96,26 @@ class NumpyNamespace:
         return np.add.reduce(x, axis, dtype, None, keepdims)  # type: ignore[call-overload]
 
     @staticmethod
+    def max(x: Any, /, *, axis: Any = None, keepdims: bool = False) -> Any:
+        """`numpy.max`."""
+        return np.maximum.reduce(x, axis, None, None, keepdims)  # type: ignore[call-overload]
+
+    @staticmethod
+    def min(x: Any, /, *, axis: Any = None, keepdims: bool = False) -> Any:
+        """`numpy.min`."""
+        return np.minimum.reduce(x, axis, None, None, keepdims)  # type: ignore[call-overload]
+
+    @staticmethod
+    def any(x: Any, /, *, axis: Any = None, keepdims: bool = False) -> Any:
+        """`numpy.any`."""
+        return np.logical_or.reduce(x, axis, None, None, keepdims)  # type: ignore[call-overload]
+
+    @staticmethod
+    def all(x: Any, /, *, axis: Any = None, keepdims: bool = False) -> Any:
+        """`numpy.all`."""
+        return np.logical_and.reduce(x, axis, None, None, keepdims)  # type: ignore[call-overload]
+
+    @staticmethod
     def cumulative_sum(x: Any, /, *, axis: int | None = None, dtype: Any = None, **more: Any) -> Any:
         """`numpy.cumulative_sum`."""
         if type(x) is np.ndarray and not more and (axis is not None or x.ndim == 1):
@@ -115,7 +135,21 @@ class NumpyNamespace:
     @staticmethod
     def take(x: Any, indices: Any, /, *, axis: int = 0, mode: Any = "clip") -> Any:
         """`numpy.take`; an index outside is brought to the nearest end, as in a pipeline."""
-        return np.take(x, indices, axis=axis, mode=mode)
+        return np.asarray(x).take(indices, axis, None, mode)
+
+    @staticmethod
+    def where(condition: Any, x: Any, y: Any, /) -> Any:
+        """`numpy.where`; of a single condition what is taken, as it lies, whoever asks and however."""
+        if not (condition.ndim if type(condition) is np.ndarray else np.ndim(condition)):
+            first, second = type(x) is np.ndarray and x.ndim > 0, type(y) is np.ndarray and y.ndim > 0
+            if first and second:
+                if x.shape == y.shape and x.dtype == y.dtype:
+                    return x if condition else y
+            elif (first and np.ndim(y) == 0) or (second and np.ndim(x) == 0):
+                whole, taken = x if first else y, x if condition else y
+                if np.result_type(x, y) == whole.dtype:
+                    return taken if taken is whole else np.full(whole.shape, taken, whole.dtype)
+        return np.where(condition, x, y)
 
     @staticmethod
     def float32_bits(x: Any) -> Any:

@@ -1,9 +1,9 @@
 """The random words and normal numbers of `random`, in NumPy with few passes, or in Python for a few.
 
 The same integers, step by step. A product of 32 bits by 32 is written once as 64, and its halves are read as
-views; each round then is one product and two exclusive ors. The segment of a normal number is found in one
-table that holds start and fall side by side. A few words are made with Python's integers, since each pass
-over a short array costs as much as all of its arithmetic.
+views; each round then is one product and two exclusive ors, with the next key mixed into the low half. The
+segment of a normal number is found in one table that holds start and fall side by side. A few words are made
+with Python's integers, since each pass over a short array costs as much as all of its arithmetic.
 """
 
 from __future__ import annotations
@@ -49,16 +49,17 @@ def words_at(count: int, name: int, times: np.ndarray, seed: np.ndarray, rounds:
 
 def _mixed(even: np.ndarray, odd: np.ndarray, seed: np.ndarray, rounds: int) -> np.ndarray:
     """The words (4 n) of n counters: even (2, n) is written over, odd (2, n), or (2, 1) for all."""
-    n, key = even.shape[1], (int(seed[0]), int(seed[1]))
-    products = np.empty((2, n), np.uint64)
-    halves = products.view(np.uint32).reshape(2, n, 2)
-    for r in range(rounds):
+    n, keys = even.shape[1], _key_columns(*seed.tolist(), rounds)
+    products, mixed, odd = np.empty((2, n), np.uint64), np.empty((2, n), np.uint32), odd ^ keys[0]
+    halves = products.view(np.uint32).reshape(2, n, 2)[::-1]
+    high, low = halves[:, :, _HIGH], halves[:, :, _LOW]
+    for key in keys[1:]:
         np.multiply(even, COLUMN, out=products)
-        np.bitwise_xor(halves[::-1, :, _HIGH], odd, out=even)
-        even ^= np.array([[(key[0] + WEYL[0] * r) & _WORD], [(key[1] + WEYL[1] * r) & _WORD]], np.uint32)
-        if r + 1 < rounds:
-            odd = halves[::-1, :, _LOW].copy()
-    return np.concatenate([even, halves[::-1, :, _LOW]]).reshape(4 * n)
+        np.bitwise_xor(high, odd, out=even)
+        odd = np.bitwise_xor(low, key, out=mixed)
+    np.multiply(even, COLUMN, out=products)
+    np.bitwise_xor(high, odd, out=even)
+    return np.concatenate([even, low]).reshape(4 * n)
 
 
 def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> list[int]:
@@ -74,6 +75,12 @@ def few_words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -
 def _keys(k: int, q: int, rounds: int) -> list[tuple[int, int]]:
     """The keys of each round."""
     return [((k + WEYL[0] * r) & _WORD, (q + WEYL[1] * r) & _WORD) for r in range(rounds)]
+
+
+@lru_cache
+def _key_columns(k: int, q: int, rounds: int) -> np.ndarray:
+    """The keys of each round (rounds, 2, 1)."""
+    return np.array(_keys(k, q, rounds), np.uint32)[:, :, None]
 
 
 def _one(

@@ -4,7 +4,8 @@ The sizes of all values are taken from flights in floating point and widened by 
 is then tried in integers, on the flights of the sizes first: what saturates there is rounding that floating
 point does not have, and its format is widened. The flights that were held out judge: against the same filter
 in float64, in the terms of the filter. The search goes down from the width that was given while the bounds
-hold.
+hold. Where they do not, some values may have wider words: those whose rounding moves most what is judged, and
+of them the fewest that keep the bounds.
 """
 
 from __future__ import annotations
@@ -30,17 +31,14 @@ from flowgraph.engines.subject import LoweredGraph
 from flowgraph.errors import DeclarationError, LoweringError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.format_files import structure_of
-from flowgraph.pipeline.formats import NARROWEST, Formats
+from flowgraph.pipeline.formats import NARROWEST, WIDEST, Formats
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.plain import plain
 from flowgraph.recorder.random import seed_words
+from flowgraph.study.differences import FIGURES, differences
+from flowgraph.study.widening import fewest, most_needed, wide_words, with_own
 from flowgraph.types import unflatten
-
-POSITION, ATTITUDE = "position_difference_rms_m", "attitude_difference_rms_deg"
-RELATIVE, DECISIONS = "estimate_difference_relative", "decisions_differing"
-FIGURES = (POSITION, ATTITUDE, RELATIVE, DECISIONS)
-"""What a bound may be of."""
 
 MARGIN = 2.0
 """The sizes that occurred times this fit their formats, if nobody says otherwise."""
@@ -80,8 +78,8 @@ class Quantised:
     pipeline: Pipeline
 
     def values(self) -> list[dict[str, Any]]:
-        """For a person: each value with its line, bits, the fractions of its elements, and whether its size
-        is proven or was observed."""
+        """For a person: each value that is no move with its line, bits, the fractions of its elements, and
+        whether its size is proven or was observed."""
         names = names_of(self.pipeline)
         return [
             {
@@ -91,7 +89,8 @@ class Quantised:
                 "fraction": [int(np.min(f)), int(np.max(f))],
                 "bound": "proven" if n in self.formats.proven else "observed",
             }
-            for n, f in sorted(self.formats.fractions.items())
+            for n in with_own(self.pipeline, self.formats)
+            for f in [self.formats.fractions[n]]
         ]
 
 
@@ -104,6 +103,7 @@ def quantise(
     margin: float = MARGIN,
     least: int = NARROWEST,
     held_width: int = 0,
+    widen: int = 0,
     say: Say = lambda words: None,
 ) -> Quantised:
     """The narrowest words, of `width` bits at most, in which a graph keeps the bounds.
@@ -116,6 +116,7 @@ def quantise(
         margin: the sizes that occurred times this fit.
         least: bits below which nothing is tried.
         held_width: bits of inputs, registers and what is added up in them, where they are more.
+        widen: bits of as few other values as keep the bounds, where `width` does not keep them for all.
         say: told what is going on.
 
     Raises:
@@ -134,7 +135,7 @@ def quantise(
             got=f"{len(flights)} and {len(held_out)} held out",
             fix="write --seeds 4 --held-out-seeds 3",
         )
-    Formats(width, {}, held_width=held_width)  # refuses words that there are not
+    Formats(width, {}, wider={0: held_width} if held_width else {})  # refuses words that there are not
     if not NARROWEST <= least <= width:
         raise DeclarationError(
             "no width can be tried",
@@ -143,13 +144,23 @@ def quantise(
             got=str(least),
             fix="ask for fewer bits at least, or for more at most (--width)",
         )
+    if widen and not width < widen <= WIDEST:
+        raise DeclarationError(
+            "values cannot be widened to this",
+            path="--widen",
+            expected=f"{width + 1} to {WIDEST} bits" if width < WIDEST else f"--width less than {WIDEST}",
+            got=str(widen),
+            fix="allow the others fewer bits (--width), or leave --widen out: a product reads no wider words",
+        )
     search = _Search(flights, held_out, margin, say, held_width)
     tried: list[Mapping[str, Any]] = []
     best: tuple[Formats, Mapping[str, Any]] | None = None
     bits, step = width, 2
     while bits >= least:
         formats, figures = search.at(bits)
-        holds = not figures["saturations"] and all(figures[k] <= v for k, v in bounds.items())
+        if widen and not keeps(figures, bounds):
+            formats, figures = search.mixed(bits, widen, bounds)
+        holds = keeps(figures, bounds)
         tried.append({**figures, "holds": holds})
         say(f"{bits} bits: {'holds' if holds else 'does not hold'}, " + _said(figures))
         if holds:
@@ -167,6 +178,11 @@ def quantise(
     return Quantised(best[0], best[1], tuple(tried), tuple(search.notes), search.pipeline)
 
 
+def keeps(figures: Mapping[str, Any], bounds: Mapping[str, float]) -> bool:
+    """Whether nothing saturates, and no bound is broken."""
+    return not figures["saturations"] and all(figures[k] <= v for k, v in bounds.items())
+
+
 def _said(figures: Mapping[str, Any]) -> str:
     return ", ".join(f"{k} {v:.3g}" for k, v in figures.items() if not k.endswith("bits") or k == "lost_bits")
 
@@ -182,6 +198,7 @@ class _Search:
         self.pipeline = self._flights[0].pipeline
         self.notes: list[str] = []
         self._more: dict[int, int] = {}
+        self._wider: dict[int, int] = {}
         self._worst = Counts()
         self._joined = False
         first = structure_of(self.pipeline)
@@ -200,7 +217,7 @@ class _Search:
     def _observe(self, flights: Sequence[_Ready]) -> None:
         """Take the sizes of some flights, all at once."""
         start, ticks = process_time(), self.sizes.ticks
-        self.sizes.play([Recorded(f.pipeline, f.tape, f.start.cells, f.seed) for f in flights])
+        self.sizes.play([f.recorded for f in flights])
         took = f"{self.sizes.ticks - ticks} ticks in {process_time() - start:.2f} s of a processor"
         self._say(f"sizes of {len(flights)} flight{'s' * (len(flights) > 1)}: {took}")
 
@@ -209,27 +226,58 @@ class _Search:
 
         Each width begins with the sizes in floating point: what another had to widen says nothing of it.
         """
-        self.sizes.forget()
-        self._more.clear()
+        self._forget()
         formats, player = self._settled(bits)
         figures = self._judge(formats, player)
         if figures["saturations"] and not self._joined:
             self._join(bits)
-            self.sizes.forget()
-            self._more.clear()
+            self._forget()
             formats, player = self._settled(bits)
             figures = self._judge(formats, player)
         for _ in range(_ROUNDS):
             if not figures["saturations"] or not self._widen(self._worst, "flights held out", bits):
                 break
-            formats = self.sizes.formats(bits, self._margin, self._held_width)
+            formats = self._formats(bits)
             figures = self._judge(formats, self._player(formats))
+        return formats, figures
+
+    def _forget(self) -> None:
+        self.sizes.forget()
+        self._more.clear()
+        self._wider.clear()
+
+    def _formats(self, bits: int) -> Formats:
+        return self.sizes.formats(bits, self._margin, self._held_width, self._wider)
+
+    def mixed(self, bits: int, widen: int, bounds: Mapping[str, float]) -> tuple[Formats, dict[str, Any]]:
+        """Formats of so many bits in which as few values as a bisection finds have wider words, after `at`;
+        and their figures.
+
+        Those come first whose rounding moves most what is judged, on the first of the flights of the sizes.
+        """
+        one = self._flights[0]
+        port = [p.name for p in self.pipeline.outputs].index(one.flown.estimate)
+        order = most_needed(one.recorded, self._formats(bits), port, set(bounds))
+        self._say(f"{len(order)} values by what their rounding does")
+
+        def tried(count: int) -> tuple[Formats, dict[str, Any]]:
+            self._wider = dict.fromkeys(order[:count], widen)
+            formats = self._formats(bits)
+            figures = self._judge(formats, self._player(formats)) | {"wide_bits": widen, "wide_values": count}
+            said = "holds" if keeps(figures, bounds) else "does not hold"
+            self._say(f"{count} of {widen} bits beside {bits}: {said}, " + _said(figures))
+            return formats, figures
+
+        formats, figures = fewest(len(order), tried, lambda made: keeps(made[1], bounds))
+        self._wider = dict.fromkeys(order[: figures["wide_values"]], widen)
+        self.notes.append(wide_words(self.pipeline, formats, self._wider))
+        self._say(self.notes[-1])
         return formats, figures
 
     def _settled(self, bits: int) -> tuple[Formats, _Fleet]:
         """Formats in which nothing saturates on the flights of the sizes."""
         for _ in range(_ROUNDS):
-            formats = self.sizes.formats(bits, self._margin, self._held_width)
+            formats = self._formats(bits)
             player = self._player(formats)
             if not self._widened(player, self._flights, "the flights of the sizes", bits):
                 break
@@ -278,7 +326,8 @@ class _Search:
 
     def _judge(self, formats: Formats, player: _Fleet) -> dict[str, Any]:
         self._worst = Counts()
-        found: dict[str, Any] = {"bits": formats.width, "held_bits": formats.held_width or formats.width}
+        held = max(self._held_width, formats.width)
+        found: dict[str, Any] = {"bits": formats.width, "held_bits": held}
         found |= dict.fromkeys(KINDS, 0)
         for one in self._held:
             counts = one.play(player.of(one))
@@ -355,6 +404,11 @@ class _Ready:
         self._outcome: Outcome | None = None
 
     @property
+    def recorded(self) -> Recorded:
+        """What is played abreast of others."""
+        return Recorded(self.pipeline, self.tape, self.start.cells, self.seed)
+
+    @property
     def reference(self) -> Result:
         """In float64."""
         if self._reference is None:
@@ -377,48 +431,3 @@ class _Ready:
                 self.pipeline.outputs, self._subject.types, self._outcome.outputs, strict=True
             )
         }
-
-
-def differences(reference: Result, found: Mapping[str, Series], estimate: str) -> dict[str, float]:
-    """How two runs of one filter differ, by the figures of `FIGURES` that it has.
-
-    A decision is an event of an output in which a truth value or an integer differs, or that only one has.
-    The relative difference is the root mean square of a leaf's, divided by that of the leaf: the worst.
-    """
-    differing = 0
-    for name, ours in found.items():
-        theirs = reference.series[name]
-        common, a, b = np.intersect1d(ours.time, theirs.time, return_indices=True)
-        differing += len(ours.time) + len(theirs.time) - 2 * len(common)
-        differs = np.zeros(len(common), bool)
-        for leaf, x in ours.leaves.items():
-            if x.dtype.kind != "f":
-                unequal = x[a] != theirs.leaves[leaf][b]
-                differs |= unequal.reshape(len(common), -1).any(axis=1)
-        differing += int(differs.sum())
-    figures: dict[str, float] = {DECISIONS: differing}
-    ours, theirs = found[estimate], reference.series[estimate]
-    _, a, b = np.intersect1d(ours.time, theirs.time, return_indices=True)
-    worst = 0.0
-    for leaf, x in ours.leaves.items():
-        if x.dtype.kind != "f" or leaf.endswith("covariance"):
-            continue
-        p, q = x[a].reshape(len(a), -1), theirs.leaves[leaf][b].reshape(len(a), -1)
-        if leaf == "position":
-            figures[POSITION] = _rms(p - q)
-        if leaf == "attitude" and p.shape[-1] == 4:
-            figures[ATTITUDE] = float(np.degrees(np.sqrt(np.mean(_turned(p, q) ** 2))))
-        size = _rms(q)
-        worst = max(worst, _rms(p - q) / size if size else float(_rms(p - q) > 0.0))
-    return figures | {RELATIVE: worst}
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.sum(x * x, axis=-1)))) if x.size else 0.0
-
-
-def _turned(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The angles between quaternions, in rad; those of the words need not be of unit length."""
-    p, q = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (p, q))
-    p = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0.0, -p, p)
-    return np.asarray(4.0 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=-1) / 2.0, 0.0, 1.0)))

@@ -27,7 +27,7 @@ from flowgraph.blocks.geometry.rotations import multiply
 from flowgraph.blocks.metrics.errors import tilt_and_heading_nees
 from flowgraph.blocks.scoring.orientation import counted, scored_errors
 from flowgraph.blocks.signals import Attitude
-from flowgraph.graphs.benches import engine_of, recordings
+from flowgraph.graphs.benches import engine_of, lists, recordings
 from flowgraph.graphs.marg import marg
 
 FIGURES = ("total_rmse_deg", "heading_rmse_deg", "inclination_rmse_deg")
@@ -52,7 +52,7 @@ def broad(
     Raises:
         DataError: where there is no trial.
     """
-    wanted = [part.strip() for part in trials.split(",") if part.strip()]
+    wanted = lists.parts(trials)
     files = recordings(data, "broad", "[0-9][0-9]_*.mat")
     files = [f for f in files if not wanted or any(part in f.stem for part in wanted)]
     if not files:

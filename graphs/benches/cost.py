@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import DeclarationError, find_graph, load_flight, lower, simulate
+from flowgraph import find_graph, load_flight, lower, simulate
 from flowgraph.data.registry import Report
+from flowgraph.graphs.benches import lists
+from flowgraph.language.checks import need_count
 from flowgraph.pipeline.costs import Costs, Machine
 
 
@@ -38,9 +40,10 @@ def cost(
     Raises:
         DeclarationError: for a list that holds no numbers of particles, or no flight.
     """
+    need_count("cost", "flights", flights, least=1)
     rows = [
         _row(n, flights, duration, engine, Machine(multipliers, min(lanes, n)), seed)
-        for n in _sizes(particles, flights)
+        for n in lists.numbers(particles, "cost.particles")
     ]
     return Report(
         rows,
@@ -52,19 +55,6 @@ def cost(
             "0.9 V, arithmetic and memories alone (Horowitz, ISSCC 2014).",
         ),
     )
-
-
-def _sizes(text: str, flights: int) -> list[int]:
-    parts = text.split(",")
-    if flights < 1 or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
-        raise DeclarationError(
-            "this bench needs numbers of particles and a flight",
-            path="cost",
-            expected="particles=10,100,1000 and flights=1 or more",
-            got=f"particles={text}, flights={flights}",
-            fix="write --set particles=10,100,1000",
-        )
-    return [int(p) for p in parts]
 
 
 def _row(

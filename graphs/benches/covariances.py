@@ -15,8 +15,9 @@ import numpy as np
 from flowgraph import Report
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fixed import flown
-from flowgraph.graphs.benches.registers import MARGIN, numbers, played, rounded
+from flowgraph.graphs.benches.registers import MARGIN, played, rounded
 from flowgraph.pipeline.formats import fraction_for
 from flowgraph.recorder.random import seed_words
 
@@ -111,7 +112,7 @@ def covariances(*, bits: str = "10,12,14,16,18,20,22,24", duration: float = 20.0
         return _apart(true, positions(lambda P: rounded(P / over, fraction) * over))
 
     rows: list[dict[str, Any]] = []
-    for width in numbers(bits, "covariances.bits"):
+    for width in lists.numbers(bits, "covariances.bits"):
         row = {"bits": width, "covariance_m": apart("covariance", width), "scaled_m": scaled(width)}
         rows.append(row | {f"{form}_m": apart(form, width) for form in ("correlations", "factor")})
     note = f"a flight of {duration:g} s; only the covariance is rounded, and sizes times {MARGIN:g} fit"

@@ -31,6 +31,7 @@ from flowgraph.blocks.flights.drive import GRADES
 from flowgraph.blocks.geometry.rotations import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from flowgraph.blocks.inertial.alignment import StartSpread, start_belief
 from flowgraph.blocks.signals import Belief, Position
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.gnss_ins import gnss_ins
 from flowgraph.graphs.ins_eskf import ins_eskf
 
@@ -69,7 +70,7 @@ def drives(
         settle: s at the start that the errors leave out.
     """
     rows: list[dict[str, Any]] = []
-    for unit in (u.strip() for u in units.split(",")):
+    for unit in lists.names(units, GRADES, what="unit", path="drives.units"):
         begin = perf_counter()
         known, bounds, graph = None, None, None
         squares = []

@@ -13,10 +13,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from flowgraph import Report, Series, UnknownNameError, find_graph, load_flight, simulate
+from flowgraph import Report, Series, find_graph, load_flight, simulate
 from flowgraph.blocks.datasets.ese650 import sets_in
 from flowgraph.data.registry import graph_names
-from flowgraph.graphs.benches import engine_of, recordings
+from flowgraph.graphs.benches import engine_of, lists, recordings
 
 FILTERS = ("quaternion_ukf", "roll_pitch", "gyro_integration")
 PUBLISHED: Mapping[int, tuple[float, float, float]] = {
@@ -48,11 +48,8 @@ def ese650(*, data: str | None = None, engine: str = "auto", filters: str = "") 
         DataError: where there are no sets. UnknownNameError: for a filter that is not installed.
     """
     installed = graph_names()
-    chosen = [f.strip() for f in filters.split(",") if f.strip()]
-    for name in chosen:
-        if name not in installed:
-            raise UnknownNameError("graph", name, installed, path="ese650.filters")
-    chosen = chosen or [f for f in FILTERS if f in installed]
+    usual = ",".join(f for f in FILTERS if f in installed)
+    chosen = lists.names(filters or usual, installed, what="graph", path="ese650.filters")
     folder = recordings(data, "ese650", "imuRaw*.mat")[0].parent
     rows: list[dict[str, Any]] = []
     figures: dict[str, Callable[[Path], None]] = {}

@@ -21,7 +21,6 @@ from flowgraph import (
     Report,
     Result,
     Series,
-    UnknownNameError,
     find_graph,
     load_flight,
     simulate,
@@ -31,6 +30,7 @@ from flowgraph.blocks.metrics.chi_square import chi_square_band
 from flowgraph.data.registry import flight_settings
 from flowgraph.data.settings import parsed_settings
 from flowgraph.errors import FlowgraphError
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fault_kinds import Fault, faults_of
 from flowgraph.types import flatten, leaves_of, unflatten
 
@@ -81,12 +81,9 @@ def faults(*, graphs: str = "all", kinds: str = "all", seed: int = 0, engine: st
     Raises:
         UnknownNameError: for a graph that is none of those that are flown here.
     """
-    names = list(FLOWN) if graphs == "all" else graphs.split(",")
-    for name in names:
-        if name not in FLOWN:
-            raise UnknownNameError("graph of this bench", name, FLOWN)
-    wanted = ("",) if kinds == "all" else tuple(kinds.split(","))
-    rows = [row for name in names for row in _rows(name, wanted, seed, engine or _quick(name))]
+    chosen = lists.names(graphs, FLOWN, what="graph of this bench", path="faults.graphs")
+    wanted = ("",) if kinds == "all" else tuple(lists.parts(kinds))
+    rows = [row for name in chosen for row in _rows(name, wanted, seed, engine or _quick(name))]
     counts = {v: sum(r["verdict"] == v for r in rows) for v in dict.fromkeys(r["verdict"] for r in rows)}
     return Report(rows, notes=("info: " + ", ".join(f"{n} {v}" for v, n in sorted(counts.items())),))
 

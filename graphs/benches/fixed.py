@@ -19,11 +19,13 @@ from flowgraph.engines.c.fixed import CompiledIntegers
 from flowgraph.engines.fixed.engine import ENGINE
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
+from flowgraph.graphs.benches import lists
 from flowgraph.language.checks import need_count
 from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.plain import plain
 from flowgraph.recorder.random import seed_words
-from flowgraph.study.quantise import MARGIN, RELATIVE, Flown, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import MARGIN, Flown, quantise
 
 __all__ = ["FLIGHTS", "fixed", "flown"]
 
@@ -82,9 +84,8 @@ def fixed(
         DeclarationError: for a setting out of range.
     """
     need_count("fixed", "flights", flights, least=1)
-    names = [n.strip() for n in graphs.split(",") if n.strip()] or graph_names()
     rows = []
-    for name in names:
+    for name in lists.names(graphs, graph_names(), what="graph", path="fixed.graphs"):
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {"graph": name}
         try:
             some = [flown(name, seed + k, duration) for k in range(flights + 1)]

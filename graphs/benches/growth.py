@@ -9,12 +9,15 @@ only the pose is kept.
 
 The exponent p of time is that of t = a + b n^p, with the smallest errors relative to t: what a run costs
 whatever its length is `a`, and is no growth. That of memory is the slope of log(memory) over log(n) where the
-run took more than the allocator's own. 1 is linear.
+run took more than the allocator's own. 1 is linear. Beside the particles stands what it takes to copy the
+filter's registers once a tick, in an array of its own: no filter that changes them all is quicker, and where
+they leave the caches that is no line either.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import resource
 import subprocess
 import sys
@@ -35,10 +38,10 @@ from flowgraph import (
     Scalar,
     Series,
     Stream,
-    UnknownNameError,
     find_graph,
     graph,
     latest,
+    lower,
     periodic,
     scan,
     simulate,
@@ -47,6 +50,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.flights import simulated
 from flowgraph.data.notes import note
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.endurance import memory
 
 PERIOD_NS, EVERY = 5_000_000, 5
@@ -61,8 +65,8 @@ as the system hands out the pages of its memory. Seven times at most."""
 RANGES: dict[str, dict[str, tuple[int, int]]] = {
     "python": {"whole": (1_000, 10_000_000), "streamed": (1_000, 10_000_000), "particles": (10, 100_000)},
     "numpy": {"whole": (100, 1_000_000), "streamed": (100, 1_000_000), "particles": (10, 100_000)},
-    "xla": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 100_000)},
-    "c": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 100_000)},
+    "xla": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 1_000_000)},
+    "c": {"whole": (1_000, 10_000_000), "streamed": (10_000, 100_000_000), "particles": (10, 1_000_000)},
     "reference": {"whole": (10, 10_000), "streamed": (10, 10_000), "particles": (10, 1_000)},
 }
 """From where to where each engine is measured: four decades or more, and what takes minutes at most. The
@@ -83,7 +87,7 @@ def growth(
     least: int = 1,
     most: int = 100_000_000,
     least_particles: int = 1,
-    most_particles: int = 100_000,
+    most_particles: int = 1_000_000,
     duration: float = 0.3,
 ) -> Report:
     """Time and memory of each engine against ticks, whole and streamed, and against particles.
@@ -97,9 +101,10 @@ def growth(
 
     Returns:
         A row a run: `engine`, `of` ("ticks" or "particles"), `mode`, `number`, `seconds` of the processor,
-        `memory_bytes`; and a row a series of them with `number` None, `time_exponent` (None of fewer than
-        three) and `memory_exponent` (None below 1 MB). Figures `growth.svg` and, as a table, `growth.md`. A
-        note says how long it took.
+        `memory_bytes`, of particles `copy_s` too, what copying the registers takes; and a row a series of
+        them with `number` None, `time_exponent` (None of fewer than three) with its standard error
+        `time_error` (None of fewer than four), `memory_exponent` (None below 1 MB), and `copy_exponent`.
+        Figures `growth.svg` and, as a table, `growth.md`. A note says how long it took.
     """
     if not (1 <= least <= most and 1 <= least_particles <= most_particles):
         raise DeclarationError(
@@ -107,13 +112,10 @@ def growth(
             got=f"{least} to {most} ticks, {least_particles} to {most_particles} particles",
             fix="write least=10000 and most=1000000",
         )  # fmt: skip
-    chosen = engines.split(","), parts.split(",")
-    for what, names, offered in zip(
-        ("engine", "part"), chosen, (list(RANGES), list(RANGES["c"])), strict=True
-    ):
-        for name in names:
-            if name not in offered:
-                raise UnknownNameError(what, name, offered, path=f"growth.{what}s")
+    chosen = (
+        lists.names(engines, RANGES, what="engine", path="growth.engines"),
+        lists.names(parts, RANGES["c"], what="part", path="growth.parts"),
+    )
     begun, busy = perf_counter(), _busy()
     rows: list[dict[str, Any]] = []
     for engine in chosen[0]:
@@ -155,29 +157,45 @@ def _fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
         np.array([r[name] for r in rows], float) for name in ("number", "seconds", "memory_bytes")
     )
     grows = held > LEAST_MEMORY
+    copied = np.array([r.get("copy_s") or 0.0 for r in rows])
+    enough = len(rows) > 2
+    power, error = exponent(number, seconds) if enough else (None, None)
     return {
         "engine": rows[0]["engine"], "of": rows[0]["of"], "mode": rows[0]["mode"], "number": None,
-        "time_exponent": exponent(number, seconds) if len(rows) > 2 else None,
+        "time_exponent": power, "time_error": error,
+        "copy_exponent": exponent(number, copied)[0] if enough and copied.all() else None,
         "memory_exponent": float(np.polyfit(np.log(number[grows]), np.log(held[grows]), 1)[0])
         if grows.sum() > 1
         else None,
     }  # fmt: skip
 
 
-def exponent(number: np.ndarray, taken: np.ndarray) -> float:
-    """p of a + b n^p, with a and b >= 0, of which the sum of squared relative errors is least."""
+def exponent(number: np.ndarray, taken: np.ndarray) -> tuple[float, float | None]:
+    """p of a + b n^p, with a and b >= 0, of which the sum of squared relative errors is least.
 
-    def error(p: float) -> float:
+    Returns:
+        p, and its standard error as those errors tell it; None where there are fewer than four.
+    """
+
+    def fit(p: float) -> tuple[float, np.ndarray, np.ndarray]:
+        """The sum of squares, the columns that it is of, and their weights."""
         rest = []
         for columns in ([0 * number + 1, number**p], [number**p]):
             basis = np.stack(columns, axis=1) / taken[:, None]
             found = np.linalg.lstsq(basis, np.ones(len(taken)), rcond=None)[0]
             if (found >= 0).all():
-                rest.append(float(((basis @ found - 1) ** 2).sum()))
-        return min(rest)
+                rest.append((float(((basis @ found - 1) ** 2).sum()), basis, found))
+        return min(rest, key=lambda r: r[0])
 
     tried = np.arange(0.05, 3.0, 0.005)
-    return float(tried[int(np.argmin([error(p) for p in tried]))])
+    p = float(min(tried, key=lambda q: fit(q)[0]))
+    if len(number) < 4:
+        return p, None
+    squares, basis, found = fit(p)
+    slope = found[-1] * basis[:, -1] * np.log(number)
+    slopes = np.column_stack([basis, slope])
+    spread = np.linalg.pinv(slopes.T @ slopes)[-1, -1]
+    return p, float(np.sqrt(squares / max(len(number) - slopes.shape[1], 1) * spread))
 
 
 def _apart(of: str, mode: str, engine: str, number: int, duration: float) -> dict[str, Any]:
@@ -212,7 +230,24 @@ def one(of: str, mode: str, engine: str, number: int, duration: float) -> None:
     taken = max(peak() - held, 0)
     while len(seconds) < REPEATS and (sum(seconds) < ENOUGH or (len(seconds) < AGAIN and seconds[0] < LONG)):
         seconds.append(_timed(run))
-    print(json.dumps({"seconds": min(seconds), "memory_bytes": taken, "runs": len(seconds)}))
+    found: dict[str, Any] = {"seconds": min(seconds), "memory_bytes": taken, "runs": len(seconds)}
+    if of == "particles":
+        cells = [c for r in lower(case.graph).registers for c in r.cells]
+        ticks = len(np.unique(np.concatenate([s.time for s in case.inputs.values()])))
+        found["copy_s"] = _copied(sum(8 * math.prod(c.shape) for c in cells), ticks)
+    print(json.dumps(found))
+
+
+def _copied(size: int, times: int) -> float:
+    """Seconds of the processor to copy so many bytes so often, from one array to another and back."""
+    one_, other = (np.full(max(size // 8, 1), 1.0) for _ in range(2))
+    turns = max(1, min(times, 2**31 // max(size, 1)))
+
+    def copy() -> None:
+        for _ in range(turns):
+            np.copyto(other, one_)
+
+    return min(_timed(copy) for _ in range(REPEATS)) * times / turns
 
 
 def _timed(run: Callable[[], object]) -> float:
@@ -255,20 +290,27 @@ def forget_peak() -> None:
         file.write("5")
 
 
+_POWERS = ("time_exponent", "memory_exponent", "copy_exponent")
+
+
 def _write(rows: list[dict[str, Any]], path: Path) -> None:
     """The exponents, and where they come from, as a table."""
     known = _series([r for r in rows if r["number"] is not None])
     lines = [
-        "| engine | of | run | from | to | time | exponent | memory | exponent |",
-        "|---|---|---|---:|---:|---|---:|---|---:|",
+        "| engine | of | run | from | to | time | exponent | memory | exponent | copied | exponent |",
+        "|---|---|---|---:|---:|---|---:|---|---:|---|---:|",
     ]
     for fit in (r for r in rows if r["number"] is None):
         first, *_, last = known[fit["of"], fit["mode"], fit["engine"]]
         spans = [f"{end['number']:,}" for end in (first, last)]
         time = f"{_short(first['seconds'])} to {_short(last['seconds'])} s"
         held = f"{first['memory_bytes'] / 1e6:.1f} to {last['memory_bytes'] / 1e6:.1f} MB"
-        powers = ["" if fit[k] is None else f"{fit[k]:.2f}" for k in ("time_exponent", "memory_exponent")]
-        cells = [f"`{fit['engine']}`", fit["of"], fit["mode"], *spans, time, powers[0], held, powers[1]]
+        powers = ["" if fit.get(k) is None else f"{fit[k]:.2f}" for k in _POWERS]
+        if fit.get("time_error") is not None:
+            powers[0] += f" ± {fit['time_error']:.2f}"
+        copied = f"{_short(first['copy_s'])} to {_short(last['copy_s'])} s" if first.get("copy_s") else ""
+        cells = [f"`{fit['engine']}`", fit["of"], fit["mode"], *spans]
+        cells += [time, powers[0], held, powers[1], copied, powers[2]]
         lines.append("| " + " | ".join(cells) + " |")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

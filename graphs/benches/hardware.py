@@ -22,11 +22,13 @@ from flowgraph.engines.verilog.place import TARGET_HZ, route
 from flowgraph.engines.verilog.simulate import Simulated
 from flowgraph.engines.verilog.text import texts
 from flowgraph.engines.verilog.toggles import toggles
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fixed import flown
-from flowgraph.graphs.benches.hardware_space import design_space, numbers, taped
+from flowgraph.graphs.benches.hardware_space import design_space, taped
 from flowgraph.language.checks import need_count
 from flowgraph.recorder.random import seed_words
-from flowgraph.study.quantise import RELATIVE, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import quantise
 
 __all__ = ["hardware"]
 
@@ -91,20 +93,20 @@ def hardware(
             fix="write --set compared=0.5",
         )  # fmt: skip
     need_count("hardware", "seeds", seeds, least=1)
-    names = graph_names() if graphs == "all" else [n.strip() for n in graphs.split(",") if n.strip()]
-    counts = numbers(lanes, "lanes")
+    chosen = lists.names(graphs, graph_names(), what="graph", path="hardware.graphs")
+    counts = lists.numbers(lanes, "hardware.lanes")
     if space:
-        if len(names) != 1:
+        if len(chosen) != 1:
             raise DeclarationError(
                 "the machines of one graph are compared", path="space", expected="one name in graphs",
-                got=", ".join(names) or "none", fix="write --set graphs=kalman",
+                got=", ".join(chosen), fix="write --set graphs=kalman",
             )  # fmt: skip
         return design_space(
-            names[0], numbers(space, "space"), counts, flights=flights, duration=duration,
+            chosen[0], lists.numbers(space, "hardware.space"), counts, flights=flights, duration=duration,
             particles=particles, routed=routed, seeds=seeds, folder=folder, seed=seed,
         )  # fmt: skip
     rows: list[dict[str, Any]] = []
-    for name, count in product(names, counts):
+    for name, count in product(chosen, counts):
         row: dict[str, Any] = dict.fromkeys(_COLUMNS) | {
             "graph": name, "particles": particles or None, "width": width,
             "lanes": count, "multipliers": count,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import DeclarationError, FlowgraphError, Report
+from flowgraph import FlowgraphError, Report
 from flowgraph.data.files import put
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.subject import LoweredGraph
@@ -23,9 +23,10 @@ from flowgraph.engines.verilog.image import Image
 from flowgraph.engines.verilog.place import TARGET_HZ, route, synthesise
 from flowgraph.engines.verilog.text import texts
 from flowgraph.graphs.benches.fixed import flown
-from flowgraph.study.quantise import RELATIVE, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import quantise
 
-__all__ = ["design_space", "draw", "fronted", "numbers", "taped"]
+__all__ = ["design_space", "draw", "fronted", "taped"]
 
 _ANY = 1e9
 """A bound that every width keeps: here all are wanted, the bad ones too."""
@@ -45,24 +46,6 @@ def taped(flight: Any, seconds: float | None = None) -> tuple[Any, Any]:
     if seconds is None:
         return events, start
     return events.first(int(np.searchsorted(events.time, events.time[0] + int(seconds * 1e9)))), start
-
-
-def numbers(text: str, what: str) -> list[int]:
-    """Whole numbers between commas, each once, in order.
-
-    Raises:
-        DeclarationError: for anything else.
-    """
-    try:
-        found = sorted({int(n) for n in text.split(",")})
-    except ValueError:
-        found = []
-    if not found or found[0] < 1:
-        raise DeclarationError(
-            "these are no whole numbers", path=what, expected="some from 1 on, such as 16,20,24",
-            got=repr(text), fix="write them with commas between",
-        )  # fmt: skip
-    return found
 
 
 def design_space(

@@ -43,7 +43,8 @@ from flowgraph.blocks.filtering import rewind
 from flowgraph.blocks.inertial.imu import predict
 from flowgraph.blocks.scoring.late import places
 from flowgraph.blocks.signals import Belief, Imu, Position
-from flowgraph.graphs.benches import recordings
+from flowgraph.engines.registry import engine_names
+from flowgraph.graphs.benches import lists, recordings
 from flowgraph.graphs.ins_eskf import ins_eskf
 from flowgraph.recorder.namespaces import NUMPY
 
@@ -89,6 +90,7 @@ def late(
     Raises:
         DataError: where the recording is not there.
     """
+    chosen = lists.names(engines, engine_names(), what="engine", path="late.engines")
     (folder,) = recordings(data, "euroc", "MH_01*")
     flight = load_flight(f"euroc:{folder}", settings={"leica.time_offset": OFFSET})
     case = ins_eskf.case(_first(flight, duration))
@@ -111,9 +113,9 @@ def late(
         inputs = {**given, "position": _arrived(fix, fixes)}
         lag = f"{max(latency, spread)}s"
         built = late_eskf.build(**clocks_of(inputs), settings=case.graph.settings, max_lag=lag, size=size)
-        for engine in engines.split(","):
-            result = simulate(built, inputs, engine=engine.strip())
-            made.add(policy, engine.strip(), result, built, difference(result, on_time, fixes))
+        for engine in chosen:
+            result = simulate(built, inputs, engine=engine)
+            made.add(policy, engine, result, built, difference(result, on_time, fixes))
     return Report(
         made.rows,
         notes=(

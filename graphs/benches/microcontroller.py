@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flowgraph import FlowgraphError, Report, lower
-from flowgraph.data.registry import find_graph, flight_settings
+from flowgraph.data.registry import find_graph, flight_settings, graph_names
 from flowgraph.data.registry import load_flight as fly
 from flowgraph.data.settings import parsed_settings
 from flowgraph.engines.c import generate, write_c, write_events
@@ -22,10 +22,11 @@ from flowgraph.engines.c.cortex import CORES, Measured, Metered, measure, need_t
 from flowgraph.engines.c.fixed_replay import write_fixed
 from flowgraph.engines.c.header import react_signature
 from flowgraph.engines.c.names import given, made
-from flowgraph.errors import UnknownNameError
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fixed import FLIGHTS
 from flowgraph.pipeline.optimise import COMPILED, optimise
-from flowgraph.study.quantise import RELATIVE, Flown, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import Flown, quantise
 
 __all__ = ["microcontroller"]
 
@@ -66,15 +67,16 @@ def microcontroller(
         UnknownNameError: for a core or a kind of number that is not there.
     """
     need_tools()
-    chosen = [_listed(text, valid, what) for text, valid, what in (
-        (cores, tuple(CORES), "core"), (dtypes, KINDS, "dtype"))]  # fmt: skip
+    kinds = lists.names(dtypes, KINDS, what="dtype", path="microcontroller.dtypes")
+    chips = lists.names(cores, CORES, what="core", path="microcontroller.cores")
+    chosen = lists.names(graphs, graph_names(), what="graph", path="microcontroller.graphs")
     rows: list[dict[str, Any]] = []
-    for name in [n.strip() for n in graphs.split(",") if n.strip()]:
+    for name in chosen:
         cases = [_flown(name, seed + k, duration) for k in range(flights + 1)]
-        for dtype in chosen[1]:
+        for dtype in kinds:
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    rows += _rows(name, dtype, chosen[0], cases, Path(folder), width, margin)
+                    rows += _rows(name, dtype, chips, cases, Path(folder), width, margin)
                 except FlowgraphError as error:
                     reason = f"{error.path}: {error.message}; {error.got}"[:300]
                     rows.append({"graph": name, "core": None, "dtype": dtype, "reason": reason})
@@ -84,14 +86,6 @@ def microcontroller(
         f"fixed: {width} bits, the sizes times {margin:g} fit; instructions are counted, not cycles"
     )
     return Report([dict.fromkeys(columns) | row for row in rows], {}, (note,))
-
-
-def _listed(text: str, valid: tuple[str, ...], what: str) -> list[str]:
-    names = [n.strip() for n in text.split(",") if n.strip()]
-    for name in names:
-        if name not in valid:
-            raise UnknownNameError(what, name, valid, path="microcontroller")
-    return names
 
 
 def _flown(name: str, seed: int, duration: float) -> Flown:

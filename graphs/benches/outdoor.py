@@ -29,7 +29,7 @@ from flowgraph.blocks.kalman.smoothing import rauch_tung_striebel
 from flowgraph.blocks.outdoor.errors import at_antenna
 from flowgraph.blocks.signals import GRAVITY
 from flowgraph.errors import DataError
-from flowgraph.graphs.benches import recordings
+from flowgraph.graphs.benches import lists, recordings
 from flowgraph.graphs.gnss_ins import gnss_ins
 
 AIDS: Mapping[str, str] = {"1 Hz": "1", "0.2 Hz": "5", "outage 10 s": "1"}
@@ -68,21 +68,21 @@ def outdoor(
     Raises:
         DataError: where there are no flights.
     """
-    wanted = [n.strip() for n in flights.split(",") if n.strip()]
+    wanted = lists.parts(flights)
     folders = [f.parent for f in recordings(data, "outdoor_quadrotor", "*/GT.csv")]
     folders = sorted((f for f in folders if not wanted or f.name in wanted), key=_number)
-    chosen = [a.strip() for a in aids.split(",") if a.strip()] or list(AIDS)
+    chosen = lists.names(aids, AIDS, what="aid", path="outdoor.aids")
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for folder in folders:
-        for unit in imu.split(","):
-            offset = clock_offset(folder, unit.strip())
+        for unit in lists.parts(imu):
+            offset = clock_offset(folder, unit)
             notes.append(f"{folder.name}, imu {unit}: the receiver's clock is {offset:+.3f} s off the unit's")
             for aid in chosen:
                 begin = perf_counter()
-                for method, found in _rows(folder, unit.strip(), aid, offset, engine):
+                for method, found in _rows(folder, unit, aid, offset, engine):
                     wall = perf_counter() - begin
-                    head = {"flight": folder.name, "aid": aid, "imu": unit.strip(), "method": method}
+                    head = {"flight": folder.name, "aid": aid, "imu": unit, "method": method}
                     rows.append({**head, **found, "wall_s": wall})
                     if found["position_rmse_m"] is None:
                         notes.append(f"{folder.name}, {aid}, imu {unit}: the {method} does not settle")

@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import DeclarationError, Report, find_graph, load_flight
+from flowgraph import Report, find_graph, load_flight
 from flowgraph.data.tape import Tape
 from flowgraph.engines.options import RunOptions
 from flowgraph.engines.reference import Interpreter
 from flowgraph.engines.subject import LoweredGraph
+from flowgraph.graphs.benches import lists
 from flowgraph.pipeline.formats import fraction_for
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program
 from flowgraph.recorder.random import seed_words
 
-__all__ = ["numbers", "played", "registers", "rounded"]
+__all__ = ["played", "registers", "rounded"]
 
 MARGIN = 2.0
 """The sizes that occurred times this fit a word."""
@@ -50,14 +51,14 @@ def registers(
         DeclarationError: for a setting out of range.
     """
     rows: list[dict[str, Any]] = []
-    for n in numbers(particles, "registers.particles"):
+    for n in lists.numbers(particles, "registers.particles"):
         flight = load_flight("sim", seed=seed, settings={"duration": str(duration)})
         case = find_graph("rbpf_indoor").case(flight, particles=n, seed=seed)
         subject = LoweredGraph(case.graph)
         start = subject.start(RunOptions(seed=seed))
         given = (subject.pipeline, subject.tape(case.inputs, start.last), start.cells, seed_words(seed))
         decided, sizes = _played(*given, None)
-        for width in numbers(bits, "registers.bits"):
+        for width in lists.numbers(bits, "registers.bits"):
             fractions = [None if s is None else fraction_for(MARGIN * s, width) for s in sizes]
             found, _ = _played(*given, fractions)
             differs = [
@@ -69,24 +70,6 @@ def registers(
             })  # fmt: skip
     note = f"a flight of {duration:g} s; only registers are rounded, and sizes times {MARGIN:g} fit them"
     return Report(rows, {}, (note,))
-
-
-def numbers(text: str, name: str) -> list[int]:
-    """Whole numbers of a setting, between commas.
-
-    Raises:
-        DeclarationError: where they are none.
-    """
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    if not parts or not all(part.isdigit() and int(part) for part in parts):
-        raise DeclarationError(
-            "these are no whole numbers",
-            path=name,
-            expected="numbers from 1 on, between commas",
-            got=repr(text),
-            fix=f"write --set {name.split('.')[-1]}=10,100",
-        )
-    return [int(part) for part in parts]
 
 
 def _played(

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph import DeclarationError, Report, UnknownNameError, find_graph, load_flight, simulate
+from flowgraph import DeclarationError, Report, find_graph, load_flight, simulate
+from flowgraph.graphs.benches import lists
 from flowgraph.graphs.benches.fault_kinds import aids_of, faulty, outliers
 
 __all__ = ["robust"]
@@ -62,15 +63,12 @@ def robust(
             path="robust", expected="flights of 1 or more, and a share between 0 and 1",
             got=f"flights={flights}, share={share:g}", fix="leave both out",
         )  # fmt: skip
-    names = [name.strip() for name in filters.split(",")]
-    for name in names:
-        if name not in FILTERS:
-            raise UnknownNameError("filter of this bench", name, FILTERS)
+    chosen = lists.names(filters, FILTERS, what="filter of this bench", path="robust.filters")
     seeds = range(seed, seed + flights)
     rows = [
         {"part": "outliers", "filter": name, "robust": method, "outliers": off, "told": 1.0, "adaptive": 0,
          **_figures(name, seeds, duration, off, engine, {} if method == "none" else {"robust": method})}
-        for name in names for off in (0.0, share) for method in METHODS
+        for name in chosen for off in (0.0, share) for method in METHODS
     ]  # fmt: skip
     rows += [
         {"part": "noise", "filter": "kalman", "robust": "none", "outliers": 0.0, "told": told,

@@ -39,9 +39,8 @@ from flowgraph.blocks.particles.cloud import start_cloud
 from flowgraph.blocks.scoring.point import positions
 from flowgraph.blocks.scoring.tuning import WEIGHTLESS, reading_of, with_imu
 from flowgraph.blocks.signals import Attitude, Belief, Gaussian, PoseEstimate
-from flowgraph.errors import UnknownNameError
 from flowgraph.graphs.augmented_complementary import augmented_complementary
-from flowgraph.graphs.benches import engine_of
+from flowgraph.graphs.benches import engine_of, lists
 from flowgraph.graphs.benches.thesis_picture import draw, write_page
 from flowgraph.graphs.ekf import ekf
 from flowgraph.graphs.ins_eskf import ins_eskf
@@ -240,14 +239,18 @@ def thesis(
     need_count("thesis", "flights", flights, least=1)
     need_count("thesis", "particles", particles, least=1)
     engine = engine_of(engine, many=True)
-    names, codes = _listed("filter", filters, FILTERS), _listed("setting", settings, SETTINGS)
-    better = [name for name in _listed("filter that is smoothed", smoothed, SMOOTHED) if name in names]
+    chosen = lists.names(filters, FILTERS, what="filter", path="thesis.filters")
+    codes = lists.names(settings, SETTINGS, what="setting", path="thesis.settings")
+    better = []
+    if smoothed:
+        better = lists.names(smoothed, SMOOTHED, what="filter that is smoothed", path="thesis.smoothed")
+    better = [name for name in better if name in chosen]
     rows = []
     for code in codes:
         noise = Noise.of(code)
         flown = [fly(seed + k, noise, duration=duration) for k in range(flights)]
         bound = bound_of(flown, noise)
-        for name in names:
+        for name in chosen:
             errors = _errors(FILTERS[name], flown, noise, particles, engine)
             rows.append(_row(code, name, errors, bound))
         least = bound_of(flown, noise, smoothing=True) if better else bound
@@ -259,7 +262,7 @@ def thesis(
     def page(path: Path) -> None:
         noise = Noise.of(codes[0])
         flight = fly(seed, noise, duration=duration)
-        trials = {name: FILTERS[name](flight, noise, particles) for name in names}
+        trials = {name: FILTERS[name](flight, noise, particles) for name in chosen}
         write_page(rows, path, words=words, flight=flight, trials=trials)
 
     return Report(rows, {"thesis.png": lambda path: draw(rows, path), "thesis.html": page}, (words,))
@@ -406,11 +409,3 @@ def _truth(flight: Flight) -> Series:
 def _at_first(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     truth = _truth(flight)
     return truth["position"][0], truth["velocity"][0], truth["attitude"][0]
-
-
-def _listed(kind: str, text: str, valid: Any) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in valid:
-            raise UnknownNameError(kind, name, list(valid), path="thesis")
-    return names

@@ -50,7 +50,7 @@ def rows(*, repeats: int = 5) -> list[Row]:
 
 def written(pipeline: Pipeline) -> Source:
     """As the engine writes it."""
-    return generate(pipeline, tidy=lambda program: optimise(program, COMPILED), checked=False)
+    return generate(pipeline, tidy=lambda program: optimise(program, COMPILED), alone=False)
 
 
 def _written_apart(pipeline: Pipeline) -> None:

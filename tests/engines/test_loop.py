@@ -143,6 +143,71 @@ def test_a_step_that_does_more_than_compute_is_called(capsys):
     assert called == {"telling", "choosing"}
 
 
+@block
+def drawn_walk(x: Scalar, seen: Scalar, *, draw, xp) -> Scalar:
+    """Numbers of any shape, some of which only one arm of a selection needs."""
+    plain = xp.sum(draw.normal("row", (30,)) @ xp.linalg.cholesky(4.0 * xp.eye(30)))
+    rare = xp.sum(xp.exp(draw.uniform("rare", (40, 2)) * seen))
+    moved = xp.where(seen > 3.0, xp.stack([rare, rare]), xp.stack([x, plain]))
+    return xp.sum(moved) + draw.uniform("one", ())
+
+
+@graph
+def walks(seen: Stream[Scalar], other: Stream[Scalar]):
+    here = drawn_walk(seen, seen)
+    return {"here": here, "far": drawn_walk(latest(other, init=1.0, at=seen), seen, name="far", draws="far")}
+
+
+def test_draws_are_the_same_tick_by_tick(monkeypatch):
+    inputs = {
+        "seen": (np.arange(0, 700, 2), np.sin(np.arange(350.0)) * 4.0),
+        "other": (np.arange(0, 700, 7), np.arange(100.0)),
+    }
+    work = lambda seed: simulate(walks.build(), inputs, seed=seed)
+    found = [work(seed) for seed in (3, 4)]
+    assert (found[0]["here"].value != found[1]["here"].value).all()
+    same(found[0], tick_by_tick(monkeypatch, lambda: work(3)))
+    same(found[1], tick_by_tick(monkeypatch, lambda: work(4)))
+    made = walks.build()
+    run = Run(made, inputs, seed=3)
+    for _ in range(5):
+        run.step()
+    assert len(loops(made)) == 1
+    run.state = Run(made, inputs, seed=4).state  # another seed: nothing that was drawn before is used
+    changed = [f["here"].value[part] for f, part in zip(found, (slice(4), slice(4, None)), strict=True)]
+    np.testing.assert_array_equal(run.to_end().result()["here"].value, np.concatenate(changed))
+
+
+def test_what_is_known_and_what_is_not_taken_is_not_computed():
+    @block
+    def either(x: Scalar, *, xp) -> Scalar:
+        a = xp.linalg.solve(xp.eye(3) * 2.0, xp.ones((3,)))
+        b = a * xp.sin(x)
+        return xp.sum(xp.where(x > 1.0, xp.cos(b), xp.tan(b)))
+
+    @block
+    def again(x: Scalar, *, xp) -> Scalar:
+        return xp.sin(x) * 2.0
+
+    @graph
+    def both(x: Stream[Scalar]):
+        return {"a": either(x), "b": again(x)}
+
+    made = both.build()
+    at = np.array([0.5, 1.5, 1.0])
+    found = simulate(made, {"x": (np.arange(3), at)})
+    b = 0.5 * np.sin(at)
+    sums = [np.sum(f(np.full(3, v))) for f, v in zip((np.tan, np.cos, np.tan), b, strict=True)]
+    np.testing.assert_array_equal(found["a"].value, sums)
+    np.testing.assert_array_equal(found["b"].value, np.sin(at) * 2.0)
+    lines = [line.strip() for line in loops(made)[0].plan.source.splitlines()]
+    assert not any("o_solve" in line for line in lines)
+    assert sum("o_sin" in line for line in lines) == 1
+    cos, tan = (next(k for k, line in enumerate(lines) if f"= o_{f}(" in line) for f in ("cos", "tan"))
+    assert lines[cos - 1].startswith("if ")
+    assert lines[tan - 1] == "else:"
+
+
 def test_an_error_leaves_the_registers_of_the_last_good_tick():
     @block
     def tender(x: Any):

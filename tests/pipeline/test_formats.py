@@ -72,6 +72,14 @@ def test_formats_are_part_of_the_description(tmp_path):
     assert len(read.formats.fractions) == len(made.formats.fractions) > 0
 
 
+def test_formats_of_one_wider_width_were_written_otherwise_and_still_read():
+    now = Formats(20, {3: np.array(4), 5: np.array(1)}, wider={3: 40, 5: 30})
+    assert now.to_json()["held"] == [{"width": 30, "values": [5]}, {"width": 40, "values": [3]}]
+    assert now.widest == 40
+    before = {**now.to_json(), "held": {"width": 40, "values": [3]}}
+    assert Formats.from_json(before).wider == {3: 40}
+
+
 def test_a_description_of_version_1_still_reads():
     data = lower(library_case("kalman").graph).to_json()
     assert data["version"] == 2

@@ -61,3 +61,15 @@ def test_reals_become_whole_numbers_without_a_word(kind, real):
         want = 0 if exact != exact else min(max(exact, int(ends.min)), int(ends.max))
         assert found.dtype == kind
         assert [int(v) for v in found.ravel()] == [0, 3, want, 2], (one, kind)
+
+
+@pytest.mark.parametrize(
+    "condition", [True, np.False_, np.array(True), np.array([True, False, True]), [True, False, True]]
+)
+@pytest.mark.parametrize(
+    "sides", [(np.arange(3.0), np.ones(3)), (np.arange(3), 2.5), (1.0, np.arange(3.0)), (1.0, 2)]
+)
+def test_a_selection_is_numpys_whatever_the_condition_is_made_of(condition, sides):
+    found, wanted = NUMPY.where(condition, *sides), np.where(condition, *sides)
+    np.testing.assert_array_equal(found, wanted)
+    assert np.asarray(found).dtype == wanted.dtype

@@ -25,7 +25,8 @@ from flowgraph import (
 from flowgraph.blocks.geometry import lanes
 from flowgraph.cli import app
 from flowgraph.pipeline.format_files import load_formats
-from flowgraph.study.quantise import DECISIONS, RELATIVE, Flown, differences, quantise
+from flowgraph.study.differences import DECISIONS, RELATIVE, differences
+from flowgraph.study.quantise import Flown, quantise
 
 MS = 1_000_000
 
@@ -182,6 +183,76 @@ def test_attitudes_that_are_held_in_wide_words_are_rounded_to_those(rate):
     )
     assert narrow.figures["saturations"] == wide.figures["saturations"] == 0
     assert wide.figures[RELATIVE] < 1.2e-5 < 2e-5 < narrow.figures[RELATIVE]
+
+
+@block
+def looked_at(x: Scalar, *, xp) -> tuple[Scalar, Scalar]:
+    """Something that is judged, of which one part needs bits, and something that is not judged."""
+    near = xp.sin(x) - xp.sin(x - 1e-3)
+    return near + 1e-3 * xp.cos(x), xp.exp(0.1 * x) * xp.cos(2.0 * x)
+
+
+@graph
+def looking(x: Stream[Scalar]):
+    """One block."""
+    y, aside = looked_at(x)
+    return {"y": y, "aside": aside}
+
+
+def looked(seed):
+    x = np.random.default_rng(seed).uniform(-2.0, 2.0, 200)
+    return Flown(looking.build(), {"x": (np.arange(200, dtype=np.int64) * MS, x)}, "y")
+
+
+def widened(**options):
+    said: list[str] = []
+    found = quantise(
+        [looked(0)], [looked(2)], width=16, least=16, bounds={RELATIVE: 1e-4}, say=said.append, **options
+    )
+    return found, said
+
+
+def test_few_values_get_wider_words_where_that_keeps_the_bound():
+    with pytest.raises(LoweringError, match="cannot be trusted at 16 bits"):
+        widened()
+    found, said = widened(widen=26)
+    assert found.figures["saturations"] == 0
+    assert found.figures[RELATIVE] <= 1e-4
+    count = found.figures["wide_values"]
+    bits: dict[str, set[int]] = {}
+    for row in found.values():
+        bits.setdefault(row["name"].split()[1].rstrip(","), set()).add(row["bits"])
+    assert 0 < count < len(found.values()) - 3
+    assert sorted(found.formats.by_width()) == [26]
+    assert len(found.formats.wider) == count
+    assert bits["sin"] == {26}
+    assert bits["exp"] == {16}  # it is not judged
+    (note,) = (words for words in found.notes if "values have 26 bits" in words)
+    assert note.startswith(f"{count} of {len(found.values())} values have 26 bits beside 16: ")
+    assert "tests.study.test_quantise:" in note
+    assert any("does not hold" in words for words in said)
+    again, _ = widened(widen=26)
+    assert again.formats.to_json() == found.formats.to_json()
+    flight = looked(2)
+    ours, theirs = (
+        simulate(flight.graph, flight.inputs, formats=found.formats, **how)
+        for how in ({"engine": "fixed"}, {"engine": "c", "dtype": "fixed"})
+    )
+    np.testing.assert_array_equal(ours.y.value, theirs.y.value)
+    real = simulate(flight.graph, flight.inputs, engine="reference")
+    assert differences(real, ours.series, "y")[RELATIVE] == found.figures[RELATIVE]
+
+
+def test_where_the_bound_holds_nothing_is_widened_and_where_it_cannot_it_is_refused():
+    found = quantise([looked(0)], [looked(2)], width=26, least=26, widen=30, bounds={RELATIVE: 1e-4})
+    assert not found.formats.wider
+    with pytest.raises(LoweringError, match="(?s)cannot be trusted at 16 bits.*wide_values"):
+        widened(widen=17)
+    for wrong in ({"widen": 16}, {"widen": 12}, {"widen": 33}):
+        with pytest.raises(DeclarationError, match="(?s)cannot be widened to this.*17 to 32 bits"):
+            widened(**wrong)
+    with pytest.raises(DeclarationError, match="(?s)cannot be widened to this.*--width less than 32"):
+        quantise([looked(0)], [looked(2)], width=32, widen=32, bounds={RELATIVE: 1e-4})
 
 
 def test_a_bound_that_nobody_keeps_is_refused_with_a_place():

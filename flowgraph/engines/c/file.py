@@ -17,18 +17,20 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.engines.c.constants import start_lines, table_text, without_repeats
 from flowgraph.engines.c.entry import entry_text, parameters, reaction_name
 from flowgraph.engines.c.expand import Expander
 from flowgraph.engines.c.expressions import Expressions
 from flowgraph.engines.c.header import header
 from flowgraph.engines.c.helpers import helper_text, own_text
+from flowgraph.engines.c.memory import Memory
 from flowgraph.engines.c.names import Names, given, made, names_of
 from flowgraph.engines.c.nodes import Buffer, Node, Store, Tape, View
 from flowgraph.engines.c.patterns import Pattern, shared
 from flowgraph.engines.c.preamble import MACROS, PACK, REFUSED
 from flowgraph.engines.c.schedule import schedule
 from flowgraph.engines.c.statements import Writer
-from flowgraph.engines.c.syntax import comment, ctype, number
+from flowgraph.engines.c.syntax import comment
 from flowgraph.engines.c.tables import join_tables
 from flowgraph.engines.c.values import Value, row_major
 from flowgraph.pipeline.optimise.aside import CHOOSE, Choice, put_aside
@@ -37,9 +39,6 @@ from flowgraph.pipeline.program import Program, specialise
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.replay import Case
 from flowgraph.recorder.trace import Instruction
-
-_LOCAL_BYTES = 512
-_BYTES = {"bool": 1, "int32": 4, "uint32": 4, "int64": 8, "uint64": 8}
 
 
 @dataclass(frozen=True)
@@ -75,20 +74,20 @@ class File:
     """One file of C: reactions, and what they need.
 
     Args:
-        pipeline, real, patterns, tidy, checked: as for `generate`.
+        pipeline, real, patterns, tidy, alone: as for `generate`.
     """
 
     writer: type[Writer] = Writer
 
     def __init__(
-        self, pipeline: Pipeline, real: str, patterns: list[int] | None, tidy: Any, checked: bool
+        self, pipeline: Pipeline, real: str, patterns: list[int] | None, tidy: Any, alone: bool
     ) -> None:
         self.pipeline, self.real, self.patterns, self.tidy = pipeline, real, patterns, tidy
-        self.checked = checked
+        self.alone = alone
         self.names = names_of(pipeline)
         self.expressions = Expressions(real, self.turn, self.choice)
         self.constants: dict[Any, tuple[str, Buffer]] = {}
-        self.pool: dict[str, list[int]] = {}
+        self.memory = Memory(real, lambda dtype: self.expressions.ctype(dtype))
         self.presence: dict[int | None, tuple[int, int]] = {}
         self.longest = 0
 
@@ -97,7 +96,7 @@ class File:
         whole = self.patterns is None
         patterns = [Pattern.all(self.pipeline)] if whole else shared(self.pipeline, self.patterns or ())
         reactions = [self.reaction(pattern) for pattern in patterns]
-        reset = self._reset()
+        reset = self._reset() if self.alone else None
         parts = [
             f'#include "{m}.h"',
             "",
@@ -113,10 +112,10 @@ class File:
             *(text for _, text in self.expressions.functions.values()),
             *reactions,
             reset,
-            entry_text(self.pipeline, self.names, self.real, patterns, checked=self.checked),
+            entry_text(self.pipeline, self.names, self.real, patterns, checked=self.alone),
         ]
         text = "\n".join(p for p in parts if p is not None).rstrip() + "\n"
-        head = partial(header, self.pipeline, self.names, self.real, self.patterns, self.pool)
+        head = partial(header, self.pipeline, self.names, self.real, self.patterns, self.memory.members())
         said = hashlib.sha256(f"{head('')}{text}".encode()).hexdigest()[:8]
         return Source(
             self.names,
@@ -172,8 +171,8 @@ class File:
                 roots += places[n].writers
             elif n != cell.read:
                 roots += self._write(expander, self.state[name], values[n])
-        plan = schedule(tape, roots)
-        work, local = self._memory(plan.span)
+        plan = schedule(tape, roots, blocks=self.writer.blocks)
+        work, local = self.memory.placed(plan.span)
         writer = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b))
         body = writer.body()
         self.longest = max(self.longest, *(math.prod(space) for _, space in writer.groups), 0)
@@ -267,8 +266,8 @@ class File:
                 expander.play(i)
         after = values[program.writes[0]]
         place = Buffer(result, "real", math.prod(after.shape), "output")
-        plan = schedule(tape, self._write(expander, place, after))
-        work, local = self._memory(plan.span, whose)
+        plan = schedule(tape, self._write(expander, place, after), blocks=self.writer.blocks)
+        work, local = self.memory.placed(plan.span, whose)
         body = self.writer(plan, self.expressions, lambda b: work.get(b) or self._name(b)).body()
         unused = [n for n in ("s", *inputs.values()) if not _names_it("\n".join(body), n)]
         return "\n".join([head, "{", *(f"    (void){n};" for n in unused), *local, *body, "}", ""])
@@ -324,11 +323,16 @@ class File:
         return values
 
     def _known(self, array: np.ndarray, dtype: str) -> Value:
+        kept, steps = without_repeats(array)
+        view = View(self._kept(kept, dtype), array.shape, 0, steps)
+        return Value(Spec(array.shape, dtype), view=view)
+
+    def _kept(self, array: np.ndarray, dtype: str) -> Buffer:
         key = (array.tobytes(), array.shape, dtype)
         if key not in self.constants:
             name = f"k{len(self.constants)}"
             self.constants[key] = name, Buffer(name, dtype, array.size, "const", data=array)
-        return _whole(self.constants[key][1], array.shape)
+        return self.constants[key][1]
 
     def _drawn(self, tape: Tape, site: Any, seed: Value) -> Value:
         blocks = -(-math.prod(site.shape) // 4)
@@ -355,9 +359,7 @@ class File:
     def _name(self, buffer: Buffer) -> str:
         if buffer.kind == "const" and not buffer.name:
             assert buffer.data is not None
-            value = self._known(buffer.data, buffer.dtype)
-            assert value.view is not None
-            buffer.name = value.view.buffer.name
+            buffer.name = self._kept(buffer.data, buffer.dtype).name
         if buffer.kind == "const":
             self.used_constants.add(buffer.name)
         return buffer.name
@@ -367,73 +369,24 @@ class File:
         used: set[str] = self.__dict__.setdefault("_used", set())
         return used
 
-    def _memory(
-        self, spans: dict[Buffer, tuple[int, int]], whose: str = ""
-    ) -> tuple[dict[Buffer, str], list[str]]:
-        """Names of the work buffers: small ones on the stack, large ones in the state, which are reused by
-        all reactions, or by all that `whose` says."""
-        names: dict[Buffer, str] = {}
-        local: list[str] = []
-        ends: dict[str, list[int]] = {}
-        pool: dict[str, list[int]] = {}
-        for buffer, (first, last) in sorted(spans.items(), key=lambda item: item[1][0]):
-            if buffer.name:
-                names[buffer] = buffer.name
-                continue
-            size = _BYTES.get(buffer.dtype, 8 if self.real == "double" else 4) * buffer.size
-            if size <= _LOCAL_BYTES:
-                names[buffer] = f"w{len(local)}"
-                kept = self.expressions.ctype(buffer.dtype)
-                local.append(f"    {kept} w{len(local)}[{max(buffer.size, 1)}];")
-                continue
-            kind = whose + buffer.dtype
-            slots, busy = pool.setdefault(kind, []), ends.setdefault(kind, [])
-            free = [k for k in range(len(slots)) if busy[k] < first]
-            fits = [k for k in free if slots[k] >= buffer.size] or free
-            k = min(fits, key=lambda j: abs(slots[j] - buffer.size), default=len(slots))
-            if k == len(slots):
-                slots.append(0)
-                busy.append(0)
-            slots[k], busy[k] = max(slots[k], buffer.size), last
-            names[buffer] = f"s->fg_work_{kind}_{k}"
-        for kind, slots in pool.items():
-            mine = self.pool.setdefault(kind, [])
-            mine += [0] * (len(slots) - len(mine))
-            for k, size in enumerate(slots):
-                mine[k] = max(mine[k], size)
-        return names, local
-
     # -- the rest of the file ------------------------------------------------------------------------
 
     def _constant(self, name: str, buffer: Buffer) -> str | None:
         if name not in self.used_constants or buffer.data is None:
             return None
-        numbers = [number(v, buffer.dtype, self.real) for v in buffer.data.ravel().tolist()] or ["0"]
-        rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
-        type_ = ctype(buffer.dtype, self.real)
-        return (
-            f"static const {type_} {name}[{max(buffer.size, 1)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
-        )
+        return table_text(name, buffer.data, Spec(buffer.data.shape, buffer.dtype), self.real)
+
+    def _table(self, array: np.ndarray, dtype: str) -> str:
+        return self._name(self._kept(array, dtype))
 
     def _reset(self) -> str:
         m = self.names.module
         lines = [f"void {m}_reset({m}_state *s, uint64_t seed)", "{"]
-        for name, cell in zip(
-            self._cell_names(), (c for r in self.pipeline.registers for c in r.cells), strict=True
-        ):
-            reset = np.asarray(cell.reset)
-            flat = [number(v, cell.dtype, self.real) for v in reset.ravel().tolist()]
-            if cell.shape == ():
-                lines.append(f"    s->{name} = {flat[0]};")
-            elif flat and len(set(flat)) == 1:
-                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {flat[0]};")
-            elif len(flat) <= 16:
-                lines += [f"    s->{name}[{i}] = {v};" for i, v in enumerate(flat)]
-            elif flat:
-                buffer = self._known(reset, cell.dtype).view
-                assert buffer is not None
-                start = self._name(buffer.buffer)
-                lines.append(f"    for (int32_t i = 0; i < {len(flat)}; i++) s->{name}[i] = {start}[i];")
+        cells = (c for r in self.pipeline.registers for c in r.cells)
+        for name, cell in zip(self._cell_names(), cells, strict=True):
+            start, spec = np.asarray(cell.reset), Spec(cell.shape, cell.dtype)
+            table = partial(self._table, dtype=cell.dtype)
+            lines += [f"    {line}" for line in start_lines(f"s->{name}", start, spec, self.real, table)]
         lines += ["    s->seed[0] = (uint32_t)seed;", "    s->seed[1] = (uint32_t)(seed >> 32);", "}", ""]
         return "\n".join(lines)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from flowgraph.engines.c.names import Names, given, made
 from flowgraph.engines.c.syntax import comment, ctype
@@ -18,10 +18,13 @@ def header(
     names: Names,
     real: str,
     patterns: Sequence[int] | None,
-    pool: Mapping[str, Sequence[int]],
+    work: Sequence[tuple[str, str, int]],
     number: str,
 ) -> str:
-    """The text of the header; `number` (8 hexadecimal digits) is this filter's and no other's."""
+    """The text of the header; `number` (8 hexadecimal digits) is this filter's and no other's.
+
+    `work` has the kind, the name and the size of each member of the state that is room to work in.
+    """
     m = names.module
     guard = f"FLOWGRAPH_{m.upper()}_H_"
     doc = [f" * {comment(line)}".rstrip() for line in pipeline.doc.splitlines()]
@@ -60,10 +63,9 @@ def header(
         lines.append(f"    /* {comment(register.path)} ({comment(register.role)}) */")
         lines += [_member(n, cell, real) for n, cell in zip(members, register.cells, strict=True)]
     lines.append("    uint32_t seed[2]; /* of the random numbers, low word first */")
-    sizes = [(d, k, n) for d, slots in sorted(pool.items()) for k, n in enumerate(slots)]
-    if sizes:
+    if work:
         lines.append("    /* room to work in during a call; nothing in it lasts */")
-        lines += [f"    {ctype(d.rpartition('_')[2], real)} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
+        lines += [f"    {ctype(dtype, real)} {name}[{size}];" for dtype, name, size in work]
     lines += [f"}} {m}_state;", ""]
     lines += [
         "/* Start anew, with the initial values of the graph. */",

@@ -161,7 +161,7 @@ class Compiled(Outputs):
                 dtype,
                 patterns=patterns,
                 tidy=lambda program: optimise(program, passes),
-                checked=False,  # faults and what is not finite are looked for by whoever plays
+                alone=False,  # whoever plays sets registers, and looks for faults and what is not finite
             )
             m = source.names.module
             loop = loop_text(pipeline, source)

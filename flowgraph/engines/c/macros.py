@@ -64,13 +64,18 @@ def index(strides: Sequence[int], names: Sequence[str]) -> str:
     return " + ".join(terms) or "0"
 
 
-def call(w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object) -> None:
-    """Call the function for these sizes and strides, which a file has once, for each of the batch."""
+def call(
+    w: Lines, kind: str, m: Macro, make: Callable[..., str], *more: object, given: Sequence[str] = ()
+) -> None:
+    """Call the function for these sizes and strides, which a file has once, for each of the batch.
+
+    `more` tells functions of the same sizes apart, `given` are arguments after the addresses.
+    """
     views = [*m.inputs, m.output]
     key = (kind, *more, *((v.shape[-2:], v.strides[-2:]) for v in views))
     name = w.write.function(key, kind, make, *views)
     with Loops(w, m.output.shape[:-2]) as batch:
-        w.line(f"{name}({', '.join(_pointer(w, v, batch) for v in views)});")
+        w.line(f"{name}({', '.join([*(_pointer(w, v, batch) for v in views), *given])});")
 
 
 _ACCUMULATORS = 12
@@ -80,7 +85,12 @@ _PACKED = 16_384
 """Elements of a matrix that are laid out for vectors at a time: they lie on the stack."""
 
 
-def _matmul(w: Lines, m: Macro) -> None:
+def write_product_of_block(w: Lines, m: Macro) -> None:
+    """Write a product of real matrices over the places of a block, added to that of the blocks before."""
+    _matmul(w, m, ("block", "end - block"))
+
+
+def _matmul(w: Lines, m: Macro, part: tuple[str, ...] = ()) -> None:
     type_ = ctype(m.output.buffer.dtype, w.write.real)
 
     def text(name: str, a: View, b: View, out: View) -> str:
@@ -98,7 +108,8 @@ def _matmul(w: Lines, m: Macro) -> None:
         kept, wide = ("fg_pack", f"FG_PACKS({columns})") if packed else (type_, columns)
         deep = min(inner, max(_PACKED // columns, 1))
         parted = packed and deep < inner
-        begin, end = ("first", "last") if parted else (0, inner)
+        assert not part or (packed and not parted)
+        begin, end = ("first", "last") if parted else (0, "count" if part else inner)
         nth = "(k - first)" if parted else "k"
 
         def so_far(r: int) -> list[str]:
@@ -119,7 +130,7 @@ def _matmul(w: Lines, m: Macro) -> None:
                 f"        for (int32_t j = 0; j < {wide}; j++) {{",
                 *(f"            row{r}[j] = {'none' if packed else '0'};" for r in each),
                 "        }",
-                *([line for r in each for line in so_far(r)] if parted else []),
+                *([line for r in each for line in so_far(r)] if parted or part else []),
                 f"        for (int32_t k = {begin}; k < {end}; k++) {{",
                 *(f"            const {type_} left{r} = a[{at(r)}];" for r in each),
                 f"            for (int32_t j = 0; j < {wide}; j++) {{",
@@ -157,7 +168,7 @@ def _matmul(w: Lines, m: Macro) -> None:
             [
                 f"/* ({rows} x {inner}) ({inner} x {columns}) */",
                 f"static FG_APART void {name}(const {type_} *restrict a, const {type_} *restrict b, "
-                f"{type_} *restrict out)",
+                f"{type_} *restrict out{', int32_t first, int32_t count' if part else ''})",
                 "{",
                 *(copy if packed else []),
                 *block(0, full, together),
@@ -168,7 +179,7 @@ def _matmul(w: Lines, m: Macro) -> None:
             ]
         )
 
-    call(w, "matmul", m, text, type_)
+    call(w, "matmul", m, text, type_, bool(part), given=part)
 
 
 def _cholesky(w: Lines, m: Macro) -> None:

@@ -11,13 +11,23 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
+from flowgraph.engines.c.blocks import in_blocks
 from flowgraph.engines.c.nodes import Buffer, Item, Macro, Node, Space, Store, Tape
 from flowgraph.engines.c.values import row_major
 
 Group = tuple[int, Space]
 REPEATED = ("load", "iota", "const", "given")
 """Operations that a loop does again rather than read from memory."""
+
+
+class Place(NamedTuple):
+    """Where the numbers of a loop lie: in a buffer, from an offset on, in these steps."""
+
+    buffer: Buffer
+    offset: int
+    strides: tuple[int, ...]
 
 
 @dataclass
@@ -27,16 +37,19 @@ class Schedule:
     Args:
         items: all that is needed, in order; those of a group have its level and space.
         uses: how often a node is named.
-        spills: the memory that keeps a node of one loop for later ones; where it is stored anyway, that.
+        spills: where a node of one loop is kept for later ones: where it is stored anyway, as a register's
+            new value is, or in memory of its own.
         late: state buffers that cannot be written in place, with the work buffer that stands in.
         span: first and last level at which a work buffer is in use.
+        blocks: loops that go block by block, with the product that takes each block.
     """
 
     items: list[Item] = field(default_factory=list)
     uses: dict[Node, int] = field(default_factory=lambda: defaultdict(int))
-    spills: dict[Node, Buffer] = field(default_factory=dict)
+    spills: dict[Node, Place] = field(default_factory=dict)
     late: dict[Buffer, Buffer] = field(default_factory=dict)
     span: dict[Buffer, tuple[int, int]] = field(default_factory=dict)
+    blocks: dict[Group, Macro] = field(default_factory=dict)
     levels: int = 1
 
 
@@ -61,8 +74,8 @@ def group_of(item: Item) -> Group:
     return item.level, () if isinstance(item, Macro) else item.space
 
 
-def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
-    """Order what the roots need."""
+def schedule(tape: Tape, roots: Iterable[Item], *, blocks: bool = False) -> Schedule:
+    """Order what the roots need; with `blocks`, products over many places go with the loops before them."""
     live = _live(roots)
     made = Schedule(sorted(live, key=lambda i: i.order))
     for item in made.items:
@@ -73,11 +86,18 @@ def schedule(tape: Tape, roots: Iterable[Item]) -> Schedule:
         for node in arguments(item):
             made.uses[node] += 1
             users[node].append(group_of(item))
-    kept = {i.node: i.buffer for i in made.items if isinstance(i, Store) and _is_whole(i)}
+    kept = {
+        i.node: Place(i.buffer, i.offset, i.strides)
+        for i in made.items
+        if isinstance(i, Store) and (_is_whole(i) or _is_state(i))
+    }
     for node, groups in users.items():
         if node.space and node.op not in REPEATED and any(g[0] > node.level for g in groups):
-            made.spills[node] = kept.get(node) or Buffer("", node.dtype, _size(node.space), "work")
+            own = Buffer("", node.dtype, _size(node.space), "work")
+            made.spills[node] = kept.get(node) or Place(own, 0, row_major(node.space))
     _write_state(made, users)
+    if blocks:
+        made.blocks = in_blocks(made.items, [place.buffer for place in made.spills.values()])
     _spans(made, users)
     return made
 
@@ -86,6 +106,12 @@ def _is_whole(store: Store) -> bool:
     """Whether it keeps its node as a spill would: all of it, in C's order."""
     plain = store.buffer.kind == "work" and not store.offset and store.space == store.node.space != ()
     return plain and store.strides == row_major(store.space)
+
+
+def _is_state(store: Store) -> bool:
+    """Whether it gives a register a new value, in the loop of its node: that stays until the next tick."""
+    there = store.buffer.kind == "state" and store.space == store.node.space and len(store.space) == 1
+    return there and store.node.dtype == store.buffer.dtype == "real"
 
 
 def _size(space: Space) -> int:
@@ -187,8 +213,9 @@ def _spans(made: Schedule, users: dict[Node, list[Group]]) -> None:
                 extend(buffer, level)
                 if isinstance(item, Node) and item.op == "load" and item.space:
                     extend(buffer, *(g[0] for g in users[item]))
-    for node, buffer in made.spills.items():
-        extend(buffer, node.level, *(g[0] for g in users[node]))
+    for node, place in made.spills.items():
+        if place.buffer.kind == "work":
+            extend(place.buffer, node.level, *(g[0] for g in users[node]))
 
 
 def is_flat(items: Iterable[Node | Store], space: Space) -> bool:
@@ -209,8 +236,3 @@ def _strides(part: Node | Store) -> tuple[int, ...]:
     if isinstance(part, Store):
         return part.strides
     return part.extra[2] if part.op == "load" else ()
-
-
-def strides_of(space: Space) -> tuple[int, ...]:
-    """Of a spill."""
-    return row_major(space)

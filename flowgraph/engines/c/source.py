@@ -25,7 +25,7 @@ def generate(
     *,
     patterns: Sequence[int] | None = None,
     tidy: Callable[[Program], Program] = lambda program: program,
-    checked: bool = True,
+    alone: bool = True,
 ) -> Source:
     """The C of a pipeline.
 
@@ -34,7 +34,8 @@ def generate(
         dtype: "float64" or "float32", what `real` is.
         patterns: the patterns of present inputs that can come; all if left out.
         tidy: makes a program shorter: that of a pattern, that of all patterns, or that of a turn of a loop.
-        checked: whether what the entry returns says that a queue was full or an output is not finite.
+        alone: whether it has a function that gives registers their first values, and what its entry returns
+            says that a queue was full or an output is not finite; or its caller sees to both.
 
     Raises:
         LoweringError: for an operation that C has no rule for, or more ports than a word has bits.
@@ -53,7 +54,7 @@ def generate(
     if chosen is not None and len(chosen) > MOST_PATTERNS:
         chosen = None
     real = "double" if dtype == "float64" else "float"
-    return File(pipeline, real, chosen, tidy, checked).source()
+    return File(pipeline, real, chosen, tidy, alone).source()
 
 
 def every_pattern(pipeline: Pipeline) -> list[int] | None:

@@ -6,11 +6,12 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 
+from flowgraph.engines.c.blocks import BLOCK, of_a_block
 from flowgraph.engines.c.expressions import Expressions
 from flowgraph.engines.c.lines import Lines
-from flowgraph.engines.c.macros import write_macro
+from flowgraph.engines.c.macros import write_macro, write_product_of_block
 from flowgraph.engines.c.nodes import Buffer, Macro, Node, Space, Store
-from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat, strides_of
+from flowgraph.engines.c.schedule import REPEATED, Schedule, group_of, is_flat
 from flowgraph.engines.c.syntax import comment, number
 from flowgraph.recorder.ops import FUNCTIONS
 
@@ -27,12 +28,16 @@ class Writer(Lines):
         names: the C expression of a buffer.
     """
 
+    blocks = True
+    """Whether it writes products in blocks."""
+
     def __init__(self, plan: Schedule, expressions: Expressions, names: Callable[[Buffer], str]) -> None:
         super().__init__(expressions, names)
         self.plan = plan
         self.uniform: dict[Node, str] = {}
         self.local: dict[Node, str] = {}
         self.place, self.flat = "", False
+        self.in_block: frozenset[Buffer] = frozenset()
         self.often: set[Node] = set()
         self.inverse: dict[Node, str] = {}
         self.kept = {i.node for i in plan.items if isinstance(i, Store) and i.buffer.kind == "state"}
@@ -46,7 +51,7 @@ class Writer(Lines):
             elif space and not isinstance(item, Macro):
                 if not (isinstance(item, Node) and item.op in REPEATED):
                     self.groups[level, space].append(item)
-            else:
+            elif item not in plan.blocks.values():
                 self.straight[level].append(item)
 
     def body(self) -> list[str]:
@@ -54,7 +59,9 @@ class Writer(Lines):
         for level in range(self.plan.levels):
             self._straight(level)
             for (at, space), items in sorted(self.groups.items()):
-                if at == level:
+                if at == level and (at, space) in self.plan.blocks:
+                    self._loop_in_blocks(space, items, self.plan.blocks[at, space])
+                elif at == level:
                     self._loop(space, items)
         for buffer, stand_in in self.plan.late.items():
             self._note("state that was still in use until here")
@@ -106,7 +113,21 @@ class Writer(Lines):
 
     # -- loops ---------------------------------------------------------------------------------------
 
-    def _loop(self, space: Space, items: list[Node | Store]) -> None:
+    def _loop_in_blocks(self, space: Space, items: list[Node | Store], product: Macro) -> None:
+        (n,) = space
+        self.line(f"for (int32_t block = 0; block < {n}; block += {BLOCK}) {{")
+        self.depth += 1
+        self.line(f"const int32_t end = block < {n - BLOCK} ? block + {BLOCK} : {n};")
+        self.in_block = frozenset(v.buffer for v in product.inputs)
+        self._loop(space, items, ("block", "end"))
+        self.in_block = frozenset()
+        self._note(product.origin)
+        write_product_of_block(self, of_a_block(product))
+        self.depth -= 1
+        self.line("}")
+        self.place = ""
+
+    def _loop(self, space: Space, items: list[Node | Store], part: tuple[str, str] | None = None) -> None:
         reductions = [i for i in items if isinstance(i, Node) and i.op == "reduce"]
         for node in reductions:
             self.uniform[node] = f"v{node.order}"
@@ -119,7 +140,8 @@ class Writer(Lines):
         if len(sizes) == 1:
             self.at_once(reductions, items)
         for k, n in enumerate(sizes):
-            self.line(f"for (int32_t i{k} = 0; i{k} < {n}; i{k}++) {{")
+            first, end = part or ("0", n)
+            self.line(f"for (int32_t i{k} = {first}; i{k} < {end}; i{k}++) {{")
             self.depth += 1
         self.local = {}
         late: list[Store] = []
@@ -138,7 +160,7 @@ class Writer(Lines):
             else:
                 self._compute(item, self.local)
         for node in [n for n in items if isinstance(n, Node) and n in self.plan.spills]:
-            if not self.plan.spills[node].writers:
+            if not self.plan.spills[node].buffer.writers:
                 self.line(f"{self._spilled(node)} = {self.local[node]};")
         for item in late:
             self._store(item)
@@ -212,10 +234,15 @@ class Writer(Lines):
 
     def _store(self, item: Store) -> None:
         buffer = self.plan.late.get(item.buffer, item.buffer)
-        self.line(f"{self.at(buffer, self.index(item.offset, item.strides))} = {self.stored(item)};")
+        if buffer in self.in_block:
+            where = f"{item.offset // item.space[0] * BLOCK} + i0 - block"
+        else:
+            where = self.index(item.offset, item.strides)
+        self.line(f"{self.at(buffer, where)} = {self.stored(item)};")
 
     def _spilled(self, node: Node) -> str:
-        return self.at(self.plan.spills[node], self.index(0, strides_of(node.space)))
+        buffer, offset, strides = self.plan.spills[node]
+        return self.at(self.plan.late.get(buffer, buffer), self.index(offset, strides))
 
     def _copy(self, buffer: Buffer, stand_in: Buffer) -> None:
         """Carry over the places that were written."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.engines.c.constants import without_repeats
 from flowgraph.engines.c.nodes import Buffer, Node, Space, Tape, View
 from flowgraph.recorder.ops import Spec
 
@@ -102,7 +103,8 @@ class Values:
             row = buffer.data.ravel()[offset :: strides[0]][: space[0]]
             if (row == row[0]).all():
                 return tape.const(row[0], buffer.dtype)
-            steps = np.diff(row) if row.dtype.kind == "i" else np.zeros(0)
+            whole = row.dtype.kind == "i" or row.dtype == np.uint32
+            steps = np.diff(row.astype(np.int64)) if whole else np.zeros(0)
             if steps.size and (steps == steps[0]).all():
                 count = tape.op("multiply", "int64", tape.iota(0, space), tape.const(steps[0], "int64"))
                 count = tape.op("add", "int64", count, tape.const(row[0], "int64"))
@@ -141,6 +143,8 @@ class Values:
         view = self.stored(v)
         if _same_strides(view, wanted):
             return View(view.buffer, v.shape, view.offset, wanted)
+        if view.buffer.kind == "const":
+            return self._in_work(v)
         return self.put(Value(v.spec, self.elements(v)), wanted)
 
     def own(self, v: Value) -> View:
@@ -148,6 +152,9 @@ class Values:
         view = self.packed(v)
         if view.buffer.kind != "const":
             return view
+        return self._in_work(v)
+
+    def _in_work(self, v: Value) -> View:
         made = View(self.tape.work(v.spec.dtype, math.prod(v.shape)), v.shape, 0, row_major(v.shape))
         self.write(made, self.elements(v))
         return made
@@ -176,10 +183,11 @@ class Values:
 
     def constant(self, array: np.ndarray, dtype: str) -> View:
         """A constant in memory; equal ones share it."""
-        key = (array.tobytes(), array.shape, dtype)
+        kept, steps = without_repeats(array)
+        key = (kept.tobytes(), kept.shape, dtype)
         if key not in self.constants:
-            self.constants[key] = Buffer("", dtype, array.size, "const", data=array)
-        return View(self.constants[key], array.shape, 0, row_major(array.shape))
+            self.constants[key] = Buffer("", dtype, kept.size, "const", data=kept)
+        return View(self.constants[key], array.shape, 0, steps)
 
 
 _HOST: dict[str, Any] = {

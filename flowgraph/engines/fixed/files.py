@@ -16,7 +16,8 @@ from flowgraph.engines.fixed.places import KNOWN, KNOWN_SMALL, Place
 from flowgraph.engines.fixed.shifts import slim
 from flowgraph.engines.fixed.standalone import Standalone
 from flowgraph.errors import LoweringError
-from flowgraph.pipeline.formats import FREE, Formats
+from flowgraph.pipeline.format_words import wider_words
+from flowgraph.pipeline.formats import FREE
 from flowgraph.pipeline.pipeline import Pipeline
 
 _MOST_INPUTS = 8
@@ -62,13 +63,14 @@ def _header(source: Standalone, unknown: list[int]) -> str:
     player = Integers(
         pipeline, [c.reset for r in pipeline.registers for c in r.cells], np.zeros(2, np.uint32)
     )
+    formats = player.formats
     (_, time), (_, seed) = (source.held(n) for n in (pipeline.time, pipeline.seed))
     lines = [
         f"#ifndef {guard}",
         f"#define {guard}",
         "#include <stdint.h>",
         "",
-        f"/* {pipeline.name} in fixed point of {_bits(player.formats)} bits.",
+        f"/* {pipeline.name} in fixed point of {formats.width} bits{wider_words(formats)}.",
         "   A real x is the whole number nearest to x 2^fraction.",
         "   Words lie in v and w, each value row by row from its place on. */",
         f"enum {{ FX_SMALL = {max(source.sizes['v'], 1)}, FX_WIDE = {max(source.sizes['w'], 1)} }};",
@@ -103,11 +105,6 @@ def _header(source: Standalone, unknown: list[int]) -> str:
     if unknown:
         lines.append(f"/* patterns without formats: {', '.join(map(str, unknown))} */")
     return "\n".join([*lines, "", "#endif", ""])
-
-
-def _bits(formats: Formats) -> str:
-    held = f", registers and what is added up in them {formats.held_width}" if formats.held else ""
-    return f"{formats.width}{held}"
 
 
 def _place(name: str, at: Place, shape: tuple[int, ...], dtype: str, fraction: np.ndarray | None) -> str:

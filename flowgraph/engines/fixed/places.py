@@ -157,7 +157,7 @@ def held_values(pipeline: Pipeline) -> list[tuple[int, Spec]]:
 
 def long_held(player: Integers, keys: Sequence[int]) -> set[int]:
     """The inputs and registers that take 64 bits: they may hold a reading that is not there, or are wide."""
-    wide = {n for n in player.formats.held if player.formats.held_width > WIDEST}
+    wide = {n for n, bits in player.formats.wider.items() if bits > WIDEST}
     cells = [c for r in player.pipeline.registers for c in r.cells]
     absent = set(player.formats.absent)
     for program in (player.bind(key).program for key in keys):

@@ -173,7 +173,9 @@ class Sizes:
         """Take back what was made wider."""
         self._wider.clear()
 
-    def formats(self, width: int, margin: float = 2.0, held_width: int = 0) -> Formats:
+    def formats(
+        self, width: int, margin: float = 2.0, held_width: int = 0, wider: Mapping[int, int] | None = None
+    ) -> Formats:
         """Formats in which numbers fit that are `margin` times as large as any that was seen, or as large as
         any can be, where that is proven and less.
 
@@ -181,11 +183,12 @@ class Sizes:
             width: bits of a word.
             margin: as above.
             held_width: bits of inputs, registers and what is added up in them; 0: those of `width`.
+            wider: bits of other values, where they are more.
         """
         fractions: dict[int, np.ndarray] = {}
         proven: set[int] = set()
-        held = _held(self.pipeline) if held_width > width else frozenset()
-        bits = {n: held_width for n in held}
+        bits = dict(wider or {})
+        bits |= dict.fromkeys(_held(self.pipeline) if held_width > width else (), held_width)
         errors = _Errors(self.pipeline, width, {n: w - WIDEST for n, w in bits.items() if w > WIDEST})
         for n in self.largest:
             if n in errors.given:
@@ -208,9 +211,8 @@ class Sizes:
             n: np.ldexp(0.5, bits.get(n, width) - 1 - f.astype(int)) / margin for n, f in fractions.items()
         }
         structure = structure_of(self.pipeline)
-        most = held_width if held else 0
         absent = frozenset(self.absent)
-        return Formats(width, fractions, margin, absent, structure, held, most, frozenset(proven))
+        return Formats(width, fractions, margin, absent, structure, bits, frozenset(proven))
 
 
 def _held(pipeline: Pipeline) -> frozenset[int]:

@@ -13,7 +13,7 @@ traces, since a person steps through the lines of blocks.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -22,9 +22,10 @@ import numpy as np
 
 from flowgraph.data.series import Series
 from flowgraph.engines.python.plan import Plan, Presence, Writer, compiled, named
-from flowgraph.engines.python.steps import KINDS, Written, silent, single, written
+from flowgraph.engines.python.steps import KINDS, Line, Written, silent, single, written
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.language.recording import StepTrace
+from flowgraph.recorder.random import Site
 from flowgraph.types import ArrayType, Signal, StructType, Type, leaves_of, unflatten
 
 MOST_PATTERNS = 8
@@ -36,12 +37,14 @@ _PART = 4096
 @dataclass(frozen=True)
 class Loop:
     """A compiled loop, the names that it needs, and where it goes by leaves: which sources it reads, and
-    which of the collected streams it keeps."""
+    which of the collected streams it keeps. What it draws has for each name its site, and the patterns at
+    which it is drawn; None where a condition says so."""
 
     plan: Plan
     names: dict[str, Any]
     open: frozenset[int]
     kept: frozenset[int]
+    sites: Mapping[str, tuple[Site, frozenset[int] | None]]
 
 
 def loop(graph: Graph, patterns: tuple[int, ...]) -> Loop | None:
@@ -104,7 +107,7 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
     to = " or ".join(named(graph, key) for key in patterns)
     code = compiled(graph, "\n".join(lines) + "\n", owner, to)
     kept = frozenset(k for k, c in enumerate(graph.collected) if which.here(c.wire))
-    return Loop(code, which.names, frozenset(which.sources.values()), kept)
+    return Loop(code, which.names, frozenset(which.sources.values()), kept, which.drawn(patterns))
 
 
 def leaves(type_: Type, text: str) -> list[str]:
@@ -143,6 +146,7 @@ class _Which:
         }  # fmt: skip
         self._texts: dict[tuple[int, int], Written] = {}
         writers = [Writer(graph, key) for key in patterns]
+        self._writers = writers
         self.calls = {i: call for i, call in graph.calls if self._may(i, call, writers)}
         ports = [i for i, n in enumerate(graph.nodes) if isinstance(n, SourceNode)]
         read = {w.node for call in self.calls.values() for w in self._wires(call)}
@@ -163,6 +167,17 @@ class _Which:
                     self.names[f"make{index}_{k}" if isinstance(node, CallNode) else f"make{index}"] = _maker(
                         type_
                     )
+
+    def drawn(self, patterns: tuple[int, ...]) -> dict[str, tuple[Site, frozenset[int] | None]]:
+        """The sites of the calls that are written out, and at which patterns they are drawn."""
+        found: dict[str, tuple[Site, frozenset[int] | None]] = {}
+        for (index, _), text in self._texts.items():
+            if index in self.calls:
+                fires = [w.when(self.calls[index].firing) for w in self._writers]
+                sure = frozenset(k for k, there in zip(patterns, fires, strict=True) if there is True)
+                for name, site in text.sites.items():
+                    found[name] = site, None if any(isinstance(f, str) for f in fires) else sure
+        return found
 
     def locals(self, register: int) -> list[str]:
         """The variables that hold the leaves of a register."""
@@ -187,7 +202,7 @@ class _Which:
         known = index, id(step)
         if known not in self._texts:
             state = None if call.state is None else self.graph.nodes[call.state].type  # type: ignore[union-attr]
-            made = written(step, [self.type(a) for a in call.arguments], state, index)
+            made = written(step, [self.type(a) for a in call.arguments], state)
             if made is None:
                 return None
             self._texts[known] = made
@@ -219,6 +234,8 @@ class _LoopWriter(Writer):
         self.lines, self.indent = [], 4
         self.leaves: dict[tuple[int, int], list[str]] = {}
         self.next: dict[int, list[str]] = {}
+        self.known: dict[str, str] = {}
+        """By what is computed, the variable that has it already."""
 
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)
@@ -275,7 +292,8 @@ class _LoopWriter(Writer):
             return
         step, text = self.variant(call), self.which.text(index, call, self)
         assert text is not None
-        local, numbers = dict(text.constants), set(text.numbers)
+        local, numbers, outside = dict(text.constants), set(text.numbers), self.known
+        self.known = dict(outside)
         if firing is not True:
             for k, dynamic in enumerate(call.dynamic):
                 if dynamic:
@@ -294,9 +312,7 @@ class _LoopWriter(Writer):
             if given:
                 local |= dict(zip(given, self._read(argument), strict=True))
         for line in text.lines:
-            i = line.instruction
-            self.emit(f"w{index}_{i.out} = {line.form.format(*(local[a] for a in i.args))}", call.path)
-            local[i.out] = f"w{index}_{i.out}"
+            self._line(line, index, local, call.path)
 
         def own(numbers_: Iterable[int], type_: Type) -> list[str]:
             return [
@@ -317,6 +333,29 @@ class _LoopWriter(Writer):
             if len(self.lines) == before:
                 self.emit("pass", call.path)
             self.indent -= 1
+            self.known = outside
+
+    def _line(self, line: Line, index: int, local: dict[int, str], owner: str) -> None:
+        """A line of a step, unless a block before it has computed the same."""
+        i, name = line.instruction, f"w{index}_{line.instruction.out}"
+        if line.arms is None or not any(line.arms):
+            text = line.form.format(*(local[a] for a in i.args))
+            if text in self.known:
+                local[i.out] = self.known[text]
+                return
+            self.emit(f"{name} = {text}", owner)
+            self.known[text] = local[i.out] = name
+            return
+        for word, lines, taken in zip((f"if {local[i.args[0]]}", "else"), line.arms, i.args[1:], strict=True):
+            self.emit(f"{word}:", owner)
+            outside, self.known = self.known, dict(self.known)
+            self.indent += 1
+            for inner in lines:
+                self._line(inner, index, local, owner)
+            self.emit(f"{name} = {local[taken]}", owner)
+            self.indent -= 1
+            self.known = outside
+        local[i.out] = name
 
     def _own(
         self,
@@ -327,13 +366,14 @@ class _LoopWriter(Writer):
         numbers: set[int],
         call: CallNode,
     ) -> str:
-        """A value in a variable of its own, since a register may be written before it is read; a single
-        number as Python's."""
+        """A value in a variable that nobody writes until the next tick, as a register may be before it is
+        read; a single number as Python's."""
         text = local[number]
         if single(leaf) and number not in numbers:
+            self.known = {text_: n for text_, n in self.known.items() if n != text}  # it becomes another kind
             text = f"{KINDS[leaf.dtype][0]}({text})"
             numbers.add(number)
-        if text != f"w{index}_{number}":
+        if text[0] not in "wx":
             self.emit(f"w{index}_{number} = {text}", call.path)
             local[number] = f"w{index}_{number}"
         return local[number]

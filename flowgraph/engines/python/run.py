@@ -26,6 +26,7 @@ from flowgraph.data.series import Series, chained
 from flowgraph.data.tape import Tape, batches, joined, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
+from flowgraph.engines.python.draws import Ahead, expected
 from flowgraph.engines.python.loop import Loop, feed, loop, numbers
 from flowgraph.engines.python.plan import Plan, bindings, bound, plan
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
@@ -89,6 +90,7 @@ class Run:
         self._full: dict[int, FifoOverflowError] = {}  # by call
         self._told: set[int] = set()  # the calls whose overflow was raised
         check_start(init, state, path=graph.name)
+        self._ahead: dict[str, Ahead] = {}
         if state is not None:
             self.state = state
         self._entrance = Entrance(graph, self._last, not_finite)
@@ -135,7 +137,11 @@ class Run:
             types = [graph.port(c.wire).type for c in graph.collected]
             self._columns = {k: [[] for _ in leaves_of(types[k])] for k in self._loop.kept}
             keep = {f"c{k}_{n}": c.append for k, some in self._columns.items() for n, c in enumerate(some)}
-            names = self._names | self._loop.names | keep | {"broken": self._broken.append}
+            self._ahead = {
+                name: Ahead(site, expected(self._tape, at), self._key)
+                for name, (site, at) in self._loop.sites.items()
+            }
+            names = self._names | self._loop.names | keep | self._ahead | {"broken": self._broken.append}
             self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
@@ -373,6 +379,8 @@ class Run:
         self._refuse_others("state")
         self._registers[:], self._last, seed = load_registers(self.graph, tree)
         self._key[:] = seed_words(seed)
+        for ahead in self._ahead.values():
+            ahead.forget()
         self.time = max(self._last.values(), default=NEVER)
 
     @property

@@ -94,7 +94,7 @@ class Image:
         cells = [c for r in pipeline.registers for c in r.cells]
         self.player = Integers(pipeline, [c.reset for c in cells], np.zeros(2, np.uint32))
         self.width = self.player.formats.width
-        self.wide = max(self.width, self.player.formats.held_width)
+        self.wide = self.player.formats.widest
         plans = [Plan(Tick(self.player, key)) for key in keys]
         for plan in plans:
             need_room(plan)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flowgraph.engines.fixed import absent, shifts
+from flowgraph.engines.fixed.counts import names_of
 from flowgraph.engines.fixed.engine import Bound, Integers, site_of
 from flowgraph.engines.fixed.shifts import Site
 from flowgraph.engines.verilog.lookup import Lookup
@@ -48,16 +49,25 @@ class Tick(Lookup):
     """
 
     def __init__(self, player: Integers, key: int) -> None:
-        super().__init__(player.formats.width, max(player.formats.width, player.formats.held_width))
+        super().__init__(player.formats.width, player.formats.widest)
         self.pipeline, self.key = player.pipeline, key
         self.formats = player.formats
+        by_width = self.formats.by_width()
         if self.wide > WIDEST:
             raise LoweringError(
                 "held words are wider than those of the machine",
-                path=self.pipeline.name,
+                path=names_of(self.pipeline)[by_width[self.wide][0]],
                 expected=f"{WIDEST} bits or fewer",
                 got=str(self.wide),
                 fix="find formats with a smaller --held-width, or lower the graph to C",
+            )
+        if len(set(by_width) - {self.width}) > 1:
+            raise LoweringError(
+                "the machine has words of two widths",
+                path=names_of(self.pipeline)[by_width[min(by_width)][0]],
+                expected=f"{self.width} or {self.wide} bits",
+                got=str(min(by_width)),
+                fix="find formats with --widen and --held-width alike, or lower the graph to C",
             )
         self.bound: Bound = player.bind(key)
         self.shortest = shortest_row(self.pipeline)

@@ -305,7 +305,7 @@ def test_the_engine_in_this_process_has_no_checks_of_its_own():
     """They are the player's; a tick there costs what it did."""
     pipeline = lower(paired.build())
     assert "fg_finite" in generate(pipeline).source
-    assert "fg_finite" not in generate(pipeline, checked=False).source
+    assert "fg_finite" not in generate(pipeline, alone=False).source
 
 
 def test_kept_nan_comes_back(tmp_path):

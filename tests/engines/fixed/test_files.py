@@ -45,10 +45,14 @@ def _numbers(result, name):
     return [(int(t), np.concatenate(r)) for t, r in zip(series.time, rows, strict=True)]
 
 
-@pytest.mark.parametrize("held", [0, 30, 44])
-def test_the_written_files_replay_what_the_interpreter_gives(held, tmp_path):
+@pytest.mark.parametrize(("held", "every"), [(0, 0), (30, 0), (44, 0), (44, 4)])
+def test_the_written_files_replay_what_the_interpreter_gives(held, every, tmp_path):
     case = library_case("kalman", 0.5)
-    formats = sizes_of(case.graph, case.inputs).formats(24, 4.0, held) if held else formats_of("kalman", 24)
+    formats = formats_of("kalman", 24)
+    if held:
+        wider = dict.fromkeys(sorted(formats.fractions)[::every] if every else (), 32)
+        formats = sizes_of(case.graph, case.inputs).formats(24, 4.0, held, wider)
+        assert len(formats.by_width()) == 1 + (every > 0)
     pipeline = with_formats(lower(case.graph, dtype="fixed"), formats)
     files = write_fixed(pipeline, tmp_path)
     assert sorted(files) == ["Makefile", "kalman_fixed.c", "kalman_fixed.h", "main.c"]
@@ -149,8 +153,9 @@ def test_one_text_serves_all_formats_of_a_structure_while_they_are_looked_for():
     subject = LoweredGraph(built_graph, dtype="fixed")
     start = subject.start(RunOptions())
     tape = subject.tape(inputs, start.last)
-    for width, held in ((12, 0), (12, 24), (32, 0)):
-        pipeline = with_formats(lower(built_graph, dtype="fixed"), sizes.formats(width, 2.0, held))
+    added = next(i.out for i in sizes.pipeline.instructions if i.op == "multiply")
+    for width, held, wider in ((12, 0, {}), (12, 24, {}), (12, 24, {added: 30}), (32, 0, {})):
+        pipeline = with_formats(lower(built_graph, dtype="fixed"), sizes.formats(width, 2.0, held, wider))
         players = [CompiledIntegers(pipeline, tape.patterns, tabled=tabled) for tabled in (False, True)]
         ours, theirs = (p.play(tape, start.cells, seed_words(0), None) for p in players)
         np.testing.assert_array_equal(ours.outputs[0][1][0], theirs.outputs[0][1][0])
@@ -181,7 +186,7 @@ def test_wider_registers_are_nearer_and_equal_in_c():
 
 def test_held_words_are_no_narrower_than_the_others():
     with pytest.raises(DeclarationError, match="no word has this width") as refused:
-        Formats(24, {}, held=frozenset([1]), held_width=20)
+        Formats(24, {}, wider={1: 20})
     assert refused.value.expected == "24 to 48 bits"
     with pytest.raises(DeclarationError, match="no word has this width"):
-        Formats(24, {}, held=frozenset([1]), held_width=49)
+        Formats(24, {}, wider={1: 49})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from typing import Annotated, Any
@@ -30,6 +31,7 @@ from flowgraph.engines.options import RunOptions
 from flowgraph.engines.reference import Interpreter
 from flowgraph.engines.subject import LoweredGraph
 from flowgraph.pipeline.format_files import with_formats
+from flowgraph.pipeline.formats import Formats
 from flowgraph.pipeline.plain import plain
 from flowgraph.pipeline.program import needed, needed_of
 from flowgraph.recorder.random import seed_words
@@ -117,6 +119,22 @@ def test_operations_are_near_to_floating_point_and_equal_in_c():
     assert ours.stats["saturations"] == 0
     real = simulate(built, _flight())["y"]["value"]
     assert np.quantile(np.abs(ours["y"]["value"] - real), 0.95) < 1e-6  # a floor may fall on the other side
+
+
+@pytest.mark.parametrize(("bits", "held"), [((30,), 0), ((29, 32), 44), ((28, 40), 40)])
+def test_words_of_several_widths_are_equal_in_c(bits, held):
+    built = everything.build()
+    sizes = sizes_of(built, _flight())
+    plain = sizes.formats(24, 2.0, held)
+    some = sorted(plain.fractions)[::3]
+    wider = {n: bits[k % len(bits)] for k, n in enumerate(some)}
+    formats = sizes.formats(24, 2.0, held, wider)
+    assert {formats.width_of(n) for n in formats.fractions} == {24, *bits, *([held] if held else [])}
+    ours = simulate(built, _flight(), engine="fixed", formats=formats)
+    same(ours, simulate(built, _flight(), engine="c", dtype="fixed", formats=formats))
+    narrow = simulate(built, _flight(), engine="fixed", formats=plain)
+    assert (ours["y"]["value"] != narrow["y"]["value"]).any()
+    assert Formats.from_json(json.loads(json.dumps(formats.to_json()))).to_json() == formats.to_json()
 
 
 def test_what_is_too_large_is_cut_and_counted_by_name_and_line():

@@ -32,7 +32,8 @@ from flowgraph.graphs.benches.fixed import flown
 from flowgraph.graphs.benches.hardware import GRAPHS
 from flowgraph.pipeline.format_files import with_formats
 from flowgraph.recorder.random import seed_words
-from flowgraph.study.quantise import RELATIVE, quantise
+from flowgraph.study.differences import RELATIVE
+from flowgraph.study.quantise import quantise
 from tests.engines.fixed.test_fixed import sizes_of
 from tests.engines.verilog.test_verilog import Three, everything, flight
 
@@ -74,11 +75,15 @@ def test_operations_are_equal_to_the_interpreter_in_every_register_and_output(ma
     assert _bench(tmp_path) == (1, player.compared, 1)
 
 
-def test_held_words_of_more_than_32_bits_are_those_of_the_interpreter():
+@pytest.mark.parametrize("every", [0, 3])
+def test_held_words_of_more_than_32_bits_are_those_of_the_interpreter(every):
     need_compiler()
     built = everything.build()
     subject = LoweredGraph(built)
-    formats = sizes_of(built, flight()).formats(26, 2.0, 44)
+    sizes = sizes_of(built, flight())
+    wider = dict.fromkeys(sorted(sizes.formats(26).fractions)[::every] if every else (), 31)
+    formats = sizes.formats(26, 2.0, 44, wider)
+    assert len(formats.by_width()) == 1 + (every > 0)
     pipeline, tape = with_formats(subject.pipeline, formats), subject.tape(flight())
     player = PlayedHls(pipeline, tape.patterns, check=True)
     player.play(tape, LoweredGraph(built).start(RunOptions()).cells, seed_words(0), None)

@@ -178,11 +178,14 @@ def lengths(x: Stream[Three], y: Stream[Scalar]):
     return {"z": in_order(x, latest(y, init=0.5))}
 
 
-def test_lengths_and_small_sorts_are_equal():
+@pytest.mark.parametrize("every", [0, 2])
+def test_lengths_and_small_sorts_are_equal_with_some_wider_words_too(every):
     need_verilator()
     built = lengths.build()
     subject = LoweredGraph(built)
-    pipeline = with_formats(subject.pipeline, sizes_of(built, flight()).formats(26, 2.0))
+    sizes = sizes_of(built, flight())
+    wider = dict.fromkeys(sorted(sizes.formats(26).fractions)[::every] if every else (), 31)
+    pipeline = with_formats(subject.pipeline, sizes.formats(26, 2.0, wider=wider))
     tape = subject.tape(flight())
     player = Simulated(pipeline, tape.patterns, check=True)
     player.play(tape, subject.start(RunOptions()).cells, seed_words(0), None)
@@ -354,6 +357,16 @@ def test_held_words_that_are_wider_than_those_of_the_machine_are_refused():
     formats = sizes_of(everything.build(), flight()).formats(24, 2.0, 44)
     with pytest.raises(LoweringError, match="(?s)held words are wider.*32 bits or fewer.*44.*held-width"):
         Image(with_formats(pipeline, formats), [1])
+
+
+def test_words_of_more_than_two_widths_are_refused_with_the_place():
+    pipeline = LoweredGraph(everything.build()).pipeline
+    sizes = sizes_of(everything.build(), flight())
+    some = [i.out for i in pipeline.instructions if i.op == "multiply"][:1]
+    Image(with_formats(pipeline, sizes.formats(24, 2.0, 30, dict.fromkeys(some, 30))), [1])
+    with pytest.raises(LoweringError, match="(?s)words of two widths.*24 or 30 bits.*got: +28") as refused:
+        Image(with_formats(pipeline, sizes.formats(24, 2.0, 30, dict.fromkeys(some, 28))), [1])
+    assert str(refused.value.path).startswith(f"v{some[0]} multiply, ")
 
 
 def test_the_files_name_places_and_lines(made, tmp_path):

@@ -39,14 +39,36 @@ def test_exponents_are_those_of_what_grew(monkeypatch, tmp_path):
         report.figures[name](tmp_path / name)
     assert (tmp_path / "growth.svg").stat().st_size > 5000
     table = (tmp_path / "growth.md").read_text().splitlines()
-    assert table[2].startswith("| `c` | ticks | whole | 1,000 | 1,000,000 | 1.5 to 1000000 s | 2.00 |")
+    assert table[2].startswith("| `c` | ticks | whole | 1,000 | 1,000,000 | 1.5 to 1000000 s | 2.00 ± 0.00 |")
     assert len(table) == 5
 
 
 def test_a_constant_is_no_growth():
     number = np.array([10.0, 100.0, 1000.0, 10_000.0])
-    assert exponent(number, 3.0 + 0.01 * number) == pytest.approx(1.0, abs=0.006)
-    assert exponent(number, 2e-6 * number**1.2) == pytest.approx(1.2, abs=0.006)
+    assert exponent(number, 3.0 + 0.01 * number)[0] == pytest.approx(1.0, abs=0.006)
+    assert exponent(number, 2e-6 * number**1.2)[0] == pytest.approx(1.2, abs=0.006)
+    assert exponent(number[:3], number[:3])[1] is None
+
+
+def test_the_error_of_an_exponent_is_how_far_it_scatters():
+    """Over 200 series with errors of 3 %, the mean of the errors told is the scatter within a third."""
+    rng = np.random.default_rng(7)
+    number = 10.0 ** np.arange(1, 7)
+    found = [
+        exponent(number, (0.5 + 0.02 * number**1.1) * (1 + 0.03 * rng.normal(size=6))) for _ in range(200)
+    ]
+    powers, errors = np.array(found, float).T
+    assert powers.mean() == pytest.approx(1.1, abs=0.01)
+    assert 0.66 < errors.mean() / powers.std() < 1.5
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell the peak")
+def test_copying_stands_beside_particles():
+    row = module._apart("particles", "whole", "python", 1000, 0.05)
+    assert 0 < row["copy_s"] < row["seconds"]
+    fit = module._fit([{**row, "number": n, "copy_s": 1e-3 * n} for n in (10, 100, 1000)])
+    assert fit["copy_exponent"] == pytest.approx(1.0, abs=0.006)
+    assert fit["time_error"] is None
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell the peak")

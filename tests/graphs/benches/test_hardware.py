@@ -12,8 +12,8 @@ from flowgraph.engines.verilog import place
 from flowgraph.engines.verilog.image import memories
 from flowgraph.engines.verilog.toggles import counted
 from flowgraph.graphs.benches.hardware import hardware
-from flowgraph.graphs.benches.hardware_space import draw, fronted, numbers
-from flowgraph.study.quantise import RELATIVE
+from flowgraph.graphs.benches.hardware_space import draw, fronted
+from flowgraph.study.differences import RELATIVE
 from tests.engines.verilog.test_verilog import need_verilator
 
 
@@ -38,13 +38,6 @@ def test_the_front_is_what_no_other_betters(tmp_path):
     assert (tmp_path / "space.png").stat().st_size > 10_000
     draw(rows[-1:], tmp_path / "none.png")  # a graph without any machine
     assert (tmp_path / "none.png").exists()
-
-
-def test_widths_are_whole_numbers():
-    assert numbers("24,16,24", "space") == [16, 24]
-    for text in ("", "16,", "x", "0"):
-        with pytest.raises(DeclarationError, match="these are no whole numbers"):
-            numbers(text, "space")
 
 
 def test_settings_that_fit_nothing_are_refused():

@@ -113,9 +113,8 @@ class _LaneFile(File):
         lines.append("typedef struct {")
         cells = [c for r in self.pipeline.registers for c in r.cells]
         lines += [_member(n, c) for n, c in zip(self._cell_names(), cells, strict=True)]
-        sizes = [(d, k, n) for d, slots in sorted(self.pool.items()) for k, n in enumerate(slots)]
         lines.append("    fg_uint seed[2];")  # up to here it is laid out from outside
-        lines += [f"    {TYPES[d.rpartition('_')[2]]} fg_work_{d}_{k}[{n}];" for d, k, n in sizes]
+        lines += [f"    {TYPES[dtype]} {name}[{size}];" for dtype, name, size in self.memory.members()]
         return "\n".join([*lines, f"}} {m}_state;", ""])
 
     def _loop(self) -> str:

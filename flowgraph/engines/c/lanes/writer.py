@@ -13,6 +13,7 @@ class LaneWriter(Writer):
     """Writes one reaction of all lanes together."""
 
     write: LaneExpressions
+    blocks = False
     flag_type, no_flag = "fg_mask", "fg_mask_of(0)"
 
     def macro(self, item: Macro) -> None:
