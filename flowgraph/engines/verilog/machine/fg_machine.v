@@ -278,10 +278,10 @@ module fg_machine #(
   assign write_index = |indexing;
   integer i;
   always @* begin
-    index_to = {PLACE{1'b0}};
-    index_word = 36'd0;
+    index_to = LANES == 1 ? write_to[PLACE-1:0] : {PLACE{1'b0}};
+    index_word = LANES == 1 ? written[35:0] : 36'd0;
     for (i = 0; i < LANES; i = i + 1)
-      if (indexing[i]) begin
+      if (LANES > 1 && indexing[i]) begin
         index_to = index_to | write_to[i*PLACE+:PLACE];
         index_word = index_word | written[i*36+:36];
       end
