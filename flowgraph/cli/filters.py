@@ -26,10 +26,12 @@ from flowgraph.cli.options import (
     Seed,
     Settings,
     SettingsFile,
+    Shard,
     Truth,
     case_of,
     graph_of,
     one_flight,
+    shared,
     with_file,
 )
 from flowgraph.cli.pages import recorder_of, runs_before, shown_again, write_page
@@ -145,6 +147,7 @@ def run(
     beside: Annotated[
         bool, typer.Option("--beside", help="Keep the runs that are in the page, to compare with them.")
     ] = False,
+    shard: Shard = None,
     diverged: Annotated[
         str, typer.Option(help="Numbers that are no longer finite: raise or count.")
     ] = "raise",
@@ -172,6 +175,7 @@ def run(
     whole = {"--out": out, "--export": export, "--html": html, "--beside": beside, "--formats": formats,
              "--checkpoint": checkpoint, "--every": every}  # fmt: skip
     folder = stream_folder(stream, resume, whole)
+    share = shared(shard, streamed=folder is not None)
     command = resumed(resume, graph=graph, data=data, truth=truth, engine=engine, dtype=dtype, seed=seed,
                       settings=settings)  # fmt: skip
     graph, engine, dtype, seed = command.graph, command.engine, command.dtype, command.seed
@@ -206,10 +210,10 @@ def run(
             else out_console.print(runs_table([row]))
         )
     recorder = recorder_of(case) if html is not None else None
-    watcher = recorder if engine == "python" and kept is None else None
+    watcher = recorder if engine == "python" and kept is None and shard is None else None
     result, row = _measure(
         case, graph, engine, dtype, seed, quiet=as_json, diverged=diverged, watcher=watcher, kept=kept,
-        formats=formats,
+        formats=formats, shard=share,
     )  # fmt: skip
     say(result.notes)
     say(case.remarks(result))
@@ -277,6 +281,7 @@ def _measure(
     watcher: Watcher | None = None,
     kept: Checkpoint | None = None,
     formats: Path | None = None,
+    shard: dict[str, int] | None = None,
 ) -> tuple[Result, dict[str, Any]]:
     start = perf_counter()
     hidden = quiet or not err_console.is_terminal
@@ -288,8 +293,9 @@ def _measure(
         options: dict[str, Any] = {"dtype": dtype, "seed": seed, "progress": meter, "diverged": diverged}
         if watcher is None:
             result = simulate(
-                case.graph, case.inputs, engine=engine, checkpoint=kept, formats=formats, **options
-            )
+                case.graph, case.inputs, engine=engine, checkpoint=kept, formats=formats, shard=shard,
+                **options,
+            )  # fmt: skip
         else:
             result = simulate_watched(case.graph, case.inputs, watcher, **options)
     total = perf_counter() - start

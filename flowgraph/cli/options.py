@@ -68,6 +68,10 @@ Formats = Annotated[
     typer.Option("--formats", metavar="DIR", help="For fixed point: what flowgraph quantise wrote."),
 ]
 Engine = Annotated[str, typer.Option(help=", ".join(engine_names()))]
+Shard = Annotated[
+    str | None,
+    typer.Option("--shard", metavar="AXIS=N", help="Devices that share an axis: particles=4, in xla."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -157,6 +161,37 @@ def _pair(text: str) -> tuple[str, str]:
             fix=f"write --set {key}=...",
         )
     return key.strip(), value.strip()
+
+
+def shared(words: str | None, *, streamed: bool = False) -> dict[str, int] | None:
+    """What `--shard runs=2,particles=4` asks for.
+
+    Raises:
+        DeclarationError: for other words; for a run that is streamed, which goes on one device.
+    """
+    if words is None:
+        return None
+    if streamed:
+        raise DeclarationError(
+            "a streamed run goes on one device",
+            path="--shard",
+            expected="--shard, or --stream",
+            got="both",
+            fix="leave one of them out",
+        )
+    found: dict[str, int] = {}
+    for part in words.split(","):
+        name, _, number = part.partition("=")
+        if not name.strip() or not number.strip().isdecimal() or int(number) < 1 or name.strip() in found:
+            raise DeclarationError(
+                "a share is a number of devices for each axis",
+                path="--shard",
+                expected="AXIS=N, with commas between",
+                got=repr(words),
+                fix="write --shard particles=4, or of many runs --shard runs=2,particles=4",
+            )
+        found[name.strip()] = int(number)
+    return found
 
 
 def with_file(settings: list[str] | None, file: Path | None) -> list[str]:

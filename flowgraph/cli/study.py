@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from flowgraph.cli.app import app
-from flowgraph.cli.options import AsJson
+from flowgraph.cli.options import AsJson, Shard, shared
 from flowgraph.cli.terminal import (
     Terminated,
     err_console,
@@ -41,6 +41,7 @@ def batch(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Run everything anew.")] = False,
     retry: Annotated[bool, typer.Option("--retry-failed", help="Run anew what ended in an error.")] = False,
+    shard: Shard = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep whole trajectories.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it runs.")] = False,
     json_lines: Annotated[
@@ -61,6 +62,8 @@ def batch(
     study = Study.load(file)
     if keep:
         study = replace(study, keep=True)
+    if shard is not None:
+        study = replace(study, shard=shared(shard))
     folder = out or (Path(study.out) if study.out else None)
     if folder is None:
         raise DeclarationError(

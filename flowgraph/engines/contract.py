@@ -135,6 +135,13 @@ class Engine(abc.ABC):
                 fix='leave shard out, or choose engine="xla"',
             )
 
+    def need_devices(self, shard: Mapping[str, int]) -> None:  # noqa: B027  most share nothing
+        """Refuse a share among more devices than this process has; for an engine that `shards`.
+
+        Raises:
+            DeclarationError: with how many there are.
+        """
+
 
 class Stepper(abc.ABC):
     """A run that takes one tick after the other.

@@ -22,7 +22,7 @@ from flowgraph.errors import DeclarationError
 from flowgraph.pipeline import digests
 from flowgraph.pipeline.lowering import lower
 from flowgraph.study import keys
-from flowgraph.study.executors import Executor, Finished, InProcess, ProcessPool
+from flowgraph.study.executors import Executor, Finished, InProcess, OnDask, ProcessPool
 from flowgraph.study.spec import Study, Value
 from flowgraph.study.store import Row, Store, import_pyarrow
 from flowgraph.study.tasks import Done, RunSpec, Task, flight_part, lost, prepared, run_task, said
@@ -87,6 +87,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
     flights = _Flights(many=len(study.each_seed) > 1)
     total = len(study.data) * sum(1 for g in study.graphs for _ in study.combinations(g))
     together = find_engine(study.engine).takes_many
+    shared = [study.shard] if study.shard else []  # results are those of one device to rounding
     runs: list[RunSpec] = []
     programs: list[str] = []
     for graph in study.graphs:
@@ -101,7 +102,7 @@ def plan(study: Study, watcher: Watcher | None = None) -> Plan:
                     "graph": [graph, described, code],
                     "data": identity,
                     "parameters": {n: [type(v).__name__, text(v)] for n, v in parameters.items()},
-                    "engine": [study.engine, study.dtype, study.chunk if together else 1],
+                    "engine": [study.engine, study.dtype, study.chunk if together else 1, *shared],
                     "metrics": study.metrics,
                 }
                 for seed in study.each_seed:
@@ -162,7 +163,9 @@ def tasks_of(study: Study, planned: Plan, wanted: Iterable[str]) -> list[Task]:
     missing = set(wanted)
     metrics = None if study.metrics is None else tuple(study.metrics)
     together = find_engine(study.engine).takes_many
-    options = RunOptions(engine=study.engine, dtype=study.dtype, runs_at_once=study.chunk)
+    options = RunOptions(
+        engine=study.engine, dtype=study.dtype, runs_at_once=study.chunk, shard=study.shard
+    )  # fmt: skip
     chunks: dict[Any, list[RunSpec]] = {}
     counts: dict[Any, int] = {}
     for place, (run, program) in enumerate(zip(planned.runs, planned.programs, strict=True)):
@@ -202,7 +205,7 @@ def run_study(
         An `Outcome`. After a KeyboardInterrupt that of what there is by then, with `interrupted`.
 
     Raises:
-        DeclarationError: without a folder.
+        DeclarationError: without a folder; for a `shard` of more devices than there are.
         OutputError: where the folder cannot be written, or another study is running into it.
         MissingDependencyError: without pyarrow.
     """
@@ -216,6 +219,8 @@ def run_study(
             got="none",
             fix="write --out DIR, or out = ... in the study",
         )
+    if study.shard and not isinstance(executor, OnDask):  # whose workers have devices of their own
+        find_engine(study.engine).need_devices(study.shard)
     start = perf_counter()
     watcher = watcher or Watcher()
     store = Store(folder)

@@ -26,7 +26,7 @@ from flowgraph.data.joint import parts_of
 from flowgraph.data.own import is_in_file, kind_and_place
 from flowgraph.data.registry import find_graph, flight_names, flight_settings
 from flowgraph.data.settings import parsed_settings, text
-from flowgraph.engines.options import DTYPES
+from flowgraph.engines.options import DTYPES, RunOptions
 from flowgraph.engines.registry import engine_names, find_engine
 from flowgraph.errors import DataError, DeclarationError, FlowgraphError, UnknownNameError
 from flowgraph.study.places import absolute, beside, placed_graphs
@@ -62,6 +62,8 @@ class Study:
             "parameters": {name: {"low": a, "high": b, "scale": "linear" or "log"}}}`.
         points: points spelled out, a mapping each. Each goes with each combination of `parameters`.
         engine, dtype: as for `simulate`.
+        shard: as for `simulate_many`: among how many devices the runs that go together are shared out, or
+            their particles.
         metrics: names of the measures to keep, the first being the one to compare by; all if left out.
         chunk: how many runs go together where the engine can; also the unit of resuming.
         keep: whether to keep whole trajectories.
@@ -81,6 +83,7 @@ class Study:
     points: Sequence[Point] = ()
     engine: str = "python"
     dtype: str = "float64"
+    shard: Mapping[str, int] | None = None
     metrics: Sequence[str] | None = None
     chunk: int = CHUNK
     keep: bool = False
@@ -101,6 +104,7 @@ class Study:
         if self.dtype not in offered:
             wanted = f"{' or '.join(offered)}, for the {self.engine.capitalize()} engine has no other"
             raise _wrong("dtype", wanted, self.dtype)
+        put("shard", self._shared())
         if type(self.chunk) is not int or not 1 <= self.chunk <= 2**16:
             raise _wrong("chunk", "a whole number from 1 to 65536", self.chunk)
         if type(self.keep) is not bool:
@@ -115,6 +119,14 @@ class Study:
         self._check_names()
         if checked:
             self._check_runs()
+
+    def _shared(self) -> dict[str, int] | None:
+        """The share as asked, where the engine has any; how many devices there are is seen when it runs."""
+        if not self.shard and isinstance(self.shard, Mapping | None):
+            return None
+        find_engine(self.engine).check(RunOptions(engine=self.engine, dtype=self.dtype, shard=self.shard))
+        assert self.shard is not None
+        return dict(self.shard)
 
     def _check_names(self) -> None:
         for spec in self.data:

@@ -33,6 +33,7 @@ import numpy as np
 
 from flowgraph import (
     DeclarationError,
+    Flight,
     Graph,
     Report,
     Scalar,
@@ -233,6 +234,7 @@ def one(of: str, mode: str, engine: str, number: int, duration: float) -> None:
     found: dict[str, Any] = {"seconds": min(seconds), "memory_bytes": taken, "runs": len(seconds)}
     if of == "particles":
         cells = [c for r in lower(case.graph).registers for c in r.cells]
+        assert not isinstance(case.inputs, Flight)  # its streams are given
         ticks = len(np.unique(np.concatenate([s.time for s in case.inputs.values()])))
         found["copy_s"] = _copied(sum(8 * math.prod(c.shape) for c in cells), ticks)
     print(json.dumps(found))

@@ -61,23 +61,10 @@ class Devices:
 
     def __init__(self, pipeline: Pipeline, shard: Mapping[str, int]) -> None:
         _check_axes(pipeline, shard)
-        self._sharding = (jax := import_jax()).sharding
-        there = _there(jax)
-        wanted = math.prod(shard.values())
-        if wanted > len(there):
-            kind = there[0].platform
-            more = (
-                f"; XLA_FLAGS=--xla_force_host_platform_device_count={wanted}, set before JAX is imported, "
-            )
-            raise DeclarationError(
-                "there are not so many devices",
-                path="shard",
-                expected=f"{len(there)} or fewer, as many as JAX has of the kind {kind}",
-                got=f"{dict(shard)}, which is {wanted}",
-                fix="ask for fewer" + (f"{more}makes so many of a processor" if kind == "cpu" else ""),
-            )
+        there = enough_devices(shard)
+        self._sharding = import_jax().sharding
         self._shard = dict(shard)
-        self._mesh = self._sharding.Mesh(np.array(there[:wanted]).reshape(*shard.values()), tuple(shard))
+        self._mesh = self._sharding.Mesh(np.array(there).reshape(*shard.values()), tuple(shard))
 
     def rounded(self, runs: int) -> int:
         """So many runs, or a few more, that each device has as many."""
@@ -92,6 +79,27 @@ class Devices:
         """Where an array lies whose first axes have these names: whole on all devices without any."""
         cut = (name if name in self._shard else None for name in names)
         return self._sharding.NamedSharding(self._mesh, self._sharding.PartitionSpec(*cut))
+
+
+def enough_devices(shard: Mapping[str, int]) -> list[Any]:
+    """The devices that share the work, of the kind that is chosen.
+
+    Raises:
+        DeclarationError: where there are fewer.
+    """
+    there = _there(import_jax())
+    wanted = math.prod(shard.values())
+    if wanted > len(there):
+        kind = there[0].platform
+        more = f"; XLA_FLAGS=--xla_force_host_platform_device_count={wanted}, set before JAX is imported, "
+        raise DeclarationError(
+            "there are not so many devices",
+            path="shard",
+            expected=f"{len(there)} or fewer, as many as JAX has of the kind {kind}",
+            got=f"{dict(shard)}, which is {wanted}",
+            fix="ask for fewer" + (f"{more}makes so many of a processor" if kind == "cpu" else ""),
+        )
+    return there[:wanted]
 
 
 def _there(jax: Any) -> list[Any]:

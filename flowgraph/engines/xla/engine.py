@@ -20,7 +20,7 @@ from flowgraph.engines.forks import refuse_lost_threads
 from flowgraph.engines.options import Meter, RunOptions
 from flowgraph.engines.stretches import gathered
 from flowgraph.engines.xla.batch import vectorised
-from flowgraph.engines.xla.devices import RUNS, Devices, chosen_device, import_jax
+from flowgraph.engines.xla.devices import RUNS, Devices, chosen_device, enough_devices, import_jax
 from flowgraph.engines.xla.scan import Scan, chunk_size
 from flowgraph.errors import DeclarationError
 from flowgraph.pipeline.optimise import ARRAYS
@@ -75,6 +75,9 @@ class XlaEngine(PipelineEngine):
     def need(self) -> None:
         refuse_lost_threads()
         import_jax()
+
+    def need_devices(self, shard: Mapping[str, int]) -> None:
+        enough_devices(shard)
 
     def prepare(
         self, pipeline: Pipeline, patterns: Sequence[int], ticks: int, dtype: str, passes: tuple[str, ...]
