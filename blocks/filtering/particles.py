@@ -62,7 +62,8 @@ def resample_cloud(  # type: ignore[no-untyped-def]
     drawn = ancestor_index(xp.exp(cloud.log_weight), scheme=scheme, draw=draw, xp=xp)
     uneven = size < below * n
     index = xp.where(uneven, drawn, xp.arange(n, dtype=xp.int64))
-    rows = {name: xp.take(getattr(cloud, name), index, axis=0) for name in cloud._fields}
+    fields = {name: getattr(cloud, name) for name in cloud._fields}
+    rows = {name: xp.where(uneven, xp.take(x, index, axis=0), x) for name, x in fields.items()}
     return cloud.replace(**(rows | {"log_weight": xp.where(uneven, -math.log(n), cloud.log_weight)}))
 
 

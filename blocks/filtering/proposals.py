@@ -68,7 +68,7 @@ def drawn(motion: Motion, control: Any, n: int, dt: Any, draw: Any, kind: Any, x
 def shaken(motion: Motion, control: Any, e: Array | None, dt: Any, kind: Any, xp: Any) -> Array | None:
     """The noises (n, n_w) of these numbers; None without noise."""
     root = motion.noise_root(control, dt, kind, xp)
-    return None if root is None or e is None else e @ root.mT
+    return None if root is None or e is None else (root @ e.mT).mT
 
 
 @block
@@ -102,7 +102,7 @@ def guide_cloud(
         raise _unguided(motion)
     still = _still(measurement, message, x, xp)
     centre = carry(0.0 * e, xp)
-    residual, R, present = residuals(centre, message, measurement, xp)
+    residual, R, present, _ = residuals(centre, message, measurement, xp)
     here = measurement.seen(centre, still, message, xp)
     seen = lambda e, xp: measurement.apart(measurement.seen(carry(e, xp), still, message, xp), here, xp)
     G = jacobian(seen, 0.0 * e, xp)[1] * xp.astype(present, kind)[:, None]
@@ -233,7 +233,7 @@ def _with_innovation(
     plain: StateCloud, found: StateCloud, whole: Array, message: Any, measurement: Measurement,
     gate: float | None, xp: Any,
 ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
-    residual, R, present = residuals(plain.state, message, measurement, xp)
+    residual, R, present, _ = residuals(plain.state, message, measurement, xp)
     here = xp.any(present)
     innovation = expected(plain, residual, R, present, gate, xp)
     kept = chosen(found, plain, innovation, gate, xp)

@@ -12,7 +12,7 @@ estimation", IEE Proceedings F 140(2), 1993.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowgraph import Array, Scalar, block, when
 from flowgraph.blocks.kalman.filters import masked, passes
@@ -45,11 +45,10 @@ def weigh_cloud(
     """
     if message is None:
         return cloud, None, None
-    residual, R, present = residuals(cloud.state, message, measurement, xp)
-    likely = log_density(residual, R, present, xp)
-    found, whole = weighed(cloud, likely, xp)
-    here = xp.any(present)
-    innovation = expected(cloud, residual, R, present, gate, xp)
+    apart = residuals(cloud.state, message, measurement, xp)
+    found, whole = weighed(cloud, log_density(apart, xp), xp)
+    here = xp.any(apart.present)
+    innovation = expected(cloud, apart.residual, apart.R, apart.present, gate, xp)
     return chosen(found, cloud, innovation, gate, xp), when(here, innovation), when(here, whole)
 
 
@@ -60,8 +59,18 @@ def weighed(cloud: Any, likely: Array, xp: Any) -> tuple[Any, Array]:
     return cloud.replace(log_weight=log_weight - whole), whole
 
 
-def residuals(x: Array, message: Any, measurement: Measurement, xp: Any) -> tuple[Array, Array, Array]:
-    """z minus what each particle expects (n, m), 0 where missing; R (m, m) or (n, m, m); present (m)."""
+class Residuals(NamedTuple):
+    """z minus what each particle expects (n, m), 0 where missing; R (m, m) or (n, m, m), which says nothing
+    of what is missing; what is present (m); and the noise of the whole measurement."""
+
+    residual: Array
+    R: Array
+    present: Array
+    noise: Array
+
+
+def residuals(x: Array, message: Any, measurement: Measurement, xp: Any) -> Residuals:
+    """What a measurement is apart from what each of the states x (n, size) expects."""
     measured, kind = measurement.vector(message, xp), x.dtype
     if measurement.inside:
         noise = measurement.covariance(message, 0, kind, xp)
@@ -76,23 +85,32 @@ def residuals(x: Array, message: Any, measurement: Measurement, xp: Any) -> tupl
     residual = measurement.apart(measured, z, xp)
     R = measurement.covariance(message, residual.shape[-1], kind, xp) if R is None else R
     present = ~xp.isnan(residual[0, :])
-    residual = xp.where(present, residual, 0.0)
-    return residual, masked(R, R, present, xp)[1], present
+    whole = xp.all(present)  # as it mostly is: then nothing of the noise waits for the measurement
+    residual = xp.where(whole, residual, xp.where(present, residual, 0.0))
+    return Residuals(residual, xp.where(whole, R, masked(R, R, present, xp)[1]), present, R)
 
 
-def log_density(residual: Array, R: Array, present: Array, xp: Any) -> Array:
-    """The logarithm (n) of the density of N(0, R) at each residual (n, m), of the entries present."""
-    L = xp.linalg.cholesky(R)
-    white = xp.linalg.solve(L, residual[..., None])[..., 0] if len(R.shape) == 3 else None
-    white = residual @ xp.linalg.solve(L, xp.eye(R.shape[-1], dtype=R.dtype)).mT if white is None else white
-    determinant = 2.0 * xp.sum(xp.log(xp.sum(L * xp.eye(R.shape[-1], dtype=R.dtype), axis=-1)), axis=-1)
+def log_density(apart: Residuals, xp: Any) -> Array:
+    """The logarithm (n) of the density of N(0, R) at each residual, of the entries present."""
+    residual, R, present, noise = apart
+    one = xp.eye(R.shape[-1], dtype=R.dtype)
+    if len(R.shape) == 3:
+        L = xp.linalg.cholesky(R)
+        white = xp.linalg.solve(L, residual[..., None])[..., 0]
+        diagonal = xp.sum(L * one, axis=-1)
+    else:
+        rooted = lambda R: xp.linalg.solve(xp.linalg.cholesky(R), one)
+        root = xp.where(xp.all(present), rooted(noise), rooted(R))
+        white = (root @ residual.mT).mT
+        diagonal = 1.0 / xp.sum(root * one, axis=-1)
+    determinant = 2.0 * xp.sum(xp.log(diagonal), axis=-1)
     parts = xp.sum(xp.astype(present, residual.dtype))
-    return -0.5 * (xp.linalg.vecdot(white, white) + determinant + math.log(2.0 * math.pi) * parts)
+    return -0.5 * (xp.sum(white * white, axis=-1) + determinant + math.log(2.0 * math.pi) * parts)
 
 
 def likelihoods(x: Array, message: Any, measurement: Measurement, xp: Any) -> Array:
     """The log-likelihood (n) of each state."""
-    return log_density(*residuals(x, message, measurement, xp), xp)
+    return log_density(residuals(x, message, measurement, xp), xp)
 
 
 def expected(

@@ -12,14 +12,18 @@ sec. 5.4.2 (eqs. 5.4.2-3 to 5.4.2-13).
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from flowgraph import Series
 from flowgraph.blocks.metrics.chi_square import chi_square
 from flowgraph.blocks.metrics.errors import error_summary, nees, nees_summary, state_error
+from flowgraph.blocks.metrics.terms import nis_limits, nis_terms
 from flowgraph.blocks.metrics.truth import interpolate, within_truth
 from flowgraph.data.consistency import CHANCE, FEW, IN_A_ROW, far_nis
 from flowgraph.data.notes import note
+from flowgraph.recorder.namespaces import NUMPY
 
 __all__ = ["nis_remarks", "nis_summary", "point_errors", "state_nees"]
 
@@ -44,23 +48,19 @@ def nis_summary(innovation: Series, *, probability: float = 0.95) -> dict[str, f
         nis_inside, the fraction of single values in their own band; nis_count; and, where the innovations say
         what a gate `accepted`, nis_rejected.
     """
-    if "parts" in innovation.leaves:
-        innovation = innovation[innovation["parts"] > 0.0]  # where nothing was measured, nothing was said
-    values = innovation["nis"]
     width = innovation["residual"].shape[-1]
-    parts = innovation["parts"] if "parts" in innovation.leaves else np.full(len(values), float(width))
-    tail = 0.5 * (1.0 - probability)
-    total = max(float(parts.sum()), 1.0)
-    within = (values >= chi_square(tail, parts)) & (values <= chi_square(1.0 - tail, parts))
+    terms = nis_terms(SimpleNamespace(**innovation.leaves), nis_limits(width, probability), NUMPY)
+    sums = {name: float(np.sum(getattr(terms, name))) for name in terms._fields}
+    tail, total = 0.5 * (1.0 - probability), max(sums["parts"], 1.0)
     found = {
-        "nis_mean": float(values.sum() / total),
+        "nis_mean": sums["nis"] / total,
         "nis_low": float(chi_square(tail, total) / total),
         "nis_high": float(chi_square(1.0 - tail, total) / total),
-        "nis_inside": float(np.mean(within)) if len(values) else float("nan"),
-        "nis_count": float(len(values)),
+        "nis_inside": sums["inside"] / sums["count"] if sums["count"] else float("nan"),
+        "nis_count": sums["count"],
     }
     if "accepted" in innovation.leaves:
-        found["nis_rejected"] = float(np.sum(~innovation["accepted"]))
+        found["nis_rejected"] = sums["rejected"]
     return found
 
 

@@ -20,8 +20,15 @@ from typing import Any
 import numpy as np
 
 from flowgraph import Array, Scalar, Stream, block, latest
-from flowgraph.blocks.metrics.chi_square import chi_square, chi_square_band
-from flowgraph.blocks.metrics.terms import FIGURES, attitude_terms, place_terms, turn_error
+from flowgraph.blocks.metrics.chi_square import chi_square_band
+from flowgraph.blocks.metrics.terms import (
+    FIGURES,
+    attitude_terms,
+    nis_limits,
+    nis_terms,
+    place_terms,
+    turn_error,
+)
 from flowgraph.blocks.signals import (
     Bounds,
     Extremes,
@@ -226,18 +233,8 @@ def pose_score(
 @block
 def nis_sums(seen: NisSums, innovation, *, limits: Array, xp: Any) -> tuple[NisSums, NisSums]:  # type: ignore[no-untyped-def]
     """Add an innovation: its NIS, how many numbers it is of, whether it is within the band of so many."""
-    nis, width = innovation.nis, innovation.residual.shape[-1]
-    parts = innovation.parts if hasattr(innovation, "parts") else xp.asarray(float(width), dtype=nis.dtype)
-    low, high = (xp.take(row, xp.astype(xp.round(parts), xp.int32), axis=0) for row in limits)
-    there = xp.astype(parts > 0.0, nis.dtype)
-    refused = ~innovation.accepted if hasattr(innovation, "accepted") else nis < 0.0
-    found = NisSums(
-        nis=seen.nis + there * nis,
-        parts=seen.parts + parts,
-        inside=seen.inside + there * xp.astype((nis >= low) & (nis <= high), nis.dtype),
-        count=seen.count + there,
-        rejected=seen.rejected + there * xp.astype(refused, nis.dtype),
-    )
+    more = nis_terms(innovation, limits, xp)
+    found = NisSums(*(getattr(seen, name) + getattr(more, name) for name in NisSums._fields))
     return found, found
 
 
@@ -281,9 +278,7 @@ def nis_score(
             got=f"{innovation.label}: residual ({width})",
             fix=f"build the graph with sizes={{{width!r}: 3}}",
         )
-    tail, parts = 0.5 * (1.0 - probability), np.maximum(np.arange(width + 1), 1)
-    limits = np.stack([chi_square(tail, parts), chi_square(1.0 - tail, parts)])
-    sums = nis_sums(innovation, limits=limits, name=f"{name}_sums")
+    sums = nis_sums(innovation, limits=nis_limits(width, probability), name=f"{name}_sums")
     none = NisSums(nis=0.0, parts=0.0, inside=0.0, count=0.0, rejected=0.0)
     kept = latest(sums, init=none, name=f"{name}_last")
     return nis_figures(kept, at=end, name=name)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""What a pose is off by at a tick: the terms of which every figure of a pose is a mean, a root or the most.
+"""What a pose or a measurement is off by at a tick: the terms that every figure sums up, or has the most of.
 
 The scorers of recorded runs and the scores that are blocks both sum these up, so that their figures are the
 same. Leading axes are ticks; a block has none.
@@ -12,8 +12,10 @@ import numpy as np
 
 from flowgraph import Array
 from flowgraph.blocks.geometry.rotations import conjugate, multiply, parted, to_matrix, to_rotation_vector
+from flowgraph.blocks.metrics.chi_square import chi_square
+from flowgraph.blocks.signals import NisSums
 
-__all__ = ["FIGURES", "attitude_terms", "place_terms", "turn_error"]
+__all__ = ["FIGURES", "attitude_terms", "nis_limits", "nis_terms", "place_terms", "turn_error"]
 
 FIGURES = (
     ("position_rmse_m", "position", "root"),
@@ -64,6 +66,33 @@ def attitude_terms(estimate: Array, truth: Array, covariance: Array | None, xp: 
         held = _held((R @ turn[..., :, None])[..., 0], xp.sum((R @ covariance) * R, axis=-1), xp)
         found |= {"tilt_held": xp.sum(held[..., :2], axis=-1) / 2.0, "heading_held": held[..., 2]}
     return found
+
+
+def nis_limits(width: int, probability: float) -> np.ndarray:
+    """The band (2, width + 1) in which an honest NIS is with this probability, by how many numbers it has."""
+    tail, parts = 0.5 * (1.0 - probability), np.maximum(np.arange(width + 1), 1)
+    return np.stack([chi_square(tail, parts), chi_square(1.0 - tail, parts)])
+
+
+def nis_terms(innovation: Any, limits: Array, xp: Any) -> NisSums:
+    """What an innovation adds to the sums: where nothing was measured, nothing.
+
+    Args:
+        innovation: with nis (...) and residual (..., m), and perhaps parts and accepted.
+        limits: those of `nis_limits`.
+    """
+    nis, width = innovation.nis, innovation.residual.shape[-1]
+    parts = innovation.parts if hasattr(innovation, "parts") else 0.0 * nis + float(width)
+    low, high = (xp.take(row, xp.astype(xp.round(parts), xp.int32), axis=0) for row in limits)
+    there = xp.astype(parts > 0.0, nis.dtype)
+    refused = ~innovation.accepted if hasattr(innovation, "accepted") else nis < 0.0
+    return NisSums(
+        nis=xp.where(parts > 0.0, nis, 0.0),
+        parts=parts,
+        inside=there * xp.astype((nis >= low) & (nis <= high), nis.dtype),
+        count=there,
+        rejected=there * xp.astype(refused, nis.dtype),
+    )
 
 
 def _held(error: Array, variance: Array, xp: Any) -> Array:

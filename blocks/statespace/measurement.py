@@ -201,7 +201,7 @@ class LinearMeasurement(Measurement):
 
     def seen(self, x: Array, v: Array | None, message: Any, xp: Any) -> Array:
         H = self._matrix(message, x.dtype, xp)
-        return (H @ x[..., None])[..., 0] if len(x.shape) == 1 else x @ H.mT  # many in one product
+        return (H @ x[..., None])[..., 0] if len(x.shape) == 1 else (H @ x.mT).mT  # as in the motion's carry
 
     def covariance(self, message: Any, m: int, kind: Any, xp: Any) -> Array:
         return self._noise.matrix(message, kind, xp, m)

@@ -204,7 +204,7 @@ class DiscreteModel:
 
     def carry(self, x: Array, control: Any, w: Array | None, dt: Any, xp: Any) -> Array:
         F, pushed, _ = self._step(control, dt, x.dtype, xp)
-        after = x @ F.mT
+        after = F @ x if len(x.shape) == 1 else (F @ x.mT).mT  # of many: each entry's numbers side by side
         after = after if w is None else after + w
         after = after if pushed is None else after + pushed
         return after if self.space.flat else self.space.plus(x, after - x, xp)

@@ -58,6 +58,10 @@ def arrays(
     return series
 
 
+MOST_TICKS = 1_000_000_000
+"""Of a source that only keeps time: nine bytes each."""
+
+
 def ticks(period: str | int, *, until: str | int, start: str | int = 0, name: str = "ticks") -> Series:
     """A source that only keeps time: true at `start` and each `period` after it, before `until`.
 
@@ -65,14 +69,22 @@ def ticks(period: str | int, *, until: str | int, start: str | int = 0, name: st
         period, until, start: a duration such as "5ms", or integer nanoseconds; `until` counts from `start`.
 
     Raises:
-        DeclarationError: for a period below 1 ns, or an `until` below 0. DataError: for a start that is no
-            whole number, or an end that int64 nanoseconds do not hold.
+        DeclarationError: for a period below 1 ns, an `until` below 0, or more ticks than `MOST_TICKS`.
+            DataError: for a start that is no whole number, or an end that int64 nanoseconds do not hold.
     """
     step, end = nanoseconds(period, what="period", least=1), nanoseconds(until, what="until", least=0)
     begin = check_stamp(
         f"{name}.start", nanoseconds(start, what="start") if isinstance(start, str) else start
     )
     check_stamp(f"{name}.until", begin + end)
+    if (count := -(-end // step)) > MOST_TICKS:
+        raise DeclarationError(
+            "these are too many ticks",
+            path=name,
+            expected=f"at most {MOST_TICKS:,}, which are kept in memory",
+            got=f"{count:,}: one each {step:,} ns until {end:,} ns",
+            fix=f'take a period of at least "{-(-end // MOST_TICKS)}ns", or an earlier end',
+        )
     time = np.arange(0, end, step, dtype=np.int64) + begin
     return Series(time, np.ones(len(time), dtype=bool), name=name)
 

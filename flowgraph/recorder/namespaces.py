@@ -9,6 +9,17 @@ import numpy as np
 
 from flowgraph.recorder import ranges
 
+_LAPACK: Any = getattr(np.linalg, "_umath_linalg", None)
+"""What the functions of `numpy.linalg` call, whose wrappers take more time than a small matrix does. It is no
+part of NumPy's interface: where it is missing, the wrappers are called."""
+
+_DOUBLE = np.dtype(np.float64)
+
+
+def _direct(x: Any) -> bool:
+    """Whether LAPACK can be called without the wrapper, which would do nothing but hand this on."""
+    return _LAPACK is not None and type(x) is np.ndarray and x.dtype == _DOUBLE
+
 
 class _LinearAlgebra:
     """`numpy.linalg`, where a singular matrix gives NaN; `vecdot` is the ufunc itself, not its wrapper."""
@@ -18,6 +29,9 @@ class _LinearAlgebra:
     @staticmethod
     def cholesky(x: Any, /) -> Any:
         """`numpy.linalg.cholesky`; NaN where a matrix is not positive definite."""
+        if _direct(x):
+            with np.errstate(all="ignore"):
+                return _LAPACK.cholesky_lo(x)
         try:
             return np.linalg.cholesky(x)
         except np.linalg.LinAlgError:
@@ -26,6 +40,9 @@ class _LinearAlgebra:
     @staticmethod
     def solve(a: Any, b: Any, /) -> Any:
         """`numpy.linalg.solve`; NaN where a matrix is singular."""
+        if _direct(a) and _direct(b):
+            with np.errstate(all="ignore"):
+                return (_LAPACK.solve1 if b.ndim == 1 else _LAPACK.solve)(a, b)
         try:
             return np.linalg.solve(a, b)
         except np.linalg.LinAlgError:

@@ -2,8 +2,9 @@
 
 The same integers, step by step. A product of 32 bits by 32 is written once as 64, and its halves are read as
 views; each round then is one product and two exclusive ors, with the next key mixed into the low half. The
-segment of a normal number is found in one table that holds start and fall side by side. A few words are made
-with Python's integers, since each pass over a short array costs as much as all of its arithmetic.
+segment of a normal number is looked up by the bits that name it, and its sign is put on while it is whole.
+A few words are made with Python's integers, since each pass over a short array costs as much as all of its
+arithmetic.
 """
 
 from __future__ import annotations
@@ -94,26 +95,34 @@ def _one(
     return a, c, b, d
 
 
-def pairs(start: np.ndarray, slope: np.ndarray, base: int) -> np.ndarray:
-    """The table of segments: (base + n, 2) int32 as int64, start and slope side by side from `base` on."""
-    table = np.zeros((base + len(start), 2), np.int32)
-    table[base:, 0], table[base:, 1] = start, slope
-    return table.view(np.int64)[:, 0]
+def by_form(values: np.ndarray, base: int) -> np.ndarray:
+    """A table of segments (n) int32, from `base` on: looked up by the leading bits of a float32."""
+    return np.concatenate([np.zeros(base, np.int32), values])
 
 
-def normals(bits: np.ndarray, table: np.ndarray, segment_bits: int, place_bits: int, scale: float) -> Any:
-    """Standard normal numbers from words; see `random.normal_from`. `table` is that of `pairs`."""
+def normals(
+    bits: np.ndarray,
+    tables: tuple[np.ndarray, np.ndarray],
+    segment_bits: int,
+    place_bits: int,
+    scale: float,
+) -> Any:
+    """Standard normal numbers from words; see `random.normal_from`. `tables`: start and fall, `by_form`."""
+    sign = (bits & np.uint32(1)).view(np.int32)
+    np.negative(sign, out=sign)
     tail = bits >> np.uint32(1)
     tail |= np.uint32(1)
-    form = tail.view(np.int32).astype(np.float32).view(np.int32)
-    place = form >> np.int32(23 - segment_bits - place_bits)
+    place = tail.view(np.int32).astype(np.float32).view(np.int32)
+    segment = (place >> np.int32(23 - segment_bits)).astype(np.intp)
+    place >>= np.int32(23 - segment_bits - place_bits)
     place &= np.int32((1 << place_bits) - 1)
-    form >>= np.int32(23 - segment_bits)
-    found = table.take(form).view(np.int32).reshape(-1, 2)
-    place *= found[:, 1]
+    place *= tables[1].take(segment, None, None, "clip")
     place += np.int32(1 << (place_bits - 1))
     place >>= np.int32(place_bits)
-    np.subtract(found[:, 0], place, out=place)
-    signs = np.array([scale, -scale]).take((bits & np.uint32(1)).view(np.int32))
-    signs *= place
-    return signs
+    size = tables[0].take(segment, None, None, "clip")
+    size -= place
+    size ^= sign  # of two's complement: -n is ~n + 1
+    size -= sign
+    found = size.astype(np.float64)
+    found *= scale
+    return found

@@ -169,12 +169,13 @@ def numbers_at(kind: str, shape: tuple[int, ...], name: int, times: np.ndarray, 
 
 
 def _normals(bits: np.ndarray) -> Any:
-    return numpy_random.normals(bits, _pairs(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
+    return numpy_random.normals(bits, _tables(), _SEGMENT_BITS, _PLACE_BITS, 2.0**-_FRACTION_BITS)
 
 
 @lru_cache(maxsize=1)
-def _pairs() -> np.ndarray:
-    return numpy_random.pairs(*segments(), _BASE)
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    start, fall = segments()
+    return numpy_random.by_form(start, _BASE), numpy_random.by_form(fall, _BASE)
 
 
 def site(prefix: str, kind: str, name: str, shape: Any) -> Site:

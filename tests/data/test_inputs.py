@@ -241,6 +241,10 @@ def test_ticks_that_are_none_are_refused():
         ticks("5ms", until="1s", start=0.5)  # type: ignore[arg-type]
     with pytest.raises(DataError, match="ticks.until: this time does not fit 64 bits"):
         ticks("100ms", until="1s", start=2**63 - 10)
+    with pytest.raises(
+        DeclarationError, match=r"too many ticks[\s\S]*1,000,000,000,000: one each 1 ns[\s\S]*1000ns"
+    ):
+        ticks(1, until="1000s")
     assert not len(ticks("5ms", until=0))
     assert ticks("5ms", until="10ms", start="1s").time.tolist() == [1_000_000_000, 1_005_000_000]
 

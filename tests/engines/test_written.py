@@ -63,15 +63,13 @@ def expression(r: random.Random, kind: str, depth: int) -> str:
     """A random expression of a kind."""
     forms = KINDS[kind][: _PLAIN[kind]] if depth == 0 else KINDS[kind]
     text = r.choice(forms)
-    for name, make in {
-        **{k: lambda k=k: expression(r, k, depth - 1) for k in KINDS},
-        "c": lambda: either(r, [round(r.uniform(-2.0, 2.0), 2) for _ in range(2)]),
-        "v": lambda: either(r, "AC"),
-        "m": lambda: either(r, "BD"),
-        "i": lambda: either(r, (0, 1)),
-    }.items():
-        while f"{{{name}}}" in text:
-            text = text.replace(f"{{{name}}}", make(), 1)
+    atoms: dict[str, Any] = {
+        "c": [round(r.uniform(-2.0, 2.0), 2) for _ in range(4)], "v": "AC", "m": "BD", "i": (0, 1)
+    }  # fmt: skip
+    while (hole := re.search(r"\{(\w+)\}", text)) is not None:
+        name = hole[1]
+        found = either(r, atoms[name]) if name in atoms else expression(r, name, depth - 1)
+        text = text[: hole.start()] + found + text[hole.end() :]
     return text
 
 

@@ -14,6 +14,9 @@ from flowgraph.blocks.flights.worlds import load_world
 from flowgraph.blocks.metrics import nees, state_error
 from flowgraph.data.batch import Runs
 
+SENSORS = "imu,gps,gps2,altimeter,magnetometer,optical_flow"
+"""Of the outdoor flights."""
+
 THESIS = math.sqrt(0.1 / 200.0)
 """The density of a variance of 0.1 per sample at 200 Hz."""
 
@@ -32,6 +35,22 @@ def smooth(seed: int, duration: float = 10.0) -> Flight:
     noise = {"gyro.noise": THESIS, "accelerometer.noise": THESIS}
     pose = {"position.noise": 0.1, "attitude.noise": 0.1}
     return simulated.load(seed=seed, settings={"duration": duration, **none, **noise, **pose})
+
+
+@functools.cache
+def outdoor(seed: int = 0, duration: float = 3.0, world: str = "thesis", **settings: float) -> Flight:
+    """A flight with all sensors of the outdoor filters; `gyro__bias=` sets gyro.bias."""
+    named = {k.replace("__", "."): v for k, v in settings.items()}
+    return load_world(world, seed=seed, settings={"sensors": SENSORS, "duration": duration, **named})
+
+
+def ratios(particles: list[dict[str, float]], reference: list[dict[str, float]]) -> dict[str, float]:
+    """How many times the error of the error-state filter ours is, over all flights."""
+    root = {
+        name: [np.sqrt(np.mean([score[name] ** 2 for score in scores])) for scores in (particles, reference)]
+        for name in ("position_rmse_m", "attitude_rmse_deg")
+    }
+    return {name: ours / theirs for name, (ours, theirs) in root.items()}
 
 
 def mean_nees(belief: Runs, flights: list[Flight]) -> np.ndarray:

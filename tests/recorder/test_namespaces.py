@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowgraph.recorder import ranges
+from flowgraph.recorder import namespaces, ranges
 from flowgraph.recorder.namespaces import NUMPY
 
 GIVEN = [
@@ -63,13 +63,53 @@ def test_reals_become_whole_numbers_without_a_word(kind, real):
         assert [int(v) for v in found.ravel()] == [0, 3, want, 2], (one, kind)
 
 
+@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("lead", [(), (3,), (0,), (2, 3)])
+def test_factors_are_those_of_numpy_and_nan_where_it_refuses(monkeypatch, direct, real, lead):
+    """By whichever way NumPy is called, also with an old one's: one matrix in a stack spoils no other."""
+    if not direct:
+        monkeypatch.setattr(namespaces, "_LAPACK", None)
+    random = np.random.default_rng(0)
+    root = random.normal(size=(*lead, 4, 4))
+    good = (root @ root.mT + np.eye(4)).astype(real)
+    b = random.normal(size=(*lead, 4, 2)).astype(real)
+    bad = good.copy()
+    if bad.size:
+        bad[(0,) * len(lead)] = 0.0
+    with np.errstate(all="raise"):
+        for a in (good, good.mT):
+            for found, wanted in (
+                (NUMPY.linalg.cholesky(a), np.linalg.cholesky(a)),
+                (NUMPY.linalg.solve(a, b), np.linalg.solve(a, b)),
+                (NUMPY.linalg.solve(a, b[..., :1]), np.linalg.solve(a, b[..., :1])),
+            ):
+                assert found.dtype == real
+                np.testing.assert_array_equal(found, wanted)
+        for found, whole in (
+            (NUMPY.linalg.cholesky(bad), NUMPY.linalg.cholesky(good)),
+            (NUMPY.linalg.solve(bad, b), NUMPY.linalg.solve(good, b)),
+        ):
+            spoilt = np.isnan(found).all((-2, -1))
+            assert spoilt.sum() == min(1, spoilt.size)
+            np.testing.assert_array_equal(found[~spoilt], whole[~spoilt])
+        if not lead:
+            np.testing.assert_array_equal(NUMPY.linalg.solve(good, b[:, 0]), np.linalg.solve(good, b[:, 0]))
+            assert np.isnan(NUMPY.linalg.solve(bad, b[:, 0])).all()
+
+
 @pytest.mark.parametrize(
     "condition", [True, np.False_, np.array(True), np.array([True, False, True]), [True, False, True]]
 )
-@pytest.mark.parametrize(
-    "sides", [(np.arange(3.0), np.ones(3)), (np.arange(3), 2.5), (1.0, np.arange(3.0)), (1.0, 2)]
-)
-def test_a_selection_is_numpys_whatever_the_condition_is_made_of(condition, sides):
-    found, wanted = NUMPY.where(condition, *sides), np.where(condition, *sides)
-    np.testing.assert_array_equal(found, wanted)
-    assert np.asarray(found).dtype == wanted.dtype
+def test_a_selection_is_that_of_numpy(condition):
+    whole = np.arange(12.0).reshape(4, 3)
+    turned = whole.mT
+    one = (2.0, 2, True, np.float64(3.0), np.array(4.0))
+    given = (whole, -whole, whole[0], np.arange(3, dtype=np.int32), *one)
+    for x in given:
+        for y in given:
+            found, wanted = NUMPY.where(condition, x, y), np.where(condition, x, y)
+            assert found.dtype == wanted.dtype
+            np.testing.assert_array_equal(found, wanted)
+    if not np.ndim(condition):
+        assert NUMPY.where(condition, turned, turned) is turned

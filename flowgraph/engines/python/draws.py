@@ -42,6 +42,8 @@ class Ahead:
         self._made = {}
 
     def __call__(self, time: int) -> Any:
+        if self._most == 1:
+            return self._site.numbers(time, self._seed, xp=NUMPY)
         if time in self._made:
             return self._made.pop(time)
         first, used = int(np.searchsorted(self._times, time)), self._many - len(self._made)

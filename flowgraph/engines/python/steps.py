@@ -79,7 +79,8 @@ _REDUCED = {
     "any": np.logical_or.reduce, "all": np.logical_and.reduce,
 }  # fmt: skip
 _LIFTED = 1_000_000  # added to the number of a value, for the same as an array
-_CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | {"vecdot"}
+_LINEAR = {"vecdot", "cholesky", "solve"}
+_CALLED = ELEMENTWISE - {"astype", "float32_bits", "materialise"} | _LINEAR
 
 
 @dataclass(frozen=True)
@@ -213,7 +214,7 @@ def _chosen(
     i: Instruction, known: dict[int, np.ndarray], kinds: dict[int, str], made: Written
 ) -> Line | None:
     """A selection of whole arrays by a single number: one of them as it is; None where it is another."""
-    if i.op != "where" or i.args[0] not in made.numbers:
+    if i.op != "where" or made.shapes[i.args[0]]:
         return None
     args = [i.args[0]]
     for a in i.args[1:]:
@@ -323,7 +324,7 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written) -> str:
     if i.op == "where" and made.shapes[i.args[0]]:
         name, made.names["o_each"] = "o_each", np.where
     elif called:
-        made.names[name] = NUMPY.linalg.vecdot if i.op == "vecdot" else getattr(NUMPY, i.op)
+        made.names[name] = getattr(NUMPY.linalg if i.op in _LINEAR else NUMPY, i.op)
     else:
         made.names[name] = partial(OPS[i.op].run, NUMPY, **bound_attrs(i.op, i.attrs, np.float64))
     given = [

@@ -280,7 +280,7 @@ class Driver:
     def _stream(self) -> str:
         name, bits = self.pipeline.name, max(1, len(self.pipeline.inputs))
         return _STREAM.format(name=name, bits=bits, top=bits - 1, place=self.image.place_bits - 1,
-                              places=self.image.place_bits, wait=f"4'd{READ_DEEP + 1}")  # fmt: skip
+                              places=self.image.place_bits, wait=f"4'd{READ_DEEP + 2}")  # fmt: skip
 
     def _host(self, shipped: str) -> str:
         m = self.module

@@ -3,7 +3,7 @@
 A lane begins a term a cycle, so a sum of n terms takes one lane for n cycles, and its word can be read some
 cycles after the last. Of the sums that could be made, the one goes first from which the way to the end is
 longest. A word lies in one of the banks of the memory, and each bank takes one word a cycle: two lanes never
-end sums for one bank together. The units, indices, and terms that are many are the first lane's.
+end sums for one bank together, nor two indices. The units and terms that are many are the first lane's.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ COPIES = {"divide": 4, "root": 2, "logarithm": 4, "angle": 2}
 ALL = -1
 """The bank of words that go through all of them, or any."""
 
+_INDEX = -2
+"""Where indices go: each lane has a copy of them, and one is written in a cycle."""
+
 _TRIED = 24
 """Sums that are looked at for a lane in a cycle."""
 
-_FIRST_LANE = frozenset(["TAKE", "GET", "NORM", "NORM_EVEN", "BITS"])
+_FIRST_LANE = frozenset(["TAKE", "NORM", "NORM_EVEN", "BITS"])
 
 Item = tuple[int, int]
 """A sum and which of the elements of a round it makes."""
@@ -249,6 +252,9 @@ class Order:
     def _bank(self, x: Item, cycle: int) -> int | None:
         """A bank that can take the word of a sum whose last term is begun in that cycle."""
         taken = self._writes.get(cycle, set())
+        if self.made(x[0]).mode == "INDEX":
+            return None if _INDEX in taken else _INDEX
+        taken = taken - {_INDEX}
         wanted = self.bank(x)
         if wanted == ALL:
             return None if taken else ALL
@@ -273,7 +279,7 @@ class Order:
             assert found is not None
             self._writes.setdefault(end, set()).add(found)
             bank = max(found, 0)
-        elif _writes(node):
+        elif _writes(node) and node.mode != "INDEX":
             bank = self.bank(x) or 0
         asked = self._item(node.terms[0].a, x[1]) if node.terms[0].kind == "TAKE" else x
         copy = self._copy.get(asked, 0)
@@ -316,14 +322,12 @@ def _repeated(node: Sum) -> bool:
 
 
 def _writes(node: Sum) -> bool:
-    return node.mode not in ("START", "INDEX")
+    return node.mode != "START"
 
 
 def _first_lane(node: Sum) -> bool:
     """Whether a sum is made in the first lane alone."""
-    return (
-        node.mode in ("START", "INDEX") or _repeated(node) or any(t.kind in _FIRST_LANE for t in node.terms)
-    )
+    return node.mode == "START" or _repeated(node) or any(t.kind in _FIRST_LANE for t in node.terms)
 
 
 __all__ = [

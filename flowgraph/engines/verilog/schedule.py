@@ -219,7 +219,7 @@ def _round(plan: Plan, stage: Stage, lanes: Lanes, held: Mapping[Held, int]) -> 
     least = 0
     terms = sum(len(plan.tick.made(n).terms) for n in stage.order)
     bound = max(terms / lanes.count, len(stage.order) / lanes.banks)
-    for step in range(1, min(_ABREAST, stage.row) + 1):
+    for step in range(1, min(_ABREAST * lanes.count, stage.row) + 1):
         if stage.row % step:
             continue
         items = [(n, k) for n in stage.order for k in range(step)]

@@ -49,7 +49,7 @@ def _blocks(name: str, words: list[int], banks: int) -> dict[str, str]:
     for level in range(-(-each // BLOCK)):
         for bank in range(banks):
             block = words[bank::banks][level * BLOCK : (level + 1) * BLOCK]
-            found[f"{name}_{level * banks + bank:02d}.hex"] = "\n".join(f"{w:x}" for w in block) + "\n"
+            found[f"{name}_{level * banks + bank:03d}.hex"] = "\n".join(f"{w:x}" for w in block) + "\n"
     return found
 
 

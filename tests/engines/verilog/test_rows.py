@@ -103,13 +103,14 @@ def made():
     return built, with_formats(subject.pipeline, formats), subject.tape(inputs)
 
 
-def test_a_particle_filter_is_equal_to_the_interpreter_in_every_register_and_output(made):
+@pytest.mark.parametrize("lanes", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_particle_filter_is_equal_to_the_interpreter_in_every_register_and_output(made, lanes):
     try:
         simulation.verilator()
     except MissingDependencyError as error:
         pytest.skip(str(error.fix))
     built, pipeline, tape = made
-    player = Simulated(pipeline, tape.patterns, check=True)
+    player = Simulated(pipeline, tape.patterns, check=True, lanes=lanes)
     player.play(tape, LoweredGraph(built).start(RunOptions()).cells, seed_words(7), None)
     assert player.compared > 25 * 3 * N
     assert player.differing == 0
@@ -219,6 +220,12 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
             now += 1
         k += 1
     assert now == found.cycles
+    steps = [w.does for w in found.words if not isinstance(w.does, Loop)]
+    ends = [[s is not None and s.mode == "INDEX" for s in lanes_] for lanes_ in steps]
+    assert max(map(sum, ends)) == 1  # one index is written in a cycle
+    if lanes.count > 1:  # in whichever lane, and asked for in any
+        assert any(any(row[1:]) for row in ends)
+        assert any(s is not None and s.term.kind == "GET" for lanes_ in steps for s in lanes_[1:])
 
 
 @block

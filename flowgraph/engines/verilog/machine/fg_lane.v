@@ -236,7 +236,7 @@ module fg_lane #(
   always @(posedge clk) begin
     cut <= 1'b0;
     write <= mode23 != 4'd0 && mode23 != HOLD && mode23 != START && mode23 != INDEX;
-    index <= FIRST_LANE != 0 && mode23 == INDEX;
+    index <= ROWS != 0 && mode23 == INDEX;
     case (mode23)
       FIT, FIT_WIDE: begin
         result <= no23 ? NAN : over23 ? most23 : under23 ? -most23 : whole23;

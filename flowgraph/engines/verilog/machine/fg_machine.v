@@ -118,8 +118,8 @@ module fg_machine #(
   wire [LANES*LANE-1:0] placed;
   wire write_index;
   // verilator lint_off UNUSEDSIGNAL
-  wire [PLACE-1:0] index_to;  // an index has fewer bits
-  wire [35:0] index_word;
+  reg [PLACE-1:0] index_to;  // an index has fewer bits
+  reg [35:0] index_word;
   // verilator lint_on UNUSEDSIGNAL
   genvar n;
   generate
@@ -163,10 +163,7 @@ module fg_machine #(
       // Of a term that is repeated, the first begins the sum, and the last, or each, ends it.
       reg [LANES*LANE-1:0] code1, code2, code3, code4;
       reg [ELEMENT-1:0] first1, first2, first3;
-      (* ram_style = "block" *) reg [PLACE-1:0] index_[0:INDICES-1];
       localparam INDEX_BITS = INDICES > 2 ? $clog2(INDICES) : 1;
-      reg [INDEX_BITS-1:0] index_place;
-      reg [PLACE-1:0] index_read, index3;
       always @(posedge clk) begin
         code1 <= code[LOOP] ? {LANES*LANE{1'b0}} : code[LANES*LANE-1:0];
         if (code[REPEAT]) begin
@@ -174,17 +171,10 @@ module fg_machine #(
           if (!at_last && !code[RUNNING]) code1[MODE+:4] <= 4'd0;
         end
         first1 <= first;
-        index_place <= code[B+:INDEX_BITS] + (code[B_MOVES] ? low(first) : {INDEX_BITS{1'b0}});
         code2 <= code1;
         first2 <= first1;
-        index_read <= index_[index_place];
-`ifdef VERILATOR
-        if (write_index && index_to[INDEX_BITS-1:0] == index_place) index_read <= ~index_[index_place];  // as of the memory
-`endif
         code3 <= code2;
         first3 <= first2;
-        index3 <= index_read;
-        if (write_index) index_[index_to[INDEX_BITS-1:0]] <= index_word[35] ? {PLACE{1'b0}} : index_word[PLACE-1:0];
       end
       function [INDEX_BITS-1:0] low(input [ELEMENT-1:0] x);
         integer k;
@@ -193,9 +183,19 @@ module fg_machine #(
       wire [PLACE-1:0] along = {{PLACE-ELEMENT{1'b0}}, first3};
       for (n = 0; n < LANES; n = n + 1) begin : lanes
         localparam O = n * LANE;
+        (* ram_style = "block" *) reg [PLACE-1:0] index_[0:INDICES-1];  // each lane has a copy of all indices
+        reg [INDEX_BITS-1:0] index_place;
+        reg [PLACE-1:0] index_read, index3;
         always @(posedge clk) begin
+          index_place <= code[O+B+:INDEX_BITS] + (code[O+B_MOVES] ? low(first) : {INDEX_BITS{1'b0}});
+          index_read <= index_[index_place];
+`ifdef VERILATOR
+          if (write_index && index_to[INDEX_BITS-1:0] == index_place) index_read <= ~index_[index_place];  // as of the memory
+`endif
+          index3 <= index_read;
+          if (write_index) index_[index_to[INDEX_BITS-1:0]] <= index_word[35] ? {PLACE{1'b0}} : index_word[PLACE-1:0];
           code4[O+:LANE] <= code3[O+:LANE];
-          if (n == 0 && code3[O+KIND+:4] == GET) code4[O+A+:PLACE] <= code3[O+A+:PLACE] + index3;
+          if (code3[O+KIND+:4] == GET) code4[O+A+:PLACE] <= code3[O+A+:PLACE] + index3;
           else if (code3[O+A_MOVES]) code4[O+A+:PLACE] <= code3[O+A+:PLACE] + along;
           if (code3[O+B_MOVES]) code4[O+B+:PLACE] <= code3[O+B+:PLACE] + along;
           if (code3[O+D_MOVES]) code4[O+D+:PLACE] <= code3[O+D+:PLACE] + along;
@@ -272,11 +272,20 @@ module fg_machine #(
       end
     end
   endgenerate
-  reg indexing;
-  always @(posedge clk) indexing <= |indexes;
-  assign write_index = indexing;
-  assign index_to = write_to[PLACE-1:0];
-  assign index_word = written[35:0];
+  // Which lane writes an index: the program sees to it that no two do.
+  reg [LANES-1:0] indexing;
+  always @(posedge clk) indexing <= indexes;
+  assign write_index = |indexing;
+  integer i;
+  always @* begin
+    index_to = LANES == 1 ? write_to[PLACE-1:0] : {PLACE{1'b0}};
+    index_word = LANES == 1 ? written[35:0] : 36'd0;
+    for (i = 0; i < LANES; i = i + 1)
+      if (LANES > 1 && indexing[i]) begin
+        index_to = index_to | write_to[i*PLACE+:PLACE];
+        index_word = index_word | written[i*36+:36];
+      end
+  end
 
   // Which lane writes to a bank: the program sees to it that no two do.
   generate

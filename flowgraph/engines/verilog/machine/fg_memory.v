@@ -13,7 +13,7 @@ module fg_memory #(
     parameter BANKS = 1,  // 1 or 2
     parameter DEEP = 0,  // needed for more than a block, or more than a bank
     parameter READS = 0,  // whether it is never written
-    parameter FILE = "memory"  // begin of the files' names, one for each block: FILE_00.hex and so on
+    parameter FILE = "memory"  // begin of the files' names, one for each block: FILE_000.hex and so on
 ) (
     input wire clk,
     // verilator lint_off UNUSEDSIGNAL
@@ -46,9 +46,9 @@ module fg_memory #(
       // So many that no block of a chip is put behind another: then nothing is chosen before the block's own register.
       localparam SIZE = LEFT <= 512 ? LEFT : LEFT <= 1024 ? 1024 : DEPTH;
       localparam IN = SIZE > 1 ? $clog2(SIZE) : 1;  // bits of a place in it
-      localparam [7:0] TENS = 8'd48 + k / 10, ONES = 8'd48 + k % 10;
+      localparam [7:0] HUNDREDS = 8'd48 + k / 100, TENS = 8'd48 + k / 10 % 10, ONES = 8'd48 + k % 10;
       (* ram_style = "block", no_rw_check *) reg [WIDTH-1:0] words[0:SIZE-1];
-      initial $readmemh({FILE, "_", TENS, ONES, ".hex"}, words);
+      initial $readmemh({FILE, "_", HUNDREDS, TENS, ONES, ".hex"}, words);
       reg [WIDTH-1:0] read, own;
       wire [IN-1:0] at;
       // Of a deep memory a block takes only places of its own, and gives zeros where another is asked: registers that
