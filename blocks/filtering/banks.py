@@ -36,6 +36,7 @@ from flowgraph.blocks.signals import Bank, BankStep, Gaussian, KalmanInnovation
 from flowgraph.blocks.statespace import Measurement, Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.language.block import When
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = ["BankFilter", "Interacting", "bank_step", "imm", "mmae"]
 
@@ -187,7 +188,7 @@ def _one_innovation(
     apart = residuals - residual
     S = xp.stack([one.covariance for one in each]) + apart[:, :, None] * apart[:, None, :]
     S = xp.sum(S * weight[:, None, None], axis=0)
-    nis = residual @ xp.linalg.solve(S, residual[:, None])[:, 0]
+    nis = residual @ solve_positive(S, residual[:, None], xp)[:, 0]
     parts = each[0].parts
     accepted = passes(nis, gate, parts, S.shape[-1], xp)
     return KalmanInnovation(residual=residual, covariance=S, nis=nis, parts=parts, accepted=accepted)

@@ -37,6 +37,7 @@ from flowgraph.blocks.signals import KalmanInnovation, StateCloud
 from flowgraph.blocks.statespace import Handed, Measurement, Motion
 from flowgraph.errors import DeclarationError
 from flowgraph.recorder.derivatives import jacobian
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = ["PROPOSALS", "auxiliary_cloud", "carry_cloud", "guide_cloud", "propose_cloud"]
 
@@ -106,7 +107,7 @@ def guide_cloud(
     here = measurement.seen(centre, still, message, xp)
     seen = lambda e, xp: measurement.apart(measurement.seen(carry(e, xp), still, message, xp), here, xp)
     G = jacobian(seen, 0.0 * e, xp)[1] * xp.astype(present, kind)[:, None]
-    gain = xp.linalg.solve(G @ G.mT + R, xp.concat([G, residual[..., None]], axis=-1))
+    gain = solve_positive(G @ G.mT + R, xp.concat([G, residual[..., None]], axis=-1), xp)
     one = xp.eye(e.shape[-1], dtype=kind)
     spread = xp.linalg.cholesky(one - G.mT @ gain[..., :-1])
     guided = (G.mT @ gain[..., -1:] + spread @ e[..., None])[..., 0]

@@ -28,6 +28,7 @@ from flowgraph.blocks.kalman.matrices import noise_matrix, observation_matrix
 from flowgraph.blocks.kalman.robust import Robust, reweighted
 from flowgraph.blocks.metrics.chi_square import gate_table
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = [
     "Correction",
@@ -199,13 +200,13 @@ def correct(
     HP = H @ P
     S = HP @ H.mT + R
     column = residual[..., None]
-    solved = xp.linalg.solve(S, xp.concat([HP, column], axis=-1))  # K^T and S^-1 r in one factorization
+    solved = solve_positive(S, xp.concat([HP, column], axis=-1), xp)
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
     parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
     if robust is not None:
         R = reweighted(robust, HP @ H.mT, residual, R, parts, xp)
-        solved = xp.linalg.solve(HP @ H.mT + R, xp.concat([HP, column], axis=-1))
+        solved = solve_positive(HP @ H.mT + R, xp.concat([HP, column], axis=-1), xp)
     K = solved[..., :-1].mT
     if gate is not None:
         K = K * xp.astype(accepted, P.dtype)[..., None, None]

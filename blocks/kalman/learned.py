@@ -31,6 +31,7 @@ from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.filters import Observe, Vector, observed, updated
 from flowgraph.blocks.kalman.robust import Robust
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = ["LEAST", "feed_scale", "learned_noise", "learned_scale", "scale_of", "update_learned"]
 
@@ -85,8 +86,8 @@ def learned_noise(noise: Noise, innovation: KalmanInnovation | None, *, memory: 
     """
     if innovation is None:
         return noise
-    solved = xp.linalg.solve(
-        innovation.covariance, xp.concat([innovation.residual[..., None], noise], axis=-1)
+    solved = solve_positive(
+        innovation.covariance, xp.concat([innovation.residual[..., None], noise], axis=-1), xp
     )
     left = noise @ solved[..., :1]
     change = (left @ left.mT - noise @ solved[..., 1:]) / memory

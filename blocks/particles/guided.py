@@ -34,6 +34,7 @@ from flowgraph.blocks.geometry.manifold import StateSpace
 from flowgraph.blocks.kalman.lost import FARTHEST
 from flowgraph.blocks.kalman.triangles import covariance_root
 from flowgraph.blocks.particles.cloud import log_sum_exp
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = ["Kernels", "Spread", "corrected", "drawn", "spread_of"]
 
@@ -97,7 +98,7 @@ def corrected(
     HB = H @ B
     S = HB @ H.mT + R
     r = residuals(middle)
-    solved = xp.linalg.solve(S, xp.concat([HB, r.mT], axis=-1))  # K^T and S^-1 r in one factorization
+    solved = solve_positive(S, xp.concat([HB, r.mT], axis=-1), xp)
     t = B.shape[-1]
     K, white = solved[:, :t].mT, solved[:, t:].mT
     distance = xp.sum(r * white, axis=-1)

@@ -19,6 +19,7 @@ from flowgraph.blocks.kalman.filters import accepts
 from flowgraph.blocks.kalman.lost import FARTHEST, in_doubt
 from flowgraph.blocks.signals import Cloud, Depletion, KalmanInnovation, Pose
 from flowgraph.data.notes import note
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = [
     "BELIEVED",
@@ -93,7 +94,7 @@ def verdict(
         xp.sum(S * xp.eye(S.shape[-1], dtype=S.dtype), axis=-1)
     )  # its nis is beyond FARTHEST
     residual = xp.maximum(xp.minimum(residual, most), -most)
-    nis = xp.sum(residual * xp.linalg.solve(S, residual[:, None])[:, 0])
+    nis = xp.sum(residual * solve_positive(S, residual[:, None], xp)[:, 0])
     parts = xp.sum(xp.astype(present, S.dtype))
     usable = nis < FARTHEST
     near = accepts(nis, BELIEVED if gate is None else gate, present, xp) & usable

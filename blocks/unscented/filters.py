@@ -42,6 +42,7 @@ from flowgraph.blocks.kalman.triangles import covariance_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
 from flowgraph.blocks.unscented.sigma_points import GAUSSIAN, Cluster, SigmaPoints
 from flowgraph.language.block import Limit
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = [
     "motion_cross",
@@ -246,13 +247,13 @@ def through_observation(
     C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), around, scale)
     residual = within(residual, gate, xp)
     column = residual[..., None]
-    solved = xp.linalg.solve(S, xp.concat([C.mT, column], axis=-1))  # K^T and S^-1 r in one factorization
+    solved = solve_positive(S, xp.concat([C.mT, column], axis=-1), xp)
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
     parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
     if robust is not None:
         noise = reweighted(robust, spread, residual, noise, parts, xp)
-        solved = xp.linalg.solve(spread + noise, xp.concat([C.mT, column], axis=-1))
+        solved = solve_positive(spread + noise, xp.concat([C.mT, column], axis=-1), xp)
     K = solved[..., :-1].mT * xp.astype(accepted, P.dtype)[..., None, None]
     shift = (K @ column)[..., 0]
     turn = None if space is None else space.reset(shift, xp)

@@ -19,7 +19,7 @@ import numpy as np
 from flowgraph.errors import DeclarationError, LoweringError
 from flowgraph.recorder.dual import Dual
 from flowgraph.recorder.dual_rules import RULES
-from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.namespaces import NUMPY, solve_positive
 from flowgraph.recorder.ops import OPS
 from flowgraph.recorder.refusals import caller, refuse
 from flowgraph.recorder.symbolic_namespace import namespace as symbolic
@@ -220,6 +220,12 @@ class Duals:
         """x, brought to the nearest end of a range."""
         low = x if min is None else self.maximum(x, min)
         return low if max is None else self.minimum(low, max)
+
+    def solve_positive(self, a: Any, b: Any, /) -> Any:
+        """The solution of a x = b with a positive matrix."""
+        if any(type(x) is Dual and x.xp is self for x in (a, b)):
+            return _applied(self, "solve", [a, b], {"assume_a": "pos"})
+        return solve_positive(a, b, self.below)
 
     def zeros_like(self, x: Any, /) -> Any:
         """Zeros of a shape and kind."""

@@ -7,10 +7,12 @@ once: as columns beside each other they share one factorization.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from flowgraph.recorder.namespaces import solve_positive
 from flowgraph.recorder.tangents import Made, Rule, Tangent, added, lifted, mapped, shape_of, spread
 
 
@@ -66,13 +68,14 @@ def _outer(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent]) -> Made:
     return xp.linalg.outer(a, b), added(xp, left, right)
 
 
-def _solve(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent]) -> Made:
+def _solve(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent], *, assume_a: str = "gen") -> Made:
     """A dX = dB - dA X, all directions as columns of one right side."""
+    solve = partial(solve_positive, xp=xp) if assume_a == "pos" else xp.linalg.solve
     A, b = values
-    y = xp.linalg.solve(A, b)
+    y = solve(A, b)
     vector = len(shape_of(b)) == 1
     wide, right = (b[:, None], mapped(tangents[1], lambda d: d[..., None])) if vector else (b, tangents[1])
-    X = xp.linalg.solve(A, wide) if vector and len(shape_of(A)) > 2 else y[:, None] if vector else y
+    X = solve(A, wide) if vector and len(shape_of(A)) > 2 else y[:, None] if vector else y
     rank, lead, last = len(shape_of(X)), shape_of(X)[:-2], shape_of(X)[-2:]
     moved = _bilinear(xp, (A, X), (mapped(tangents[0], lambda d: -d), {}), xp.matmul, 2)
     change = added(xp, mapped(right, lambda d: lifted(xp, _spread_matrix(xp, d, wide), rank)), moved)
@@ -84,7 +87,7 @@ def _solve(xp: Any, values: Sequence[Any], tangents: Sequence[Tangent]) -> Made:
         full = xp.broadcast_to(d, (k, *lead, *last)) if tuple(d.shape) != (k, *lead, *last) else d
         order = (*range(1, rank - 1), rank - 1, 0, rank)
         columns.append(xp.reshape(xp.permute_dims(full, order), (*lead, last[0], k * last[1])))
-    solved = xp.linalg.solve(A, columns[0] if len(columns) == 1 else xp.concat(columns, axis=-1))
+    solved = solve(A, columns[0] if len(columns) == 1 else xp.concat(columns, axis=-1))
     out, start = {}, 0
     for key, d in change.items():
         width = d.shape[0] * last[1]

@@ -53,6 +53,9 @@ _OF_TWO = "atan2 hypot copysign"
 SINC = "unnormalized_sinc"
 """sin(x) / x, and 1 at 0. NumPy's `sinc` is another function: of pi x."""
 
+ASSUMED = ("gen", "pos")
+"""What `solve` may be told of its matrix, by SciPy's names: nothing, or that it is symmetric and positive."""
+
 FUNCTIONS = frozenset(f"{_OF_ONE} {_OF_TWO}".split())
 """Functions of real numbers; C has them under the same names."""
 
@@ -146,7 +149,9 @@ def _square(x: Spec) -> Spec:
     return x
 
 
-def _solve(a: Spec, b: Spec) -> Spec:
+def _solve(a: Spec, b: Spec, *, assume_a: str = "gen") -> Spec:
+    if assume_a not in ASSUMED:
+        raise ShapeError(f"solve assumes one of {', '.join(ASSUMED)}, not {assume_a!r}")
     _square(a)
     if len(b.shape) == 1:
         if b.shape[0] != a.shape[-1]:
@@ -401,7 +406,7 @@ def _table() -> dict[str, Op]:
     add("matmul", _matmul, "same")
     add("matrix_transpose", _transpose, "as is")
     add("cholesky", _square, "real", _linalg)
-    add("solve", _solve, "real", _linalg)
+    ops["solve"] = Op("solve", _solve, lambda xp, a, b, *, assume_a="gen": xp.linalg.solve(a, b), "real")
     add("cross", _cross, "same", _linalg)
     add("vecdot", _vecdot, "same", _linalg)
     add("outer", _outer, "same", _linalg)

@@ -71,6 +71,11 @@ def _recorder(name: str, plain: Any = np) -> Callable[..., Any]:
     return call
 
 
+def _solve_positive(a: Any, b: Any) -> Any:
+    trace = _trace_of((a, b))
+    return NUMPY.solve_positive(a, b) if trace is None else trace.apply("solve", a, b, assume_a="pos")
+
+
 def _along(name: str) -> Callable[..., Any]:
     def call(arrays: Sequence[Any], *, axis: int = 0) -> Any:
         trace = _trace_of(arrays)
@@ -197,6 +202,7 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "take": _take,
     "cumulative_sum": _cumulative_sum,
     "roll": _roll,
+    "solve_positive": _solve_positive,
     "argsort": _argsort,
     "zeros_like": lambda x: np.zeros(x.shape, x.dtype),
     "ones_like": lambda x: np.ones(x.shape, x.dtype),

@@ -263,7 +263,8 @@ class Expander(Shapes):
         self.tape.macro("cholesky", [self.form.stored(x)], out)
         return self.from_view(spec, out)
 
-    def solve(self, spec: Spec, a: Value, b: Value) -> Value:
+    def solve(self, spec: Spec, a: Value, b: Value, *, assume_a: str = "gen") -> Value:
+        """Whatever is assumed: C looks whether the matrix is one that needs no exchange of rows."""
         vector = len(b.shape) == 1
         if vector:
             b = self.reshape(Spec((*b.shape, 1), "real"), b)

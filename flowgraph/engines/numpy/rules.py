@@ -150,7 +150,7 @@ def _cholesky(spec: Spec, x: Any) -> Any:
     return _last(NUMPY.linalg.cholesky(_first(x)))
 
 
-def _solve(spec: Spec, a: Any, b: Any) -> Any:
+def _solve(spec: Spec, a: Any, b: Any, *, assume_a: str = "gen") -> Any:
     left, right = _first(a), _first(b)
     if b.ndim == 2:
         return _last(NUMPY.linalg.solve(*_same_rank(left, right[..., None]))[..., 0])

@@ -320,7 +320,7 @@ def _array(i: Instruction, kinds: dict[int, str], made: Written) -> str:
         return method
     if i.op == "concat":
         return f"concatenate(({', '.join(places)},), {i.attrs['axis']})"
-    called = i.op in _CALLED and not i.attrs
+    called = i.op in _CALLED and i.attrs.keys() <= {"assume_a"}
     if i.op == "where" and made.shapes[i.args[0]]:
         name, made.names["o_each"] = "o_each", np.where
     elif called:

@@ -51,6 +51,9 @@ class JaxNamespace:
     def unnormalized_sinc(self, x: Any) -> Any:
         return unnormalized_sinc(x, self._jax.numpy)
 
+    def solve_positive(self, a: Any, b: Any) -> Any:
+        return self.linalg.solve(a, b)
+
     def floor_divide(self, a: Any, b: Any) -> Any:
         return ranges.floor_divide(self._jax.numpy, a, b)
 

@@ -260,7 +260,9 @@ def test_the_bench_of_particles_shows_what_they_cost():
 
 @pytest.mark.parametrize("bad", [{"particles": "10;20"}, {"particles": "0"}, {"flights": 0}])
 def test_the_bench_refuses_what_is_no_size(bad):
-    with pytest.raises(DeclarationError, match="numbers of particles"):
+    with pytest.raises(
+        DeclarationError, match=r"cost\.particles: these are no whole|cost needs a whole number as 'flights'"
+    ):
         cost(**bad)
 
 
