@@ -14,9 +14,8 @@ from flowgraph.cli.options import case_of
 from flowgraph.data.registry import find_graph, graph_names
 from flowgraph.graphs.benches import engine_of
 from flowgraph.graphs.benches.thesis import Noise, bound_of, fly, smoothed_errors
-from tests.graphs.estimation import smooth
+from tests.graphs.estimation import outdoor, smooth
 from tests.graphs.library import OWN
-from tests.graphs.test_outdoor import flight as outdoor
 from tests.recordings import recordings
 
 POSES = ("ekf", "ukf", "ins_eskf", "ins_ekf_pose", "ins_ukf_pose")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -36,7 +37,8 @@ class Programme:
     """Microwords of the first lane by hand; a word's number is its place."""
 
     def __init__(self, image: Image) -> None:
-        self.image, self.code, self.free = image, [], FREE
+        self.image, self.free = image, FREE
+        self.code: list[Any] = []
 
     def step(self, kind, a, b=ONE, *, shift=0, mode="RAW", to=None, unit="divide", last=False) -> None:
         term = Term(kind, a, b, shift)

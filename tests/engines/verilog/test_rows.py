@@ -221,10 +221,10 @@ def test_a_row_is_read_after_its_last_element_is_written_and_its_place_is_kept_u
         k += 1
     assert now == found.cycles
     steps = [w.does for w in found.words if not isinstance(w.does, Loop)]
-    ends = [[s is not None and s.mode == "INDEX" for s in lanes_] for lanes_ in steps]
-    assert max(map(sum, ends)) == 1  # one index is written in a cycle
+    indexed = [[s is not None and s.mode == "INDEX" for s in lanes_] for lanes_ in steps]
+    assert max(map(sum, indexed)) == 1  # one index is written in a cycle
     if lanes.count > 1:  # in whichever lane, and asked for in any
-        assert any(any(row[1:]) for row in ends)
+        assert any(any(row[1:]) for row in indexed)
         assert any(s is not None and s.term.kind == "GET" for lanes_ in steps for s in lanes_[1:])
 
 
