@@ -72,6 +72,7 @@ from flowgraph.blocks.kalman.smoothing import (
 )
 from flowgraph.blocks.kalman.triangles import covariance_root, lower_root, semidefinite_root
 from flowgraph.blocks.signals import Gaussian, KalmanInnovation
+from flowgraph.recorder.namespaces import solve_positive
 
 __all__ = [
     "Smoothing",
@@ -99,6 +100,7 @@ __all__ = [
     "aged",
     "bridge",
     "bridged",
+    "solve_positive",
     "stay",
     "find_back",
     "in_doubt",

@@ -43,12 +43,21 @@ from flowgraph.blocks.metrics.running import (
     settle_time,
 )
 from flowgraph.blocks.metrics.states import ALIGNMENTS, StateErrors, true_parts
-from flowgraph.blocks.metrics.terms import FIGURES, attitude_terms, place_terms, turn_error
+from flowgraph.blocks.metrics.terms import (
+    FIGURES,
+    attitude_terms,
+    nis_limits,
+    nis_terms,
+    place_terms,
+    turn_error,
+)
 from flowgraph.blocks.metrics.truth import known, truth_remarks
 
 __all__ = [
     "FIGURES",
     "attitude_terms",
+    "nis_limits",
+    "nis_terms",
     "place_terms",
     "turn_error",
     "nis_score",

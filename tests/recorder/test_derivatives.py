@@ -25,7 +25,7 @@ from flowgraph import (
 )
 from flowgraph.blocks.geometry.rotations import from_rotation_vector, normalize, to_rotation_vector
 from flowgraph.recorder.dual_rules import RULES
-from flowgraph.recorder.namespaces import NUMPY
+from flowgraph.recorder.namespaces import NUMPY, solve_positive
 from flowgraph.recorder.ops import OPS, Spec, bound_attrs
 from flowgraph.recorder.symbolic_namespace import namespace
 from flowgraph.recorder.trace import Trace
@@ -183,6 +183,7 @@ CASES: dict[str, list[Callable[[Any, Any], Any]]] = {
     "cholesky": [lambda x, xp: xp.linalg.cholesky(positive(x, xp))],
     "solve": [
         lambda x, xp: xp.linalg.solve(positive(x, xp), grid(x * x, xp)),
+        lambda x, xp: solve_positive(positive(x, xp), grid(x * x, xp), xp),
         lambda x, xp: xp.linalg.solve(positive(x, xp), x[..., :3, None])[..., 0],
         lambda x, xp: xp.linalg.solve(A[:3, :3] + 2.0 * np.eye(3), grid(x, xp)),
         lambda x, xp: xp.linalg.solve(positive(x, xp), A[:3, :2] + 0.0 * grid(x, xp)[..., :2]),
@@ -237,6 +238,7 @@ ONE_ROW = {
     ],
     "solve": [
         lambda x, xp: xp.linalg.solve(positive(x, xp), x[3:]),
+        lambda x, xp: solve_positive(positive(x, xp), x[3:], xp),
         lambda x, xp: xp.linalg.solve(A[:3, :3] + 2.0 * np.eye(3), x[3:]),
         lambda x, xp: xp.linalg.solve(positive(x, xp) * np.ones((2, 1, 1)), x[3:] ** 2),
     ],
