@@ -200,7 +200,7 @@ def correct(
     HP = H @ P
     S = HP @ H.mT + R
     column = residual[..., None]
-    solved = solve_positive(S, xp.concat([HP, column], axis=-1), xp)
+    solved = solve_positive(S, xp.concat([HP, column], axis=-1), xp)  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
     parts = xp.sum(xp.astype(present, P.dtype), axis=-1)

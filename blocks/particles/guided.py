@@ -98,7 +98,7 @@ def corrected(
     HB = H @ B
     S = HB @ H.mT + R
     r = residuals(middle)
-    solved = solve_positive(S, xp.concat([HB, r.mT], axis=-1), xp)
+    solved = solve_positive(S, xp.concat([HB, r.mT], axis=-1), xp)  # K^T and S^-1 r in one factorization
     t = B.shape[-1]
     K, white = solved[:, :t].mT, solved[:, t:].mT
     distance = xp.sum(r * white, axis=-1)

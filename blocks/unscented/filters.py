@@ -247,7 +247,7 @@ def through_observation(
     C = points.covariance(Cluster(x, apart, 0.0 * apart[..., :1, :]), around, scale)
     residual = within(residual, gate, xp)
     column = residual[..., None]
-    solved = solve_positive(S, xp.concat([C.mT, column], axis=-1), xp)
+    solved = solve_positive(S, xp.concat([C.mT, column], axis=-1), xp)  # K^T and S^-1 r in one factorization
     nis = (column.mT @ solved[..., -1:])[..., 0, 0]
     accepted = accepts(nis, gate, present, xp)
     parts = xp.sum(xp.astype(present, P.dtype), axis=-1)
