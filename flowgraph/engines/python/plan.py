@@ -322,3 +322,15 @@ def bound(plan_: Plan, names: dict[str, Any]) -> Callable[..., None]:
     exec(plan_.code, scope)  # text written above from the graph, never from a file
     reaction: Callable[..., None] = scope.pop("react")  # else it would hold itself
     return reaction
+
+
+class Reactions(dict[int, Callable[[int], None]]):
+    """Reactions by pattern, compiled when a pattern first occurs."""
+
+    def __init__(self, graph: Graph, names: dict[str, Any]) -> None:
+        super().__init__()
+        self._graph, self._names = graph, names
+
+    def __missing__(self, key: int) -> Callable[[int], None]:
+        self[key] = bound(plan(self._graph, key), self._names)
+        return self[key]

@@ -28,7 +28,7 @@ from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.draws import Ahead
 from flowgraph.engines.python.loop import Loop, feed, loop, numbers
-from flowgraph.engines.python.plan import Plan, bindings, bound, plan
+from flowgraph.engines.python.plan import Plan, Reactions, bindings, bound
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
 from flowgraph.errors import DataError, FifoOverflowError
@@ -133,7 +133,7 @@ class Run:
             **{f"c{k}": values.append for k, values in enumerate(self._values)},
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
         }
-        self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        self._reactions: dict[int, Callable[[int], None]] = Reactions(graph, self._names)
         self._stamped: Mapping[int, frozenset[int]] = {}
         self._columns: dict[int, list[list[Any]]] = {}  # of what the loop keeps by leaves
         if self._loop is not None:
@@ -440,15 +440,3 @@ class Run:
         self._packed.clear()
         self._forget()
         return found
-
-
-class _Reactions(dict[int, Callable[[int], None]]):
-    """Reactions by pattern, compiled when a pattern first occurs."""
-
-    def __init__(self, graph: Graph, names: dict[str, Any]) -> None:
-        super().__init__()
-        self._graph, self._names = graph, names
-
-    def __missing__(self, key: int) -> Callable[[int], None]:
-        self[key] = bound(plan(self._graph, key), self._names)
-        return self[key]
