@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.series import Series
+from flowgraph.engines.python.lifetimes import let_go
 from flowgraph.engines.python.plan import Plan, Presence, Writer, compiled, named
 from flowgraph.engines.python.steps import KINDS, Line, Written, silent, single, written
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
@@ -105,7 +106,7 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
         lines.append(f"            {'if' if n == 0 else 'elif'} key == {key}:")
         writer = _LoopWriter(graph, key, which, len(lines))
         writer.reaction()
-        lines += writer.lines
+        lines += let_go(writer.lines, writer.arrays)
         owner |= writer.owner
     lines += ["    except BaseException:", "        broken(t)", "        raise"]
     lines += ["    finally:", *(stores or ["        pass"])]
@@ -263,6 +264,7 @@ class _LoopWriter(Writer):
         self.lines, self.indent = [], 4
         self.leaves: dict[tuple[int, int], list[str]] = {}
         self.next: dict[int, list[str]] = {}
+        self.arrays: set[str] = set()
         self.known: dict[str, str] = {}
         """By what is computed, the variable that has it already."""
 
@@ -338,6 +340,7 @@ class _LoopWriter(Writer):
         for argument, given in zip(call.arguments, step.arguments, strict=True):
             if given:
                 local |= dict(zip(given, self._read(argument), strict=True))
+        self.arrays |= {f"w{index}_{n}" for n, shape in text.shapes.items() if shape}
         for line in text.lines:
             self._line(line, index, local, call.path)
 
