@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flowgraph.data.arrival import with_stamps
+from flowgraph.data.finite import finite
 from flowgraph.data.flight import Flight
 from flowgraph.data.series import Series, unmasked
 from flowgraph.data.stamps import extreme_steps
@@ -264,8 +265,7 @@ def _check_after(name: str, time: int, resumed: int) -> None:
 
 def check_finite(name: str, series: Series) -> None:
     """Refuse a recording with values that are NaN or infinite."""
-    sound = all(np.isfinite(leaf).all() for leaf in series.leaves.values() if leaf.dtype.kind == "f")
-    if not sound and (broken := _broken_rows(series)).any():
+    if not all(map(finite, series.leaves.values())) and (broken := _broken_rows(series)).any():
         row = int(np.flatnonzero(broken)[0])
         _not_finite(name, int(series.time[row]), f"row {row} ({int(broken.sum())} in all)")
 

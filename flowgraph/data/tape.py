@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,6 +66,12 @@ class Tape:
         rows = [(int((before >> k & 1).sum()), int((key >> k & 1).sum())) for k in range(len(self.series))]
         series = tuple(s[n : n + count] for s, (n, count) in zip(self.series, rows, strict=True))
         return Tape(self.time[first:last], key, series)
+
+    def times(self, patterns: Collection[int], first: int = 0, last: int | None = None) -> np.ndarray:
+        """The times of the ticks with these patterns, from tick `first` on and before `last`."""
+        time, key = self.time[first:last], self.key[first:last]
+        asked = np.array(sorted(patterns), self.key.dtype)
+        return time if set(patterns_of(key)) <= set(patterns) else time[np.isin(key, asked)]
 
     @property
     def rows(self) -> tuple[Rows, ...]:
@@ -211,7 +217,7 @@ def _columns(events: Iterable[tuple[int, Any]]) -> tuple[list[int], list[Any]]:
     return [t for t, _ in pairs], [v for _, v in pairs]
 
 
-def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series:
+def stack(times: Sequence[int] | np.ndarray, values: list[Any], type_: Type, name: str) -> Series:
     """A series from times and single values."""
     leaves = leaves_of(type_)
     if len(leaves) == 1 and not isinstance(type_, StructType):
@@ -232,7 +238,7 @@ def stack(times: list[int], values: list[Any], type_: Type, name: str) -> Series
     return joined(times, columns, type_, name)
 
 
-def joined(times: list[int], columns: Iterable[list[Any]], type_: Type, name: str) -> Series:
+def joined(times: Sequence[int] | np.ndarray, columns: Iterable[list[Any]], type_: Type, name: str) -> Series:
     """A series from times and a list of values for each leaf."""
     made = [_stacked(column, leaf) for column, (_, leaf) in zip(columns, leaves_of(type_), strict=True)]
     return Series(np.asarray(times, dtype=np.int64), unflatten(type_, iter(made)), type=type_, name=name)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flowgraph.data.batch import Runs
+from flowgraph.data.finite import finite
 from flowgraph.data.notes import note
 from flowgraph.data.result import Result
 from flowgraph.data.tape import Tape
@@ -70,8 +71,7 @@ class Astray(NamedTuple):
 def gaps_of(tape: Tape, names: Sequence[str]) -> dict[str, list[bool]]:
     """The inputs whose leaves hold what is not finite."""
     return {
-        name: [a.dtype.kind == "f" and not np.isfinite(a).all() for a in s.leaves.values()]
-        for name, s in zip(names, tape.series, strict=True)
+        name: [not finite(a) for a in s.leaves.values()] for name, s in zip(names, tape.series, strict=True)
     }
 
 
@@ -130,7 +130,7 @@ def all_finite(result: Result) -> bool:
     """Whether all that a run gave is finite."""
     arrays = [a for s in result.series.values() for a in s.leaves.values()]
     arrays += [a for _, a in _leaves(result.state)]
-    return all(a.dtype.kind != "f" or bool(np.isfinite(a).all()) for a in arrays)
+    return all(map(finite, arrays))
 
 
 def astray(result: Result, run: Playback) -> list[Astray]:
@@ -153,7 +153,7 @@ def _made(outputs: list[Astray], registers: list[Astray], run: Playback) -> list
 
 
 def _bad_rows(array: np.ndarray) -> np.ndarray | None:
-    if array.dtype.kind != "f" or np.isfinite(array).all():
+    if finite(array):
         return None
     found: np.ndarray = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
     return found
@@ -166,11 +166,7 @@ def _leaves(state: Mapping[str, Any]) -> Iterator[tuple[Place, np.ndarray]]:
 
 
 def _bad_registers(result: Result) -> list[Astray]:
-    return [
-        Astray(place, None, 1)
-        for place, value in _leaves(result.state)
-        if value.dtype.kind == "f" and not np.isfinite(value).all()
-    ]
+    return [Astray(place, None, 1) for place, value in _leaves(result.state) if not finite(value)]
 
 
 def moved_leaves(
@@ -184,13 +180,13 @@ def moved_leaves(
         gaps: the inputs, by name, whose leaf may hold a NaN.
     """
     held = [(r.path, c) for r in pipeline.registers for c in r.cells]
-    given = {n for n, a in pipeline.constants.items() if a.dtype.kind == "f" and not np.isfinite(a).all()}
+    given = {n for n, a in pipeline.constants.items() if not finite(a)}
     for port in pipeline.inputs:
         may = gaps.get(port.name, [True] * len(port.leaves))
         given |= {leaf.value for leaf, gap in zip(port.leaves, may, strict=True) if gap}
     for (_, cell), value in zip(held, cells, strict=True):
         array = np.asarray(value)
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        if not finite(array):
             given.add(cell.read)
     while True:
         for i in pipeline.instructions:
@@ -234,7 +230,7 @@ class ManyTroubles:
         found = [
             Astray(place, None, 1)
             for place, cell in zip(self._held, map(np.asarray, cells), strict=True)
-            if cell.dtype.kind == "f" and not np.isfinite(cell).all()
+            if not finite(cell)
         ]
         if found:
             self._found[n] = self._made(n, [], found)
@@ -249,7 +245,7 @@ class ManyTroubles:
         found: dict[int, list[Astray]] = {}
         for name, runs in series.items():
             for leaf, array in runs.leaves.items():
-                if array.dtype.kind != "f" or np.isfinite(array).all():
+                if finite(array):
                     continue
                 bad = ~np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=2) & runs.present
                 for n in np.flatnonzero(bad.any(axis=1)).tolist():

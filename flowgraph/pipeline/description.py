@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from flowgraph.data.finite import finite
 from flowgraph.errors import DeclarationError, PipelineError
 from flowgraph.language.block import Limit
 from flowgraph.language.clock import Timing
@@ -139,7 +140,7 @@ def _plain(record: Any) -> Any:
 def _numbers(array: Any) -> Any:
     """Nested lists; numbers that JSON lacks as text."""
     flat = np.asarray(array)
-    if flat.dtype.kind == "f" and not np.isfinite(flat).all():
+    if not finite(flat):
         spelled = np.array([x if math.isfinite(x) else str(x) for x in flat.ravel().tolist()], dtype=object)
         return spelled.reshape(flat.shape).tolist()
     return flat.tolist()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowgraph.data.tape import Tape
-from flowgraph.engines.python.draws import Ahead, expected
+from flowgraph.engines.python.draws import Ahead
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.random import seed_words, site
 
@@ -19,7 +19,7 @@ KEY = np.arange(900) % 3 + 1
 @pytest.mark.parametrize("patterns", [frozenset({1, 2, 3}), frozenset({2}), None])
 def test_draws_made_ahead_are_those_of_the_site(kind, shape, patterns):
     one, seed = site("a", kind, "n", shape), seed_words(5)
-    ahead = Ahead(one, expected(Tape(TIME, KEY, ()), patterns), seed)
+    ahead = Ahead(one, Tape(TIME, KEY, ()).times(patterns or ()), seed)
     often = 1 if shape != (3000, 3) else 40
     for stride in (often, 30, often):  # used at each tick, seldom, and at each again
         for k in range(1, 400, stride):  # with times at which nothing is expected to be drawn

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -70,6 +71,42 @@ def test_an_input_is_spread_over_the_ticks_of_each_chunk(at):
         np.testing.assert_array_equal(when, np.r_[time[first:last], [time[last - 1]] * short])
         assert buffers.holds(column[1:])
         assert not buffers.holds(column.copy())
+
+
+def test_buffers_serve_one_recording_after_another():
+    """What another left in them is gone, whichever rows it had."""
+    ways = [slice(None), slice(1, 12, 5), slice(1, 12, 5), np.array([0, 3, 11]), slice(0, 12, 5), slice(None)]
+    buffers = Buffers(12, np.uint8, False, [[np.zeros(12)]], 0, np.float64, 9)
+    for n, at in enumerate(ways):
+        dense = np.zeros(12)
+        dense[at] = n + np.arange(1.0, 13)[: len(dense[at])]
+        ticks = 7 if n == 3 else 12
+        at = np.array([0, 3]) if n == 3 else at
+        dense[ticks:] = 0
+        time, choice = np.arange(ticks), np.zeros(ticks, np.uint8)
+        buffers.fill(choice, time, [at], [[dense[:ticks][at]]], slice(0, ticks))
+        np.testing.assert_array_equal(buffers.arrays[2][0][0], dense)
+    assert buffers.bytes == 12 * 9
+    assert buffers.fits([[np.zeros(5)]])
+    assert not buffers.fits([[np.zeros((5, 3))]])
+
+
+def test_runs_in_threads_do_not_share_buffers():
+    """Two at once of one compiled scan: each with its own inputs."""
+    pytest.importorskip("jax")
+    one = built()
+    time = np.arange(200_000) * 10
+    flights = [
+        {
+            "a": Series(time, np.full(len(time), 1.0 * k)),
+            "b": Series(time[::3], np.full(len(time[::3]), 100.0 * k)),
+        }
+        for k in range(8)
+    ]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda f: simulate(one, f, engine="xla")["out"]["value"], flights))
+    for k, values in enumerate(found):
+        np.testing.assert_array_equal(values, 101.0 * k)
 
 
 def test_buffers_lie_where_xla_takes_them():

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.files import put_new, whole
+from flowgraph.data.finite import finite
 from flowgraph.data.inputs import Inputs
 from flowgraph.engines.c.replay import KEEPS, csv_names, main_text
 from flowgraph.engines.c.source import generate
@@ -99,9 +100,7 @@ def write_events(pipeline: Pipeline, inputs: Inputs | Mapping[str, Any], file: s
     rows = [iter(c) for c in columns]
     names = csv_names(pipeline.inputs)
     with whole(file) as out:
-        if any(
-            a.dtype.kind == "f" and not np.isfinite(a).all() for x in events.series for a in x.leaves.values()
-        ):
+        if not all(finite(a) for x in events.series for a in x.leaves.values()):
             out.write(f"{KEEPS}\n".encode())
         for time, key in zip(events.time.tolist(), events.key.tolist(), strict=True):
             for k, name in enumerate(names):

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from flowgraph.data.tape import Tape
 from flowgraph.recorder.namespaces import NUMPY
 from flowgraph.recorder.random import Site
 
@@ -56,12 +55,3 @@ class Ahead:
         rows = np.moveaxis(self._site.at(times, self._seed), -1, 0)
         self._made = dict(zip(times.tolist(), np.ascontiguousarray(rows), strict=True))
         return self._made.pop(time)
-
-
-def expected(tape: Tape, patterns: frozenset[int] | None) -> np.ndarray:
-    """The times of the ticks with these patterns; of None, none."""
-    if patterns is None:
-        return tape.time[:0]
-    if patterns.issuperset(tape.patterns):
-        return tape.time
-    return tape.time[np.isin(tape.key, np.array(sorted(patterns), tape.key.dtype))]

@@ -38,13 +38,17 @@ _PART = 4096
 @dataclass(frozen=True)
 class Loop:
     """A compiled loop, the names that it needs, and where it goes by leaves: which sources it reads, and
-    which of the collected streams it keeps. What it draws has for each name its site, and the patterns at
-    which it is drawn; None where a condition says so."""
+    which of the collected streams it keeps. The values of `steady` sources, which every tick has, come with
+    the ticks. Of the collected streams that are there at some patterns whatever happens, `stamped` has these:
+    nobody need note their times. What it draws has for each name its site, and the patterns at which it is
+    drawn; None where a condition says so."""
 
     plan: Plan
     names: dict[str, Any]
     open: frozenset[int]
+    steady: tuple[int, ...]
     kept: frozenset[int]
+    stamped: Mapping[int, frozenset[int]]
     sites: Mapping[str, tuple[Site, frozenset[int] | None]]
 
 
@@ -64,15 +68,15 @@ def numbers(array: np.ndarray) -> Iterator[Any]:
     return chain.from_iterable(array[k : k + _PART].tolist() for k in range(0, len(array), _PART))
 
 
-def feed(series: Series, k: int, to: Loop | None) -> Callable[[], Any]:
+def feed(series: Series, k: int, to: Loop | None) -> Iterator[Any]:
     """The values of source k one after the other, as a loop reads them."""
     if to is None or k not in to.open:
-        return iter(series).__next__
+        return iter(series)
     columns = [
         numbers(array) if single(leaf) else iter(array)
         for array, (_, leaf) in zip(series.leaves.values(), leaves_of(series.type), strict=True)
     ]
-    return columns[0].__next__ if isinstance(series.type, ArrayType) else zip(*columns, strict=True).__next__
+    return columns[0] if isinstance(series.type, ArrayType) else zip(*columns, strict=True)
 
 
 def _may(graph: Graph) -> bool:
@@ -96,7 +100,8 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
         else:
             lines.append(f"    r{index} = r[{index}]")
             stores.append(f"        r[{index}] = r{index}")
-    lines += ["    try:", "        for t, key in ticks:"]
+    given = ["t", "key", *(which.given(k) for k in which.steady)]
+    lines += ["    try:", f"        for {', '.join(given)} in ticks:"]
     for n, key in enumerate(patterns):
         lines.append(f"            {'if' if n == 0 else 'elif'} key == {key}:")
         writer = _LoopWriter(graph, key, which, len(lines))
@@ -108,7 +113,8 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
     to = " or ".join(named(graph, key) for key in patterns)
     code = compiled(graph, "\n".join(lines) + "\n", owner, to)
     kept = frozenset(k for k, c in enumerate(graph.collected) if which.here(c.wire))
-    return Loop(code, which.names, frozenset(which.sources.values()), kept, which.drawn(patterns))
+    open_ = frozenset(which.sources.values())
+    return Loop(code, which.names, open_, which.steady, kept, which.stamped, which.drawn(patterns))
 
 
 def leaves(type_: Type, text: str) -> list[str]:
@@ -152,6 +158,9 @@ class _Which:
         ports = [i for i, n in enumerate(graph.nodes) if isinstance(n, SourceNode)]
         read = {w.node for call in self.calls.values() for w in self._wires(call)}
         self.sources = {i: k for k, i in enumerate(ports) if i in read}
+        self._ports = ports
+        self.steady = tuple(k for k in range(len(ports)) if all(key >> k & 1 for key in patterns))
+        """The sources that are there at all patterns, in order."""
         states = {call.state for call in self.calls.values()}
         self.registers = {
             i: node
@@ -168,6 +177,26 @@ class _Which:
                     self.names[f"make{index}_{k}" if isinstance(node, CallNode) else f"make{index}"] = _maker(
                         type_
                     )
+
+        self.stamped: dict[int, frozenset[int]] = {}
+        """The patterns at which collected stream k is there, where nothing else decides that."""
+        for k, collected in enumerate(graph.collected):
+            there = [w.fresh(collected.wire) for w in writers]
+            if not any(isinstance(f, str) for f in there):
+                self.stamped[k] = frozenset(key for key, f in zip(patterns, there, strict=True) if f)
+
+    def source(self, index: int) -> list[str]:
+        """The variables that hold the leaves of a source, or the one that holds its value."""
+        node = self.graph.nodes[index]
+        assert isinstance(node, SourceNode)
+        count = len(leaves_of(node.type))
+        return [f"x{index}_{n}" for n in range(count)] if index in self.sources else [f"x{index}"]
+
+    def given(self, k: int) -> str:
+        """Source k as the target of an assignment."""
+        node, names = self.graph.nodes[self._ports[k]], self.source(self._ports[k])
+        whole = isinstance(node, SourceNode) and isinstance(node.type, ArrayType)
+        return names[0] if whole or self._ports[k] not in self.sources else f"({', '.join(names)},)"
 
     def drawn(self, patterns: tuple[int, ...]) -> dict[str, tuple[Site, frozenset[int] | None]]:
         """The sites of the calls that are written out, and at which patterns they are drawn."""
@@ -244,13 +273,10 @@ class _LoopWriter(Writer):
         self.owner[self.first + len(self.lines)] = owner
 
     def read(self, index: int, k: int, node: SourceNode) -> None:
-        if index not in self.which.sources:
-            super().read(index, k, node)
-            return
-        single_ = isinstance(node.type, ArrayType)
-        names = [f"x{index}_{n}" for n in range(len(leaves_of(node.type)))]
-        self.emit(f"{', '.join(names)}{'' if single_ else ','} = n{k}()", node.path)
-        self.leaves[index, 0] = names
+        if k not in self.which.steady:
+            self.emit(f"{self.which.given(k)} = n{k}()", node.path)
+        if index in self.which.sources:
+            self.leaves[index, 0] = self.which.source(index)
 
     def stamp(self, register: int) -> str:
         return f"r{register}"
@@ -269,9 +295,10 @@ class _LoopWriter(Writer):
         return put_together(self.graph.port(wire).type, self._leaves(wire), maker)
 
     def kept(self, k: int, wire: Wire) -> str:
-        if not self.which.here(wire):
-            return super().kept(k, wire)
-        return "; ".join(f"c{k}_{n}({leaf})" for n, leaf in enumerate(self._leaves(wire)))
+        here = self.which.here(wire)
+        keep = [f"c{k}_{n}({leaf})" for n, leaf in enumerate(self._leaves(wire))] if here else []
+        keep = keep or [f"c{k}({self.value(wire)})"]
+        return "; ".join(keep if k in self.which.stamped else [*keep, f"u{k}(t)"])
 
     def remembered(self, index: int, register: int) -> str:
         if index not in self.which.calls:

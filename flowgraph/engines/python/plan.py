@@ -11,6 +11,8 @@ from __future__ import annotations
 import linecache
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import blake2b
 from types import CodeType
 from typing import Any
 
@@ -54,9 +56,15 @@ def named(graph: Graph, key: int) -> str:
 
 def compiled(graph: Graph, text: str, nodes: Mapping[int, str], to: str) -> Plan:
     """A text as code, which tracebacks and debuggers can show."""
-    file = f"<reaction of {graph.name} {id(graph):x} to {to}>"
+    return Plan(_code(text, f"reaction of {graph.name} to {to}"), text, nodes)
+
+
+@lru_cache(maxsize=256)
+def _code(text: str, title: str) -> CodeType:
+    """Compiled once for all graphs that are built alike: compiling takes longer than writing."""
+    file = f"<{title}, {blake2b(text.encode(), digest_size=6).hexdigest()}>"
     linecache.cache[file] = (len(text), None, text.splitlines(True), file)
-    return Plan(compile(text, file, "exec"), text, nodes)
+    return compile(text, file, "exec")
 
 
 def presence(result: Any) -> tuple[bool, Any]:
@@ -101,9 +109,7 @@ class Writer:
             if register.feed is not None:
                 self.guarded(self.fresh(register.feed), self.fed(index, register.feed), register.path)
         for k, collected in enumerate(self.graph.collected):
-            self.guarded(
-                self.fresh(collected.wire), f"{self.kept(k, collected.wire)}; u{k}(t)", collected.name
-            )
+            self.guarded(self.fresh(collected.wire), self.kept(k, collected.wire), collected.name)
         if len(self.lines) == before:
             self.emit("pass", "")
 
@@ -128,8 +134,8 @@ class Writer:
         return f"r[{register}] = {self.value(wire)}"
 
     def kept(self, k: int, wire: Wire) -> str:
-        """The statement that keeps the value of collected stream k."""
-        return f"c{k}({self.value(wire)})"
+        """The statement that keeps the value of collected stream k and its time."""
+        return f"c{k}({self.value(wire)}); u{k}(t)"
 
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)
@@ -316,3 +322,15 @@ def bound(plan_: Plan, names: dict[str, Any]) -> Callable[..., None]:
     exec(plan_.code, scope)  # text written above from the graph, never from a file
     reaction: Callable[..., None] = scope.pop("react")  # else it would hold itself
     return reaction
+
+
+class Reactions(dict[int, Callable[[int], None]]):
+    """Reactions by pattern, compiled when a pattern first occurs."""
+
+    def __init__(self, graph: Graph, names: dict[str, Any]) -> None:
+        super().__init__()
+        self._graph, self._names = graph, names
+
+    def __missing__(self, key: int) -> Callable[[int], None]:
+        self[key] = bound(plan(self._graph, key), self._names)
+        return self[key]

@@ -26,9 +26,9 @@ from flowgraph.data.series import Series, chained
 from flowgraph.data.tape import Tape, batches, joined, merged, stack
 from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
-from flowgraph.engines.python.draws import Ahead, expected
+from flowgraph.engines.python.draws import Ahead
 from flowgraph.engines.python.loop import Loop, feed, loop, numbers
-from flowgraph.engines.python.plan import Plan, bindings, bound, plan
+from flowgraph.engines.python.plan import Plan, Reactions, bindings, bound
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
 from flowgraph.errors import DataError, FifoOverflowError
@@ -96,7 +96,7 @@ class Run:
         self._entrance = Entrance(graph, self._last, not_finite)
         self._recorded = True
         self._loop: Loop | None = None
-        self._played = 0  # ticks of the tape
+        self._played, self._packed_at = 0, 0  # ticks of the tape
         self._broken: list[int | None] = []  # the time of the tick that failed
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
@@ -113,8 +113,10 @@ class Run:
             if self._recorded:
                 self._tape = Tape.of(series)
                 self._loop = loop(graph, self._tape.patterns)
-                self._ticks = zip(numbers(self._tape.time), numbers(self._tape.key), strict=True)
-                feeds = [feed(s, k, self._loop) for k, s in enumerate(series)]
+                read = [feed(s, k, self._loop) for k, s in enumerate(series)]
+                steady = [] if self._loop is None else [read[k] for k in self._loop.steady]
+                self._ticks = zip(numbers(self._tape.time), numbers(self._tape.key), *steady, strict=True)
+                feeds = [values.__next__ for values in read]
             else:
                 self._ticks, feeds = merged(prepared)
         here = weakref.proxy(self)  # a run that nobody holds is gone at once, with all that it has kept
@@ -131,14 +133,16 @@ class Run:
             **{f"c{k}": values.append for k, values in enumerate(self._values)},
             **{f"u{k}": times.append for k, times in enumerate(self._times)},
         }
-        self._reactions: dict[int, Callable[[int], None]] = _Reactions(graph, self._names)
+        self._reactions: dict[int, Callable[[int], None]] = Reactions(graph, self._names)
+        self._stamped: Mapping[int, frozenset[int]] = {}
         self._columns: dict[int, list[list[Any]]] = {}  # of what the loop keeps by leaves
         if self._loop is not None:
+            self._stamped = self._loop.stamped
             types = [graph.port(c.wire).type for c in graph.collected]
             self._columns = {k: [[] for _ in leaves_of(types[k])] for k in self._loop.kept}
             keep = {f"c{k}_{n}": c.append for k, some in self._columns.items() for n, c in enumerate(some)}
             self._ahead = {
-                name: Ahead(site, expected(self._tape, at), self._key)
+                name: Ahead(site, self._tape.times(() if at is None else at), self._key)
                 for name, (site, at) in self._loop.sites.items()
             }
             names = self._names | self._loop.names | keep | self._ahead | {"broken": self._broken.append}
@@ -242,11 +246,13 @@ class Run:
 
     def _pack(self) -> None:
         """Make arrays of what was collected, once it is much."""
-        if max(map(len, self._times), default=0) >= _PACKED:
+        stamped = self._played - self._packed_at if self._stamped else 0
+        if max(stamped, *map(len, self._times), 0) >= _PACKED:
             self._packed.append(self._collected())
             self._forget()
 
     def _forget(self) -> None:
+        self._packed_at = self._played
         for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
             kept.clear()
 
@@ -414,10 +420,15 @@ class Run:
         """The collected streams since they were last packed or drained."""
         series = {}
         for k, collected in enumerate(self.graph.collected):
-            type_, name, times = self.graph.port(collected.wire).type, collected.name, self._times[k]
-            by_leaf = k in self._columns
-            series[name] = (joined if by_leaf else stack)(
-                times, self._columns[k] if by_leaf else self._values[k], type_, name
+            type_, name = self.graph.port(collected.wire).type, collected.name
+            times: list[int] | np.ndarray = self._times[k]
+            values, columns = self._values[k], self._columns.get(k)
+            if k in self._stamped:
+                times = self._tape.times(self._stamped[k], self._packed_at, self._played)
+                for some in (values, *(columns or ())):
+                    del some[len(times) :]  # of a tick that was broken off
+            series[name] = (
+                stack(times, values, type_, name) if columns is None else joined(times, columns, type_, name)
             )
         return series
 
@@ -429,15 +440,3 @@ class Run:
         self._packed.clear()
         self._forget()
         return found
-
-
-class _Reactions(dict[int, Callable[[int], None]]):
-    """Reactions by pattern, compiled when a pattern first occurs."""
-
-    def __init__(self, graph: Graph, names: dict[str, Any]) -> None:
-        super().__init__()
-        self._graph, self._names = graph, names
-
-    def __missing__(self, key: int) -> Callable[[int], None]:
-        self[key] = bound(plan(self._graph, key), self._names)
-        return self[key]

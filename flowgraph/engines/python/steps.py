@@ -22,9 +22,9 @@ import dis
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from hashlib import blake2b
-from types import BuiltinFunctionType, CellType, FunctionType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -364,6 +364,12 @@ def _index(entries: Sequence[Any]) -> str:
     )
 
 
+@lru_cache(maxsize=256)
+def _straight(code: CodeType) -> bool:
+    """Whether a function is one expression without branches, loops and writes."""
+    return not any(i.opname.startswith(_NOT_STRAIGHT) for i in dis.get_instructions(code))
+
+
 def silent(step: Any) -> bool:
     """Whether a function does nothing that its recorded list does not: nobody misses the call.
 
@@ -376,7 +382,7 @@ def silent(step: Any) -> bool:
         held += [*(step.__defaults__ or ()), *(step.__kwdefaults__ or {}).values()]
         if is_own_function(step):
             code, around = step.__code__, step.__globals__
-            if any(i.opname.startswith(_NOT_STRAIGHT) for i in dis.get_instructions(code)):
+            if not _straight(code):
                 return False
             names = set(names_read(code)) - set(code.co_freevars)
             if not all(name in around for name in names):

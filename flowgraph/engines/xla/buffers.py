@@ -2,7 +2,8 @@
 
 They lie where XLA takes an array as it is, at a multiple of 64 bytes; one at another address would be copied.
 An input that is not there at every tick is spread over the ticks here, a chunk at a time, so that no array
-of all ticks is made of it and what is written is still in the cache when it is read.
+of all ticks is made of it. A run that ends leaves its buffers to the next, which the system need not give it
+new memory for.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ class Buffers:
         self._ticks, self._axis, self._idle = ticks, axis, idle
         self._choice = aligned((ticks,), choice)
         self._time = aligned((ticks,), np.int64) if timed else None
+        self._written: list[Rows] = [slice(0, 0, 1)] * len(inputs)  # for each port, where it is not 0
         self._leaves = tuple(
             tuple(
                 aligned(
@@ -51,6 +53,21 @@ class Buffers:
                 for x in port
             )
             for port in inputs
+        )
+
+    @property
+    def bytes(self) -> int:
+        """What they take."""
+        some = [self._choice, self._time, *(leaf for port in self._leaves for leaf in port)]
+        return sum(a.nbytes for a in some if a is not None)
+
+    def fits(self, inputs: Sequence[Sequence[np.ndarray]]) -> bool:
+        """Whether these inputs go into them, but for the number of their rows."""
+        axis = self._axis
+        return all(
+            x.shape[:axis] == kept.shape[:axis] and x.shape[axis + 1 :] == kept.shape[axis + 1 :]
+            for port, leaves in zip(inputs, self._leaves, strict=True)
+            for x, kept in zip(port, leaves, strict=True)
         )
 
     @property
@@ -81,12 +98,14 @@ class Buffers:
             self._time[:count] = time[here]
             self._time[count:] = time[here.stop - 1]
         before = (slice(None),) * self._axis
-        for at, port, leaves in zip(rows, inputs, self._leaves, strict=True):
+        for k, (at, port, leaves) in enumerate(zip(rows, inputs, self._leaves, strict=True)):
             places, part = _within(at, here)
+            last, self._written[k] = self._written[k], places
+            same = isinstance(places, slice) and isinstance(last, slice) and places == last
             for array, kept in zip(port, leaves, strict=True):
                 if isinstance(at, slice) and at.step is None:  # at all ticks
                     kept[(*before, slice(count, None))] = 0
-                else:
+                elif not same:
                     kept[...] = 0
                 kept[(*before, places)] = array[(*before, part)]
 

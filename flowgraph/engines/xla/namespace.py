@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
+import operator
+from collections.abc import Callable
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,10 @@ from flowgraph.recorder import ranges
 from flowgraph.recorder.namespaces import unnormalized_sinc
 from flowgraph.recorder.ops import OPS, bound_attrs
 from flowgraph.recorder.replay import Case, body_of
+
+_SHORT = 16
+_MANY = 2048
+"""A reduction over so few of so many goes slice by slice."""
 
 
 class JaxLinearAlgebra:
@@ -38,7 +44,12 @@ class JaxLinearAlgebra:
 
 
 class JaxNamespace:
-    """`jax.numpy` with the operations that pipelines add to it or define further, and a faster `take`."""
+    """`jax.numpy` with what pipelines add to it or define further, and a faster `take` and short reductions.
+
+    A reduction over a short axis of a large array, such as the sum of the squares of three numbers for each
+    particle, is written as operations on slices, in the order of the axis. These XLA computes in one loop
+    with what is around them; a reduction, on a processor, is a call that keeps the loops around it apart.
+    """
 
     def __init__(self, jax: Any) -> None:
         self._jax = jax
@@ -59,6 +70,36 @@ class JaxNamespace:
 
     def remainder(self, a: Any, b: Any) -> Any:
         return ranges.remainder(self._jax.numpy, a, b)
+
+    def sum(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("sum", operator.add, x, axis, keepdims, real=True)
+
+    def prod(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("prod", operator.mul, x, axis, keepdims, real=True)
+
+    def max(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("max", self._jax.numpy.maximum, x, axis, keepdims)
+
+    def min(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("min", self._jax.numpy.minimum, x, axis, keepdims)
+
+    def any(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("any", self._jax.numpy.logical_or, x, axis, keepdims)
+
+    def all(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
+        return self._reduced("all", self._jax.numpy.logical_and, x, axis, keepdims)
+
+    def _reduced(
+        self, name: str, fold: Callable[..., Any], x: Any, axis: Any, keepdims: bool, real: bool = False
+    ) -> Any:
+        """A reduction by `jax.numpy`, or slice by slice: with `real` of reals only."""
+        jnp = self._jax.numpy
+        x = jnp.asarray(x)
+        few = isinstance(axis, int) and 2 <= x.shape[axis] <= _SHORT and x.size // x.shape[axis] >= _MANY
+        if not few or (real and x.dtype.kind != "f"):
+            return getattr(jnp, name)(x, axis=axis, keepdims=keepdims)
+        parts = [self._jax.lax.index_in_dim(x, k, axis, keepdims) for k in range(x.shape[axis])]
+        return reduce(fold, parts)
 
     def materialise(self, x: Any) -> Any:
         return self._jax.lax.optimization_barrier(x)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -31,6 +32,8 @@ _UNROLLED = 4
 _SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
+_LARGEST_OF_SMALL, _WASTE = 2**20, 0.1  # of ticks that take less than copying what they make
+_KEPT_BYTES = 32 * 2**20  # of buffers that wait for the next run
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Scan:
         if runs is not None:
             play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
         self._compiled: Any = None
+        self._free: list[Buffers] = []
         self._play_chunk = self.jax.jit(play, **placed)
 
     def _program(self, key: int | None) -> Program:
@@ -115,6 +119,11 @@ class Scan:
                 self._compiled = self._play_chunk.lower(now, seed, self._buffers(inputs).arrays).compile()
 
     def _buffers(self, inputs: list[list[np.ndarray]]) -> Buffers:
+        """Those of an earlier run, or new ones."""
+        with suppress(IndexError):  # another thread may take them
+            free = self._free.pop()
+            if free.fits(inputs):
+                return free
         ports = len(self.pipeline.inputs)
         kind, idle = (np.int32, len(self.keys)) if self.branches is not None else (bits(ports), 0)
         return Buffers(self.chunk, kind, self._timed, inputs, self._input_axis, self.dtype, idle)
@@ -216,6 +225,8 @@ class Scan:
                 ]
                 now = self.jax.block_until_ready(now)  # the buffers are read until then
             yield Chunk(count, outputs), [np.asarray(c) for c in now]
+        if buffers.bytes <= _KEPT_BYTES:
+            self._free = [buffers]
 
 
 def _held(array: np.ndarray, buffers: Buffers) -> np.ndarray:
@@ -267,8 +278,12 @@ def bytes_per_tick(pipeline: Pipeline) -> int:
 
 def chunk_size(pipeline: Pipeline, ticks: int) -> int:
     """A power of two that holds all ticks, or as many as keep the outputs of a chunk in bounds."""
-    most = min(_LARGEST_CHUNK, max(256, _CHUNK_BYTES // max(bytes_per_tick(pipeline), 1)))
-    return int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
+    largest = _LARGEST_OF_SMALL if _moved(pipeline) <= _SMALL_TICK else _LARGEST_CHUNK
+    most = min(largest, max(256, _CHUNK_BYTES // max(bytes_per_tick(pipeline), 1)))
+    chunk = int(min(2 ** math.ceil(math.log2(max(ticks, 64))), 2 ** math.floor(math.log2(most))))
+    while chunk > _LARGEST_CHUNK and -ticks % chunk > _WASTE * ticks:
+        chunk //= 2
+    return chunk
 
 
 def _dtype(kind: str, real: Any) -> Any:

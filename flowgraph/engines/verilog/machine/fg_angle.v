@@ -54,35 +54,34 @@ module fg_angle (
   endfunction
   localparam signed [65:0] HALF_TURN = 66'h3243f6a8885a3000;
 
+  // A turn is two cycles: one finds out what is added, and which way, from registers that change in the other alone.
   reg signed [65:0] x, y, step_x, step_y, turned, step;
   reg [5:0] turn;
-  reg ready;
+  reg finds, adds, last, down;
 
-  always @(posedge clk)
+  always @(posedge clk) begin
+    step_x <= y >>> turn;
+    step_y <= x >>> turn;
+    step <= angle_of(turn);
+    down <= !y[65] && y != 66'sd0;
+    last <= turn == 6'd39;
     if (start) begin
       x <= along[65] ? -along : along;
       y <= along[65] ? -up : up;
       turned <= !along[65] ? 66'sd0 : up[65] ? -HALF_TURN : HALF_TURN;
       turn <= 6'd0;
-      ready <= 1'b0;
-    end else if (turn != 6'd40) begin
-      ready <= ~ready;
-      if (!ready) begin
-        step_x <= y >>> turn;
-        step_y <= x >>> turn;
-        step <= angle_of(turn);
-      end else begin
+      finds <= 1'b1;
+      adds <= 1'b0;
+    end else begin
+      adds <= finds;
+      finds <= adds && !last;
+      if (adds) begin
         turn <= turn + 6'd1;
-        if (!y[65] && y != 66'sd0) begin
-          x <= x + step_x;
-          y <= y - step_y;
-          turned <= turned + step;
-        end else begin
-          x <= x - step_x;
-          y <= y + step_y;
-          turned <= turned - step;
-        end
+        x <= down ? x + step_x : x - step_x;
+        y <= down ? y - step_y : y + step_y;
+        turned <= down ? turned + step : turned - step;
       end
     end
+  end
   assign value = turned;
 endmodule

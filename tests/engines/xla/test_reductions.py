@@ -1,0 +1,47 @@
+"""Reductions over a short axis of many in XLA: slice by slice they are what they are at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowgraph.engines.xla import namespace
+from flowgraph.engines.xla.namespace import JaxNamespace
+
+jax = pytest.importorskip("jax")
+
+MANY = namespace._MANY
+RANDOM = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("name", ["sum", "prod", "max", "min", "any", "all"])
+@pytest.mark.parametrize("keepdims", [False, True])
+@pytest.mark.parametrize("axis", [0, -2])
+def test_a_short_axis_of_many_gives_what_numpy_gives(name, keepdims, axis):
+    x = RANDOM.normal(size=(4, 3, MANY))
+    x[1, 2, 5] = np.nan
+    for given in (x, x > 0.5, (10 * RANDOM.normal(size=x.shape)).astype(np.int32)):
+        if name in ("any", "all"):
+            given = given > 0
+        elif name in ("max", "min") and given.dtype == bool:
+            continue
+        with jax.enable_x64(True):
+            found = getattr(JaxNamespace(jax), name)(given, axis=axis, keepdims=keepdims)
+        expected = getattr(np, name)(given, axis=axis, keepdims=keepdims)
+        assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+        np.testing.assert_array_equal(np.asarray(found), expected)
+
+
+def operations(shape, axis):
+    def squares(x):
+        return JaxNamespace(jax).sum(x * x, axis=axis)
+
+    return {e.primitive.name for e in jax.make_jaxpr(squares)(np.zeros(shape)).jaxpr.eqns}
+
+
+def test_only_a_short_axis_of_many_goes_slice_by_slice():
+    assert "reduce_sum" not in operations((3, MANY), 0)
+    assert "reduce_sum" in operations((3, MANY - 1), 0)
+    assert "reduce_sum" in operations((17, MANY), 0)
+    assert "reduce_sum" in operations((3, MANY), 1)
+    assert "reduce_sum" in operations((3, MANY), None)
