@@ -9,7 +9,7 @@ reaction (its text is registered for tracebacks) into the lines that the user wr
 from __future__ import annotations
 
 import linecache
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
@@ -67,6 +67,18 @@ def _code(text: str, title: str) -> CodeType:
     return compile(text, file, "exec")
 
 
+def explain(error: BaseException, plans: Iterable[Plan], name: str, time: int) -> None:
+    """Add to an error from a block's step the path in the graph of this name, and the time."""
+    nodes = {plan.code.co_filename: plan.nodes for plan in plans}
+    trace = error.__traceback__
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if code.co_name == "react" and code.co_filename in nodes:
+            node = nodes[code.co_filename].get(trace.tb_lineno)  # None between two ticks
+            error.add_note(f"in {name if node is None else f'{name}, at {node}'}, t = {time} ns")
+        trace = trace.tb_next
+
+
 def presence(result: Any) -> tuple[bool, Any]:
     """Whether a step's output is there, and its value."""
     if result is None:
@@ -90,7 +102,8 @@ class Writer:
         return "\n".join(self.lines) + "\n", self.owner
 
     def reaction(self) -> None:
-        """The lines of one tick: what is present, the calls in their order, then all that is written."""
+        """The lines of one tick: what is present, the calls in their order, what is kept of it, then all
+        that is written: in lines without a call, between which Python hears no signal such as Ctrl-C."""
         before = len(self.lines)
         for k, (index, node) in enumerate(
             (i, n) for i, n in enumerate(self.graph.nodes) if isinstance(n, SourceNode)
@@ -99,6 +112,8 @@ class Writer:
                 self.read(index, k, node)
         for index, call in self.graph.calls:
             self.call(index, call)
+        for k, collected in enumerate(self.graph.collected):
+            self.guarded(self.fresh(collected.wire), self.kept(k, collected.wire), collected.name)
         for index, call in self.graph.calls:
             firing = self.when(call.firing)
             if call.state is not None:
@@ -108,8 +123,6 @@ class Writer:
         for index, register in self.graph.registers:
             if register.feed is not None:
                 self.guarded(self.fresh(register.feed), self.fed(index, register.feed), register.path)
-        for k, collected in enumerate(self.graph.collected):
-            self.guarded(self.fresh(collected.wire), self.kept(k, collected.wire), collected.name)
         if len(self.lines) == before:
             self.emit("pass", "")
 
