@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 import sys
 from typing import Any
 
@@ -284,6 +285,23 @@ def test_what_breaks_in_anywhere_leaves_the_last_whole_tick(monkeypatch, loop):
                 np.testing.assert_array_equal(np.concatenate(parts), getattr(whole, field), err_msg=name)
         same_state(after.state, expected.state)
     assert places > 50
+
+
+def test_a_graph_built_like_one_before_shows_its_lines_too():
+    """Its code is there already; what a traceback shows may have been cleared since."""
+
+    @graph
+    def g(x: Stream[Scalar]):
+        return {"sum": scan(x, lambda s, x: s + x, init=0.0)}
+
+    found = []
+    for _ in range(2):
+        made = g.build()
+        simulate(made, {"x": scalars([0, 10])})
+        (plan,) = [known.plan for known in loops(made)]
+        found.append("".join(linecache.getlines(plan.code.co_filename)))
+        linecache.clearcache()
+    assert found == [plan.source, plan.source]
 
 
 def test_single_steps_and_the_rest_are_one_run():

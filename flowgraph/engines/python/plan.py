@@ -56,15 +56,17 @@ def named(graph: Graph, key: int) -> str:
 
 def compiled(graph: Graph, text: str, nodes: Mapping[int, str], to: str) -> Plan:
     """A text as code, which tracebacks and debuggers can show."""
-    return Plan(_code(text, f"reaction of {graph.name} to {to}"), text, nodes)
+    code = _code(text, f"reaction of {graph.name} to {to}")
+    file = code.co_filename
+    if file not in linecache.cache:
+        linecache.cache[file] = (len(text), None, text.splitlines(True), file)
+    return Plan(code, text, nodes)
 
 
 @lru_cache(maxsize=256)
 def _code(text: str, title: str) -> CodeType:
     """Compiled once for all graphs that are built alike: compiling takes longer than writing."""
-    file = f"<{title}, {blake2b(text.encode(), digest_size=6).hexdigest()}>"
-    linecache.cache[file] = (len(text), None, text.splitlines(True), file)
-    return compile(text, file, "exec")
+    return compile(text, f"<{title}, {blake2b(text.encode(), digest_size=6).hexdigest()}>", "exec")
 
 
 def explain(error: BaseException, plans: Iterable[Plan], name: str, time: int) -> None:
