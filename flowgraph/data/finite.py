@@ -17,7 +17,7 @@ def finite(array: np.ndarray | Any) -> bool:
         return True
     if array.flags.c_contiguous:
         flat = array.reshape(-1)
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             if np.isfinite(np.dot(flat, flat)):
                 return True
     return bool(np.isfinite(array).all())

@@ -15,9 +15,9 @@ from flowgraph.data.finite import finite
 
 @given(arrays(st.sampled_from([np.float32, np.float64]), array_shapes(min_side=0, max_dims=3)), st.booleans())
 def test_it_is_what_each_entry_is(array, turned):
-    """Of numbers whose squares are none that a float holds too, and of arrays that do not lie in one piece."""
+    """Of numbers whose squares no float holds too, and of arrays that do not lie in one piece."""
     array = array.T if turned else array[..., ::2]
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), np.errstate(all="raise"):
         warnings.simplefilter("error")
         assert finite(array) == bool(np.isfinite(array).all())
 
@@ -29,6 +29,12 @@ def test_one_among_many_is_found(wrong, place):
     assert finite(array)
     array[place] = wrong
     assert not finite(array)
+
+
+def test_numbers_with_squares_below_all_others_are_finite_for_one_who_wants_errors_of_them():
+    with np.errstate(all="raise"):
+        assert finite(np.full(3, 1e-200))
+        assert not finite(np.array([1e-200, np.nan]))
 
 
 def test_other_kinds_are_always_finite():

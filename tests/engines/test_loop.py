@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 import sys
 from typing import Any
 
@@ -27,7 +28,7 @@ from flowgraph.engines.python import run as runs
 from flowgraph.engines.python.loop import Loop
 from tests.oracle.build import built, inputs_of
 from tests.oracle.specs import drawn
-from tests.support import same, scalars
+from tests.support import same, same_state, scalars
 
 
 def loops(built: Any) -> list[Loop]:
@@ -229,6 +230,78 @@ def test_an_error_leaves_the_registers_of_the_last_good_tick():
     (path,) = [p for p in run.state["registers"] if "scan" in p]
     assert run.state["registers"][path] == 3.0
     assert run.state["sources"]["x"] == 10
+
+
+class _Signal(KeyboardInterrupt):
+    pass
+
+
+@pytest.mark.parametrize("loop", [True, False])
+def test_what_breaks_in_anywhere_leaves_the_last_whole_tick(monkeypatch, loop):
+    """Ctrl-C is heard after a call: after each one in turn, of the loop and of what counts and packs."""
+
+    @graph
+    def g(x: Stream[Scalar], y: Stream[Scalar]):
+        kept = {"x": x, "y": y, "sum": scan(x, lambda s, x: 0.5 * s + x, init=0.0)}
+        return kept | {"some": x.filter(lambda x: x > 0.0), "before": x.delay(7.0).at(x)}
+
+    monkeypatch.setattr(runs, "_PACKED", 3)
+    monkeypatch.setattr(runs, "_BATCH", 5)
+    if not loop:
+        monkeypatch.setattr(runs, "loop", lambda *_: None)
+    made = g.build()
+    inputs = {"x": scalars(range(0, 80, 10), [1, -1, 2, 3, -4, 5, 6, -7]), "y": scalars([0, 30, 60, 75])}
+    expected = simulate(made, inputs)
+    inside = {"react", "_has_gone", "_account", "_pack", "_collected", "_stamps", "_forget"}
+
+    def broken_off_after(calls: int) -> Run | None:
+        left = [calls]
+
+        def heard(frame: Any, event: str, _: Any) -> None:
+            if event == "c_return" and frame.f_code.co_name in inside:
+                left[0] -= 1
+                if left[0] < 0:
+                    raise _Signal
+
+        run = Run(made, inputs)
+        sys.setprofile(heard)
+        try:
+            run.to_end()
+        except _Signal:
+            return run
+        finally:
+            sys.setprofile(None)
+        return None
+
+    places = 0
+    while (run := broken_off_after(places)) is not None:
+        places += 1
+        rest = {n: s[int((s.time <= run.time).sum()) :] for n, s in inputs.items()}
+        first, after = run.result(), Run(made, rest, state=run.state).to_end().result()
+        assert first.ticks + after.ticks == expected.ticks
+        for name, whole in expected.series.items():
+            for field in ("time", "value"):
+                parts = [getattr(r[name], field) for r in (first, after)]
+                np.testing.assert_array_equal(np.concatenate(parts), getattr(whole, field), err_msg=name)
+        same_state(after.state, expected.state)
+    assert places > 50
+
+
+def test_a_graph_built_like_one_before_shows_its_lines_too():
+    """Its code is there already; what a traceback shows may have been cleared since."""
+
+    @graph
+    def g(x: Stream[Scalar]):
+        return {"sum": scan(x, lambda s, x: s + x, init=0.0)}
+
+    found = []
+    for _ in range(2):
+        made = g.build()
+        simulate(made, {"x": scalars([0, 10])})
+        (plan,) = [known.plan for known in loops(made)]
+        found.append("".join(linecache.getlines(plan.code.co_filename)))
+        linecache.clearcache()
+    assert found == [plan.source, plan.source]
 
 
 def test_single_steps_and_the_rest_are_one_run():

@@ -80,7 +80,7 @@ class _Singly:
         state = State(library, self.many.cells(n), seed_words(self.many.seeds[n]))
         rooms = [output.room(n, library, events) for output in self.outputs]
         counts, made = library.advance(state, events.time, events.key, given, rooms)
-        self.many.finish(n, state.after())
+        self.many.finish(n, state.now())
         for output, room, count in zip(self.outputs, rooms, counts, strict=False):
             output.came(n, events, room, count, made)
         return len(events.time)

@@ -16,7 +16,7 @@ from flowgraph.engines.c.compile import compiler
 from flowgraph.engines.c.fixed import CompiledIntegers
 from flowgraph.engines.c.fixed_replay import write_fixed
 from flowgraph.engines.c.harness import write_c, write_events
-from flowgraph.engines.c.library import Compiled, compiled
+from flowgraph.engines.c.library import Compiled, State, compiled
 from flowgraph.engines.c.step import SingleTicks
 from flowgraph.engines.contract import (
     CellStepper,
@@ -45,8 +45,8 @@ class _Loaded(Player):
         done = 0
         start = perf_counter()
         outputs = gathered(library.pipeline, tape)
-        for part, after in library.play(cells, seed, tape.time, tape.key, rows):
-            cells = after
+        state = State(library, cells, seed)
+        for part in library.play(state, tape.time, tape.key, rows):
             times = tape.time[done : done + part.ticks]
             for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
                 output.add(part.ticks, times if mask.all() else times[mask], leaves)
@@ -54,7 +54,7 @@ class _Loaded(Player):
             if progress is not None:
                 progress.update(done, int(times[-1]))
         collected = [output.rows() for output in outputs]
-        return Outcome(cells, collected, perf_counter() - start)
+        return Outcome(state.after(), collected, perf_counter() - start)
 
 
 class CEngine(PipelineEngine):

@@ -63,14 +63,18 @@ class State:
                 self._seen[name] = np.asarray(value).reshape(self._seen[name].shape)
         self._seen["fg_seed"] = seed
 
-    def after(self) -> list[np.ndarray]:
-        """Copies of the register cells as they are now."""
+    def now(self) -> list[np.ndarray]:
+        """The register cells as they are now: views, which the next tick changes."""
         return [
-            np.array(self._seen[name][0]).reshape(cell.shape)
+            self._seen[name].reshape(cell.shape)
             if math.prod(cell.shape)
             else np.zeros(cell.shape, self._seen.dtype[name].base)
             for name, cell in zip(self._struct.names or (), self._held, strict=False)
         ]
+
+    def after(self) -> list[np.ndarray]:
+        """Copies of the register cells as they are now."""
+        return [np.array(cell) for cell in self.now()]
 
     def seen_cells(self, places: Sequence[tuple[str, str]]) -> list[np.ndarray]:
         """Views of register cells as they are, by path and name."""
@@ -247,24 +251,15 @@ class Compiled(Outputs):
         )
         return counts.tolist(), made
 
-    def play(
-        self,
-        cells: Sequence[Any],
-        seed: np.ndarray,
-        time: np.ndarray,
-        key: np.ndarray,
-        rows: Structs,
-    ) -> Iterator[tuple[Piece, list[np.ndarray]]]:
-        """Play ticks; yields stretches of outputs, with the register cells after each.
+    def play(self, state: State, time: np.ndarray, key: np.ndarray, rows: Structs) -> Iterator[Piece]:
+        """Play ticks, from what is remembered on; yields stretches of outputs.
 
         Args:
-            cells: register cells before the first tick.
-            seed: (2,) uint32.
+            state: of the run, which goes on with it.
             time: (T,) int64 ns.
             key: (T,), bit k set where input k is present.
             rows: events of each port, from `rows`.
         """
-        state = State(self, cells, seed)
         rows = list(rows)
         for first in range(0, len(time), self.chunk):
             here = key[first : first + self.chunk]
@@ -275,7 +270,7 @@ class Compiled(Outputs):
             for k, (room, n) in enumerate(zip(rooms, counts, strict=False)):
                 mask = (made >> np.uint64(k) & np.uint64(1)).astype(bool)
                 outputs.append((mask, [shrunk(leaf, n) for leaf in room if leaf is not None]))
-            yield Piece(len(here), outputs), state.after()
+            yield Piece(len(here), outputs)
 
 
 def shrunk(leaf: np.ndarray, n: int) -> np.ndarray:

@@ -6,6 +6,7 @@ A value is kept for the ticks that need it, in their order; `Stretch` brings it 
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +21,9 @@ from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.random import numbers_at
 from flowgraph.recorder.trace import Instruction
 from flowgraph.types import DTYPES
+
+LARGE = 4096
+"""Numbers of a value that is worth being let go."""
 
 
 class Stretch:
@@ -298,7 +302,19 @@ class Loop(Step):
         return tuple(n for n, _ in self.outside)
 
     def __post_init__(self) -> None:
-        self.lists = [self._list(p) for p in range(self.count)]
+        self.lists = [self._parted(self._list(p)) for p in range(self.count)]
+
+    def _parted(self, some: list[Any]) -> list[tuple[list[Any], list[int]]]:
+        """In parts, with the large values that nothing takes after each: the next find their memory."""
+        ends = {n for n, _, _ in self.wanted} | {write for _, write in self.cells}
+        large = {i.out for i, _ in self.instructions if math.prod(i.spec.shape) >= LARGE} - ends
+        parts: list[tuple[list[Any], list[int]]] = [([], [])]
+        for run, args, out in reversed(some):
+            if done := large.intersection((out, *args)):
+                large -= done
+                parts.append(([], sorted(done)))
+            parts[-1][0].append((run, args, out))
+        return [(part[::-1], done) for part, done in reversed(parts)]
 
     def _list(self, p: int) -> list[Any]:
         """What one tick of a pattern does."""
@@ -327,8 +343,11 @@ class Loop(Step):
         for p in ticks.which.tolist():
             for n, feed in coming[p]:
                 env[n] = next(feed)
-            for run, args, out in self.lists[p]:
-                env[out] = run(*[env[a] for a in args])
+            for part, done in self.lists[p]:
+                for run, args, out in part:
+                    env[out] = run(*[env[a] for a in args])
+                for n in done:
+                    del env[n]
             for n, rows in going[p]:
                 rows.append(env[n])
             env.update([(read, env[write]) for read, write in self.cells])

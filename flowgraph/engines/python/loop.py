@@ -88,18 +88,16 @@ def _may(graph: Graph) -> bool:
 
 def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
     which = _Which(graph, patterns)
-    lines, owner = ["def react(ticks):", "    t = None"], dict[int, str]()
-    stores = []
+    lines, owner = ["def react(ticks):", "    done = None"], dict[int, str]()
+    stores = {"through[0]": "done"}
     for index, register in graph.registers:
         if index in which.registers:
             local = ", ".join(which.locals(index))
             lines.append(f"    {local}, = {', '.join(leaves(register.type, f'r[{index}]'))},")
-            stores.append(
-                f"        r[{index}] = {put_together(register.type, which.locals(index), str(index))}"
-            )
+            stores[f"r[{index}]"] = put_together(register.type, which.locals(index), str(index))
         else:
             lines.append(f"    r{index} = r[{index}]")
-            stores.append(f"        r[{index}] = r{index}")
+            stores[f"r[{index}]"] = f"r{index}"
     given = ["t", "key", *(which.given(k) for k in which.steady)]
     lines += ["    try:", f"        for {', '.join(given)} in ticks:"]
     for n, key in enumerate(patterns):
@@ -108,8 +106,8 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
         writer.reaction()
         lines += let_go(writer.lines, writer.arrays)
         owner |= writer.owner
-    lines += ["    except BaseException:", "        broken(t)", "        raise"]
-    lines += ["    finally:", *(stores or ["        pass"])]
+    lines.append("            done = t")
+    lines += ["    finally:", f"        {', '.join(stores)}, = {', '.join(stores.values())},"]
     to = " or ".join(named(graph, key) for key in patterns)
     code = compiled(graph, "\n".join(lines) + "\n", owner, to)
     kept = frozenset(k for k, c in enumerate(graph.collected) if which.here(c.wire))

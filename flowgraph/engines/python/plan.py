@@ -9,7 +9,7 @@ reaction (its text is registered for tracebacks) into the lines that the user wr
 from __future__ import annotations
 
 import linecache
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
@@ -56,15 +56,29 @@ def named(graph: Graph, key: int) -> str:
 
 def compiled(graph: Graph, text: str, nodes: Mapping[int, str], to: str) -> Plan:
     """A text as code, which tracebacks and debuggers can show."""
-    return Plan(_code(text, f"reaction of {graph.name} to {to}"), text, nodes)
+    code = _code(text, f"reaction of {graph.name} to {to}")
+    file = code.co_filename
+    if file not in linecache.cache:
+        linecache.cache[file] = (len(text), None, text.splitlines(True), file)
+    return Plan(code, text, nodes)
 
 
 @lru_cache(maxsize=256)
 def _code(text: str, title: str) -> CodeType:
     """Compiled once for all graphs that are built alike: compiling takes longer than writing."""
-    file = f"<{title}, {blake2b(text.encode(), digest_size=6).hexdigest()}>"
-    linecache.cache[file] = (len(text), None, text.splitlines(True), file)
-    return compile(text, file, "exec")
+    return compile(text, f"<{title}, {blake2b(text.encode(), digest_size=6).hexdigest()}>", "exec")
+
+
+def explain(error: BaseException, plans: Iterable[Plan], name: str, time: int) -> None:
+    """Add to an error from a block's step the path in the graph of this name, and the time."""
+    nodes = {plan.code.co_filename: plan.nodes for plan in plans}
+    trace = error.__traceback__
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if code.co_name == "react" and code.co_filename in nodes:
+            node = nodes[code.co_filename].get(trace.tb_lineno)  # None between two ticks
+            error.add_note(f"in {name if node is None else f'{name}, at {node}'}, t = {time} ns")
+        trace = trace.tb_next
 
 
 def presence(result: Any) -> tuple[bool, Any]:
@@ -90,7 +104,8 @@ class Writer:
         return "\n".join(self.lines) + "\n", self.owner
 
     def reaction(self) -> None:
-        """The lines of one tick: what is present, the calls in their order, then all that is written."""
+        """The lines of one tick: what is present, the calls in their order, what is kept of it, then all
+        that is written: in lines without a call, between which Python hears no signal such as Ctrl-C."""
         before = len(self.lines)
         for k, (index, node) in enumerate(
             (i, n) for i, n in enumerate(self.graph.nodes) if isinstance(n, SourceNode)
@@ -99,6 +114,8 @@ class Writer:
                 self.read(index, k, node)
         for index, call in self.graph.calls:
             self.call(index, call)
+        for k, collected in enumerate(self.graph.collected):
+            self.guarded(self.fresh(collected.wire), self.kept(k, collected.wire), collected.name)
         for index, call in self.graph.calls:
             firing = self.when(call.firing)
             if call.state is not None:
@@ -108,8 +125,6 @@ class Writer:
         for index, register in self.graph.registers:
             if register.feed is not None:
                 self.guarded(self.fresh(register.feed), self.fed(index, register.feed), register.path)
-        for k, collected in enumerate(self.graph.collected):
-            self.guarded(self.fresh(collected.wire), self.kept(k, collected.wire), collected.name)
         if len(self.lines) == before:
             self.emit("pass", "")
 

@@ -28,7 +28,7 @@ from flowgraph.engines.entrance import Admitted, Entrance
 from flowgraph.engines.options import Meter
 from flowgraph.engines.python.draws import Ahead
 from flowgraph.engines.python.loop import Loop, feed, loop, numbers
-from flowgraph.engines.python.plan import Plan, Reactions, bindings, bound
+from flowgraph.engines.python.plan import Plan, Reactions, bindings, bound, explain
 from flowgraph.engines.state import check_start, initial_registers, load_registers, state_tree
 from flowgraph.engines.trouble import overflow_error
 from flowgraph.errors import DataError, FifoOverflowError
@@ -97,7 +97,7 @@ class Run:
         self._recorded = True
         self._loop: Loop | None = None
         self._played, self._packed_at = 0, 0  # ticks of the tape
-        self._broken: list[int | None] = []  # the time of the tick that failed
+        self._through: list[int | None] = [None]  # the last tick of a loop's that is in the registers
         self._values: list[list[Any]] = [[] for _ in graph.collected]
         self._times: list[list[int]] = [[] for _ in graph.collected]
         self._packed: list[dict[str, Series]] = []  # what was collected before, as arrays
@@ -145,7 +145,7 @@ class Run:
                 name: Ahead(site, self._tape.times(() if at is None else at), self._key)
                 for name, (site, at) in self._loop.sites.items()
             }
-            names = self._names | self._loop.names | keep | self._ahead | {"broken": self._broken.append}
+            names = self._names | self._loop.names | keep | self._ahead | {"through": self._through}
             self._goes_through = bound(self._loop.plan, names)
         self.time = max(self._last.values(), default=NEVER)
 
@@ -248,13 +248,13 @@ class Run:
         """Make arrays of what was collected, once it is much."""
         stamped = self._played - self._packed_at if self._stamped else 0
         if max(stamped, *map(len, self._times), 0) >= _PACKED:
-            self._packed.append(self._collected())
-            self._forget()
+            self._forget([*self._packed, self._collected()])
 
-    def _forget(self) -> None:
-        self._packed_at = self._played
-        for kept in (*self._times, *self._values, *itertools.chain(*self._columns.values())):
-            kept.clear()
+    def _forget(self, packed: list[dict[str, Series]]) -> None:
+        """Collect anew, after these parts; in one call, within which Python hears no signal."""
+        clearing = map(list.clear, [*self._times, *self._values, *itertools.chain(*self._columns.values())])
+        self._packed, self._packed_at = packed, self._played
+        deque(clearing, 0)
 
     @contextmanager
     def _entered(self, what: str) -> Iterator[None]:
@@ -290,39 +290,54 @@ class Run:
             for time, key in batch:
                 reactions[key](time)
                 done += 1
+            self._account(batch)
         except BaseException as error:
             self._account(batch[:done])
-            self._stopped = batch[done][0]
-            self._explain(error, self._stopped)
+            if done < len(batch):
+                self._stop(error, batch[done][0])
             raise
-        self._account(batch)
         self.wall_s += perf_counter() - start
 
     def _go_on(self, count: int) -> None:
         """So many ticks of a recording in its loop, or as many as there are."""
         start, first = perf_counter(), self._played
         last = min(first + count, len(self._tape.time))
+        self._through[0] = None
         try:
             self._goes_through(itertools.islice(self._ticks, last - first))
+            self._has_gone(last)
         except BaseException as error:
-            at = next((time for time in self._broken if time is not None), int(self._tape.time[first]))
-            done = int(np.searchsorted(self._tape.time, at))
-            self._has_gone(first, done)
-            self._stopped = int(at)
-            self._explain(error, self._stopped)
+            through = self._through[0]
+            done = first if through is None else int(np.searchsorted(self._tape.time, through)) + 1
+            self._has_gone(done)
+            if done < last:
+                self._stop(error, int(self._tape.time[done]))
             raise
-        self._has_gone(first, last)
         self.wall_s += perf_counter() - start
 
-    def _has_gone(self, first: int, last: int) -> None:
-        """Count ticks of the tape, and note when each source came last."""
-        self._played, self.ticks = last, self.ticks + last - first
+    def _has_gone(self, last: int) -> None:
+        """Count the ticks of the tape before `last`, and note when each source came last."""
+        first = self._played
         if last > first:
             self.time = max(self.time, int(self._tape.time[last - 1]))
         for k, name in enumerate(self._last):
             rows = np.flatnonzero(self._tape.key[first:last] >> k & 1)
             if len(rows):
                 self._last[name] = int(self._tape.time[first + rows[-1]])
+        self._played, self.ticks = last, self.ticks + last - first
+
+    def _stop(self, error: BaseException, time: int) -> None:
+        """Go on no more from the tick at `time`, which was broken off: nothing is kept of what it gave."""
+        self._stopped = time
+        for k, values in enumerate(self._values):
+            times = self._times[k]
+            while times and times[-1] >= time:
+                times.pop()
+            there = len(self._stamps(k))
+            for some in (values, *self._columns.get(k, ())):
+                del some[there:]
+        known = [k.plan if isinstance(k, Loop) else k for k in self.graph.plans.copy().values()]
+        explain(error, [p for p in known if isinstance(p, Plan)], self.graph.name, time)
 
     def _refuse_if_stopped(self) -> None:
         if self._stopped is not None:
@@ -335,7 +350,6 @@ class Run:
             )
 
     def _account(self, batch: list[tuple[int, int]]) -> None:
-        self.ticks += len(batch)
         keys = 0
         for time, key in reversed(batch):
             self.time = max(self.time, time)
@@ -345,22 +359,7 @@ class Run:
             keys |= key
             if keys == (1 << len(self._last)) - 1:
                 break
-
-    def _explain(self, error: BaseException, time: int) -> None:
-        """Add to an error from a block's step the graph path and the time."""
-        trace = error.__traceback__
-        while trace is not None:
-            if trace.tb_frame.f_code.co_name == "react":
-                for known in list(self.graph.plans.values()):
-                    known = known.plan if isinstance(known, Loop) else known
-                    if (
-                        isinstance(known, Plan)
-                        and known.code.co_filename == trace.tb_frame.f_code.co_filename
-                    ):
-                        error.add_note(
-                            f"in {self.graph.name}, at {known.nodes.get(trace.tb_lineno)}, t = {time} ns"
-                        )
-            trace = trace.tb_next
+        self.ticks += len(batch)
 
     def _overflow(self, index: int, time: int) -> None:
         """Stop at a full queue, or, where events are live, remember it and go on with what is in it."""
@@ -421,22 +420,22 @@ class Run:
         series = {}
         for k, collected in enumerate(self.graph.collected):
             type_, name = self.graph.port(collected.wire).type, collected.name
-            times: list[int] | np.ndarray = self._times[k]
-            values, columns = self._values[k], self._columns.get(k)
-            if k in self._stamped:
-                times = self._tape.times(self._stamped[k], self._packed_at, self._played)
-                for some in (values, *(columns or ())):
-                    del some[len(times) :]  # of a tick that was broken off
+            times, values, columns = self._stamps(k), self._values[k], self._columns.get(k)
             series[name] = (
                 stack(times, values, type_, name) if columns is None else joined(times, columns, type_, name)
             )
         return series
+
+    def _stamps(self, k: int) -> list[int] | np.ndarray:
+        """The times of collected stream k since it was last packed or drained."""
+        if k not in self._stamped:
+            return self._times[k]
+        return self._tape.times(self._stamped[k], self._packed_at, self._played)
 
     def drain(self) -> Result:
         """The collected streams since the last call; the run forgets them, and its memory stays flat."""
         found = self.result()
         found = replace(found, ticks=self.ticks - self._drained[0], wall_s=self.wall_s - self._drained[1])
         self._drained = self.ticks, self.wall_s
-        self._packed.clear()
-        self._forget()
+        self._forget([])
         return found

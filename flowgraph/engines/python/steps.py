@@ -163,7 +163,8 @@ def written(step: Any, arguments: Sequence[Type | None], state: Type | None) -> 
                 same[i.out] = again
                 if again in made.numbers:
                     made.numbers.add(i.out)
-                made.lines.append(Line(replace(i, args=(again,)), "{0}"))
+                if i.out in ends:
+                    made.lines.append(Line(replace(i, args=(again,)), "{0}"))
                 continue
             form = _number(i, kinds) if made.numbers.issuperset(i.args) else None
             if form is not None:

@@ -77,11 +77,25 @@ class JaxNamespace:
     def prod(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
         return self._reduced("prod", operator.mul, x, axis, keepdims, real=True)
 
+    def maximum(self, a: Any, b: Any) -> Any:
+        jnp = self._jax.numpy
+        return self._or_nan(jnp.maximum(a, b), jnp.isnan(a) | jnp.isnan(b))
+
+    def minimum(self, a: Any, b: Any) -> Any:
+        jnp = self._jax.numpy
+        return self._or_nan(jnp.minimum(a, b), jnp.isnan(a) | jnp.isnan(b))
+
+    def _or_nan(self, extreme: Any, missing: Any) -> Any:
+        """NaN where a number is missing: of a large array XLA leaves extremes, and sums of them, to a library
+        that passes over it (YNNPACK, with JAX 0.10 on a processor)."""
+        jnp = self._jax.numpy
+        return jnp.where(missing, jnp.nan, extreme) if extreme.dtype.kind == "f" else extreme
+
     def max(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
-        return self._reduced("max", self._jax.numpy.maximum, x, axis, keepdims)
+        return self._reduced("max", self.maximum, x, axis, keepdims)
 
     def min(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
-        return self._reduced("min", self._jax.numpy.minimum, x, axis, keepdims)
+        return self._reduced("min", self.minimum, x, axis, keepdims)
 
     def any(self, x: Any, *, axis: Any = None, keepdims: bool = False) -> Any:
         return self._reduced("any", self._jax.numpy.logical_or, x, axis, keepdims)
@@ -97,7 +111,10 @@ class JaxNamespace:
         x = jnp.asarray(x)
         few = isinstance(axis, int) and 2 <= x.shape[axis] <= _SHORT and x.size // x.shape[axis] >= _MANY
         if not few or (real and x.dtype.kind != "f"):
-            return getattr(jnp, name)(x, axis=axis, keepdims=keepdims)
+            whole = getattr(jnp, name)(x, axis=axis, keepdims=keepdims)
+            if name not in ("max", "min"):
+                return whole
+            return self._or_nan(whole, jnp.isnan(x).any(axis=axis, keepdims=keepdims))
         parts = [self._jax.lax.index_in_dim(x, k, axis, keepdims) for k in range(x.shape[axis])]
         return reduce(fold, parts)
 

@@ -5,7 +5,7 @@ import pytest
 
 from flowgraph import Array, Scalar, Series, Signal, Stream, aperiodic, block, graph, lower, real, simulate
 from flowgraph.engines.c.blocks import BLOCK
-from flowgraph.engines.c.library import Compiled
+from flowgraph.engines.c.library import Compiled, State
 from flowgraph.engines.c.source import generate
 from flowgraph.engines.c.statements import Writer
 from tests.engines.c.support import replays, written
@@ -53,7 +53,8 @@ def test_blocks_give_the_bits_of_the_whole(n, monkeypatch):
     whole = Compiled(pipeline, np.float64, [1])
     cells = [c.reset for r in pipeline.registers for c in r.cells]
     rows = whole.rows([[np.array([0.5, -1.0, 2.0])]])
-    ((piece, _),) = whole.play(cells, np.zeros(2, np.uint32), GIVEN["x"].time, np.ones(3, np.int64), rows)
+    state = State(whole, cells, np.zeros(2, np.uint32))
+    (piece,) = whole.play(state, GIVEN["x"].time, np.ones(3, np.int64), rows)
     assert np.array_equal(piece.outputs[0][1][0], found)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,7 @@ from flowgraph import (
 from flowgraph.blocks.flights.figure import figure
 from flowgraph.blocks.inertial.imu import ImuNoise
 from flowgraph.engines.numpy import engine as whole
+from flowgraph.engines.numpy import steps
 from flowgraph.engines.numpy.plan import ordered, planned
 from flowgraph.engines.numpy.rules import _RULES
 from flowgraph.engines.numpy.steps import Before, Draw, Loop, Scan
@@ -75,11 +77,12 @@ def equal(built: Any, inputs: Any, **options: Any) -> Any:
 
 
 @settings(RANDOM, max_examples=60)
-@given(RECIPES, TIMES, TIMES, st.integers(0, 1000), st.sampled_from([1, 4, 8192]))
-def test_random_graphs_are_equal(recipe, times_x, times_y, seed, size):
+@given(RECIPES, TIMES, TIMES, st.integers(0, 1000), st.sampled_from([1, 4, 8192]), st.sampled_from([0, 1024]))
+def test_random_graphs_are_equal(recipe, times_x, times_y, seed, size, large):
     built, data = random_graph(recipe), random_data(times_x, times_y, seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(whole, "TICKS", size)
+        patch.setattr(steps, "LARGE", large)
         equal(built, data)
 
 
@@ -284,6 +287,37 @@ def test_what_loops_in_another_way_is_played_tick_by_tick_between_the_rest(stret
     same(want, got, exact=True)
     (loop, *_) = (s for s in plan.steps if isinstance(s, Loop))
     assert len(loop.instructions) < len(plan.program.instructions) // 2
+
+
+def test_a_looped_tick_holds_no_more_arrays_than_are_read_later():
+    size = 20_000
+
+    @block
+    def long_way(state, x: Scalar, *, xp):
+        moved = state + x
+        for k in range(40):
+            moved = xp.sin(moved) + float(k)
+        return moved, xp.max(moved)
+
+    @long_way.init
+    def _(x):
+        return np.zeros(size)
+
+    @graph
+    def g(x: Stream[Scalar]):
+        return {"out": long_way(x)}
+
+    built, data = g.build(), scalars([0, 1, 2], [0.5, 1.5, 2.5])
+    want = simulate(built, {"x": data}, engine="reference")
+    assert plan_of(built, (1,)).loops == 1
+    tracemalloc.start()
+    try:
+        got = simulate(built, {"x": data}, engine="numpy")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    same(want, got, exact=True)
+    assert peak < 20 * 8 * size  # a few arrays, and the registers of three ticks; all would be eighty
 
 
 def test_single_precision_is_that_of_the_reference(stretch):

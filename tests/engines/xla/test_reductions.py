@@ -45,3 +45,23 @@ def test_only_a_short_axis_of_many_goes_slice_by_slice():
     assert "reduce_sum" in operations((17, MANY), 0)
     assert "reduce_sum" in operations((3, MANY), 1)
     assert "reduce_sum" in operations((3, MANY), None)
+
+
+def jitted(name, shape, axis):
+    xp = JaxNamespace(jax)
+    if name in ("max", "min"):
+        return lambda x: getattr(xp, name)(1.5 * xp.reshape(x, shape), axis=axis)
+    return lambda x: xp.sum(getattr(xp, name)(1.5 * xp.reshape(x, shape), 0.0), axis=axis)
+
+
+@pytest.mark.parametrize("name", ["max", "min", "maximum", "minimum"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("shape", "axis"), [((9000,), None), ((30, 300), 1), ((300, 30), 0), ((3, 3000), 0)])
+def test_an_extreme_of_many_has_the_nan_among_them(name, dtype, shape, axis):
+    x = np.arange(9000, dtype=dtype) - 4000.0
+    x[7] = np.nan
+    with jax.enable_x64(True):
+        found = np.asarray(jax.jit(jitted(name, shape, axis))(x))
+    assert found.dtype == dtype
+    expected = np.isnan(x.reshape(shape)).any(axis=axis)
+    np.testing.assert_array_equal(np.isnan(found), expected)
