@@ -59,7 +59,8 @@ module fg_machine #(
   reg [5:0] draining;
   wire go, jump;  // without `go` the program stands still
   wire [STEP-1:0] back;
-  assign ready = !running && draining == 6'd0;
+  reg idle;  // neither running nor draining: worked out a cycle ahead
+  assign ready = idle;
   fg_memory #(
       .WIDTH(CODE), .PLACE(STEP), .WORDS(STEPS), .DEEP(1), .READS(1), .FILE(PROGRAM)
   ) steps (
@@ -98,11 +99,13 @@ module fg_machine #(
     end
     if (reset) begin
       running <= 1'b0;
+      idle <= 1'b1;
       live <= {FETCH{1'b0}};
       draining <= 6'd0;
       step <= {STEP{1'b0}};
     end else if (start && ready) begin
       running <= 1'b1;
+      idle <= 1'b0;
       step <= from;
       draining <= DRAIN[5:0];
     end else if (running) begin
@@ -111,7 +114,10 @@ module fg_machine #(
         running <= 1'b0;
         live <= {FETCH{1'b0}};
       end
-    end else if (draining != 6'd0) draining <= draining - 6'd1;
+    end else begin
+      if (draining != 6'd0) draining <= draining - 6'd1;
+      idle <= draining[5:1] == 5'd0;
+    end
   end
 
   // -- loops: `first` is the first of the elements that a round makes, `placed` a microword with its places -----
