@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowgraph import Graph, Scalar, Series, Stream, graph, latest, simulate
-from flowgraph.data.tape import Tape
+from flowgraph.data.tape import Rows, Tape
 from flowgraph.engines.stretches import Gathered
 from flowgraph.engines.xla.buffers import Buffers, aligned
 from flowgraph.pipeline.lowering import lower
@@ -75,14 +75,14 @@ def test_an_input_is_spread_over_the_ticks_of_each_chunk(at):
 
 def test_buffers_serve_one_recording_after_another():
     """What another left in them is gone, whichever rows it had."""
-    ways = [slice(None), slice(1, 12, 5), slice(1, 12, 5), np.array([0, 3, 11]), slice(0, 12, 5), slice(None)]
+    every, fifth = slice(None), slice(1, 12, 5)
+    ways: list[tuple[Rows, int]] = [
+        (every, 12), (fifth, 12), (fifth, 12), (np.array([0, 3]), 7), (slice(0, 12, 5), 12), (every, 12)
+    ]  # fmt: skip
     buffers = Buffers(12, np.uint8, False, [[np.zeros(12)]], 0, np.float64, 9)
-    for n, at in enumerate(ways):
+    for n, (at, ticks) in enumerate(ways):
         dense = np.zeros(12)
         dense[at] = n + np.arange(1.0, 13)[: len(dense[at])]
-        ticks = 7 if n == 3 else 12
-        at = np.array([0, 3]) if n == 3 else at
-        dense[ticks:] = 0
         time, choice = np.arange(ticks), np.zeros(ticks, np.uint8)
         buffers.fill(choice, time, [at], [[dense[:ticks][at]]], slice(0, ticks))
         np.testing.assert_array_equal(buffers.arrays[2][0][0], dense)
