@@ -16,12 +16,19 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+_MOST = 2000
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def plain(words: str) -> str:
     """Text that steers no terminal: characters that would are spelled out, but for ends of lines and tabs."""
     return _CONTROL.sub(lambda m: m[0].encode("unicode_escape").decode(), words)
+
+
+def _bounded(words: str) -> str:
+    """What a person can read of a part of an error: of a list of thousands its start and its end."""
+    left_out = len(words) - _MOST
+    return words if left_out <= 0 else f"{words[: _MOST - 300]} ({left_out:,} characters) {words[-300:]}"
 
 
 class FlowgraphError(Exception):
@@ -57,7 +64,7 @@ class FlowgraphError(Exception):
         parts = {"at": self.line, "expected": self.expected, "got": self.got, "fix": self.fix}
         for label, part in parts.items():
             if part is not None:
-                lines.append(f"  {label + ':':<10}{part}")
+                lines.append(f"  {label + ':':<10}{_bounded(str(part))}")
         return plain("\n".join(lines))
 
 
