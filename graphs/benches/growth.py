@@ -1,11 +1,12 @@
 """How time and memory grow with the length of a recording, and with the number of particles, in each engine.
 
-Each run has a process of its own. Its time is that of the processor (of all threads, the system's part
-included), which other programs on the machine do not lengthen much, the least of some runs where they are
-short; what is imported and compiled once is done before. Its memory is the most that the process held, less
-what it held before. A run is of a whole recording with all of its outputs, whose memory counts but not the
-time in which it is made; or streamed, from arrays that are made as they are needed to Parquet. Of particles
-only the pose is kept.
+Each run has a process of its own, on one core where the system lets it: threads of a library that wait for
+each other spin, which counts as time of the processor and is no work. Its time is that of the processor
+(the system's part included), which other programs on the machine do not lengthen much, the least of some
+runs where they are short; what is imported and compiled once is done before. Its memory is the most that
+the process held, less what it held before. A run is of a whole recording with all of its outputs, whose
+memory counts but not the time in which it is made; or streamed, from arrays that are made as they are
+needed to Parquet. Of particles only the pose is kept.
 
 The exponent p of time is that of t = a + b n^p, with the smallest errors relative to t: what a run costs
 whatever its length is `a`, and is no growth. That of memory is the slope of log(memory) over log(n) where the
@@ -62,6 +63,12 @@ LEAST_MEMORY = 1.0e6
 ENOUGH, AGAIN, LONG, REPEATS = 0.3, 3, 3.0, 7
 """A run is repeated for so many seconds, and so often where it does not take too long: the first is dearer,
 as the system hands out the pages of its memory. Seven times at most."""
+
+_ONE_CORE = """
+import os
+if hasattr(os, "sched_setaffinity"):  # before a library counts the cores for its threads
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+"""
 
 RANGES: dict[str, dict[str, tuple[int, int]]] = {
     "python": {"whole": (1_000, 10_000_000), "streamed": (1_000, 10_000_000), "particles": (10, 100_000)},
@@ -200,8 +207,8 @@ def exponent(number: np.ndarray, taken: np.ndarray) -> tuple[float, float | None
 
 
 def _apart(of: str, mode: str, engine: str, number: int, duration: float) -> dict[str, Any]:
-    """A run in a process of its own."""
-    call = f"from {__name__} import one; one({of!r}, {mode!r}, {engine!r}, {number}, {duration})"
+    """A run in a process of its own, on one core."""
+    call = f"{_ONE_CORE}from {__name__} import one; one({of!r}, {mode!r}, {engine!r}, {number}, {duration})"
     done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout.splitlines()[-1])
     return {"engine": engine, "of": of, "mode": mode, "number": number, **found}
