@@ -35,7 +35,7 @@ _UNROLLED = 4
 _SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
-_LARGEST_OF_SMALL, _WASTE = 2**20, 0.1  # of ticks that take less than copying what they make
+_LARGEST_OF_SMALL, _WASTE = 2**18, 0.1  # of ticks that take less than a call of many
 _SMALL_TICKS, _TICK_BY_TICK = 128, 0.5  # numbers that a tick makes, and the share that needs the tick before
 _KEPT_BYTES = 32 * 2**20  # of buffers that wait for the next run
 
