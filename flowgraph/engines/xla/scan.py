@@ -280,11 +280,11 @@ class Scan:
         choice = key if self.branches is None else pattern
         self.compile(cells, seed, inputs)
         now: Any = tuple(_as(c, self.dtype) for c in cells)
-        buffers = self._buffers(inputs)
-        others = self._buffers(inputs) if len(time) > self.chunk else buffers
+        starts = range(0, len(time), self.chunk)
+        turns = [self._buffers(inputs) for _ in starts[:2]]
         played: tuple[slice, Any, Any, Buffers] | None = None
-        for start in range(0, len(time), self.chunk):
-            here = slice(start, min(start + self.chunk, len(time)))
+        for n, start in enumerate(starts):
+            here, buffers = slice(start, min(start + self.chunk, len(time))), turns[n % 2]
             buffers.fill(choice, time, rows, inputs, here)
             with self.jax.enable_x64(True):
                 now, ys = self._compiled(now, seed, buffers.arrays)
@@ -292,10 +292,10 @@ class Scan:
             if played is not None:
                 yield self._handed(pattern, *played)
             played = here, now, ys, buffers
-            buffers, others = others, buffers
         if played is not None:
             yield self._handed(pattern, *played)
-        self._free = [b for b in {id(b): b for b in (buffers, others)}.values() if b.bytes <= _KEPT_BYTES]
+        if sum(b.bytes for b in turns) <= _KEPT_BYTES:
+            self._free = turns
 
     def _handed(
         self, pattern: np.ndarray, here: slice, now: Any, ys: Any, buffers: Buffers
