@@ -110,9 +110,8 @@ assert np.allclose(*places, rtol=1e-9, atol=1e-9)
 # what goes over all ticks at once is shared out likewise
 single = doubled.build()
 for inputs in (given, given(0)):
-    one, many = (
-        simulate_many(single, inputs, range(4), engine="xla", **shard) for shard in ({}, {"shard": {"runs": 2}})
-    )
+    one = simulate_many(single, inputs, range(4), engine="xla")
+    many = simulate_many(single, inputs, range(4), engine="xla", shard={"runs": 2})
     same(many.series, one.series)
     for seed in range(4):
         alone = simulate(single, inputs if isinstance(inputs, dict) else inputs(seed))
