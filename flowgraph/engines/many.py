@@ -84,6 +84,8 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
     engine = find_engine(options.engine)
     engine.check(options)
     alone = not engine.takes_many or options.dtype == "fixed"
+    if isinstance(engine, BlockEngine):
+        graph = _collecting(graph, keep)
     if alone or lower(graph, dtype=options.dtype).host:  # the host has its part in every run
         return _one_by_one(graph, inputs, seeds, keep, options)
     assert isinstance(engine, PipelineEngine)
@@ -102,6 +104,18 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
         _alone(graph, runs, worst, options)
         raise troubles.error(worst)
     return Batch(graph.name, options.engine, seeds, series, found.ticks, found.wall_s, astray)
+
+
+def _collecting(graph: Graph, names: Collection[str]) -> Graph:
+    """The graph that collects these outputs and no others, kept with the whole one."""
+    collected = tuple(c for c in graph.collected if c.name in names)
+    if len(collected) == len(graph.collected):
+        return graph
+    which = ("collecting", *(c.name for c in collected))
+    if which not in graph.plans:
+        graph.plans[which] = replace(graph, collected=collected, plans={})
+    found: Graph = graph.plans[which]
+    return found
 
 
 def _alone(graph: Graph, runs: ManyRuns, n: int, options: RunOptions) -> None:

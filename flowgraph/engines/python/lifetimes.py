@@ -1,4 +1,4 @@
-"""Arrays of a tick, let go in the line after which nobody reads them.
+"""Values of a tick: not computed where nobody reads them, and let go in the line after which nobody does.
 
 A variable holds its array until the next tick writes it anew, so that all that a tick computes would lie
 beside one another: a thousand numbers a particle for a cloud, of which a few dozen are needed at one time.
@@ -12,10 +12,24 @@ from collections.abc import Collection, Sequence
 
 _NAME = re.compile(r"\b[hvw]\d+_\d+\b")
 _WRITTEN = re.compile(r"\s*([hvw]\d+_\d+) = ")
+_COMPUTED = re.compile(r"\s*(w\d+_\d+) = (?=[^;]*$)")
 _INDENT = 4
 
 Place = tuple[tuple[int, int], ...]
 """Of a line: from the outside, the block that it is in and the statement there."""
+
+
+def unread(lines: Sequence[str]) -> list[int]:
+    """The lines of a tick that compute what no other line of it reads, nor what such lines read."""
+    read: set[str] = set()
+    found = []
+    for k in range(len(lines) - 1, -1, -1):
+        line = lines[k]
+        if (written := _COMPUTED.match(line)) is not None and written[1] not in read:
+            found.append(k)
+            continue
+        read.update(_NAME.findall(line if written is None else line[written.end() :]))
+    return found
 
 
 def let_go(lines: Sequence[str], arrays: Collection[str]) -> list[str]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from flowgraph.data.series import Series
-from flowgraph.engines.python.lifetimes import let_go
+from flowgraph.engines.python.lifetimes import let_go, unread
 from flowgraph.engines.python.plan import Plan, Presence, Writer, compiled, named
 from flowgraph.engines.python.steps import KINDS, Line, Written, silent, single, written
 from flowgraph.engines.python.strips import Rooms, Strips, Whole
@@ -105,6 +105,7 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
         lines.append(f"            {'if' if n == 0 else 'elif'} key == {key}:")
         writer = _LoopWriter(graph, key, which, len(lines))
         writer.reaction()
+        writer.leave_out()
         strips = Strips(writer.lines, writer.whole)
         owner |= {
             len(lines) + n: writer.owner[writer.first + k + 1] for n, (_, k) in enumerate(strips.made, 1)
@@ -278,6 +279,13 @@ class _LoopWriter(Writer):
     def emit(self, line: str, owner: str) -> None:
         self.lines.append("    " * self.indent + line)
         self.owner[self.first + len(self.lines)] = owner
+
+    def leave_out(self) -> None:
+        """Compute nothing that nobody reads, as of a block of whose outputs few are collected."""
+        for k in unread(self.lines):
+            line = self.lines[k]
+            self.lines[k] = f"{line[: len(line) - len(line.lstrip())]}pass"
+            self.whole.pop(k, None)
 
     def read(self, index: int, k: int, node: SourceNode) -> None:
         if k not in self.which.steady:
