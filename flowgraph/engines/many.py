@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from flowgraph.errors import DeclarationError, RunError, UnknownNameError
 from flowgraph.language.graph import Graph
 from flowgraph.pipeline.lowering import lower
 from flowgraph.pipeline.optimise import RELYING, without
+from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.recorder.random import seed_words
 from flowgraph.types import leaves_of
 
@@ -56,7 +58,8 @@ def simulate_many(
         seeds: one a run.
         engine, dtype: as for `simulate`.
         init: other initial values, shared or a function of the seed, or a list, one a run.
-        keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out.
+        keep: what to keep of the outputs, `"pose"` or `"pose.position"`; everything if left out. What
+            nothing else needs is not computed, and not found to have diverged.
         runs_at_once: size of a chunk of runs in XLA. It is fixed, and the last chunk is filled up, so memory
             is bounded and the result of a run does not depend on how many others are asked for.
         progress: told the number of finished runs.
@@ -84,7 +87,7 @@ def run_many(graph: Graph, inputs: ManyInputs, seeds: Sequence[int], options: Ru
     engine = find_engine(options.engine)
     engine.check(options)
     alone = not engine.takes_many or options.dtype == "fixed"
-    if isinstance(engine, BlockEngine):
+    if alone:
         graph = _collecting(graph, keep)
     if alone or lower(graph, dtype=options.dtype).host:  # the host has its part in every run
         return _one_by_one(graph, inputs, seeds, keep, options)
@@ -113,7 +116,12 @@ def _collecting(graph: Graph, names: Collection[str]) -> Graph:
         return graph
     which = ("collecting", *(c.name for c in collected))
     if which not in graph.plans:
-        graph.plans[which] = replace(graph, collected=collected, plans={})
+        plans: dict[Any, Any] = {}
+        made: Pipeline | None = graph.plans.get("pipeline")
+        if made is not None and not made.host:  # it may have been lifted since
+            outputs = tuple(port for port in made.outputs if port.name in names)
+            plans["pipeline"] = replace(made, outputs=outputs)
+        graph.plans[which] = replace(graph, collected=collected, plans=plans)
     found: Graph = graph.plans[which]
     return found
 

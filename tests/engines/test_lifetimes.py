@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 
 from flowgraph import Scalar, Stream, block, graph, simulate
-from flowgraph.engines.python.lifetimes import let_go
+from flowgraph.engines.python.lifetimes import let_go, unread
 
 LINES = """
 w1_1 = x0_0 * x0_0
@@ -52,6 +52,13 @@ def test_a_variable_goes_with_its_last_reader_where_it_surely_is():
     ]  # w2_2 may not be there where it would go
     assert let_go(LINES, ()) == LINES
     assert let_go([], arrays) == []
+
+
+def test_a_line_that_only_unread_lines_read_is_not_read():
+    lines = [*LINES[:-3], "    w3_4 = a3(t)", "    w3_5, w3_6 = halves(w3_4)", LINES[-1]]
+    dead = {lines[k].strip() for k in unread(lines)}
+    assert dead == {"w2_1 = w1_5 * w1_5", "w2_2 = w2_1 - w1_1"}
+    assert unread([]) == []
 
 
 def test_a_tick_holds_no_more_arrays_than_are_read_later():

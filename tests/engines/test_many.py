@@ -8,6 +8,7 @@ import pytest
 from flowgraph import (
     DataError,
     DeclarationError,
+    DivergedError,
     Scalar,
     Series,
     Stream,
@@ -18,6 +19,7 @@ from flowgraph import (
     simulate,
     simulate_many,
 )
+from tests.support import ENGINES, scalars
 
 
 @block
@@ -78,6 +80,33 @@ def test_only_what_is_kept_comes_back(built):
         simulate_many(built, inputs(), range(2), keep=["plaice"])
     with pytest.raises(UnknownNameError, match="high"):
         batch["high"]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_is_not_kept_and_nothing_else_needs_is_not_computed(engine):
+    """Nor is it found to have diverged; what a register needs is."""
+
+    @block
+    def moved(level: Scalar, x: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+        return level + x, 1.0 / (x - 3.0), 2.0 * x
+
+    @graph
+    def g(x: Stream[Scalar]):
+        memory = delay(0.0, name="level")
+        level, far, double = moved(memory, x)
+        memory.feed(level)
+        return {"level": level, "far": far, "double": double}
+
+    made, data = g.build(), {"x": scalars(range(5))}
+    whole = simulate_many(made, data, [0, 1], engine=engine, diverged="count")
+    few = simulate_many(made, data, [0, 1], engine=engine, keep=["double", "level"])
+    assert list(few.series) == ["double", "level"]
+    assert not few.diverged
+    assert set(whole.diverged) == {0, 1}
+    for name, runs in few.series.items():
+        np.testing.assert_array_equal(runs.value, whole[name].value)
+    with pytest.raises(DivergedError, match="far"):
+        simulate_many(made, data, [0, 1], engine=engine)
 
 
 def test_runs_at_other_times_are_refused(built):
