@@ -21,7 +21,7 @@ from flowgraph.language.graph import NEVER, Graph
 from flowgraph.types import DTYPES, ArrayType, StructType, Type, flatten, leaves_of, unflatten
 
 _WIDE = 64
-_FIRST, _MANY = 1024, 32
+_FIRST, _MANY, _STRETCH = 1024, 32, 65_536
 Rows = slice | np.ndarray
 
 
@@ -92,16 +92,20 @@ def bits(sources: int) -> Any:
 
 
 def patterns_of(key: np.ndarray) -> tuple[int, ...]:
-    """The keys that occur, in order: those at the start, and what else is found behind."""
+    """The keys that occur, in order: of each stretch those at its start, and what else is behind them."""
     found: set[int] = set()
-    while len(key):
-        found.update(key[:_FIRST].tolist())
-        if len(found) > _MANY:
-            return tuple(sorted(found.union(np.unique(key).tolist())))
-        others = np.ones(len(key), dtype=bool)
-        for known in found:
-            others &= key != known
-        key = key[others]
+    for first in range(0, len(key), _STRETCH):
+        rest = key[first : first + _STRETCH]
+        while len(rest):
+            others = np.ones(len(rest), dtype=bool)
+            for known in found:
+                others &= rest != known
+            if not others.any():
+                break
+            rest = rest[others]
+            found.update(rest[:_FIRST].tolist())
+            if len(found) > _MANY:
+                return tuple(sorted(found.union(np.unique(key).tolist())))
     return tuple(sorted(found))
 
 

@@ -202,7 +202,9 @@ def exponent(number: np.ndarray, taken: np.ndarray) -> tuple[float, float | None
     squares, basis, found = fit(p)
     slope = found[-1] * basis[:, -1] * np.log(number)
     slopes = np.column_stack([basis, slope])
-    spread = np.linalg.pinv(slopes.T @ slopes)[-1, -1]
+    sizes = np.linalg.norm(slopes, axis=0)  # seconds and powers of n differ by more than digits there are
+    slopes = slopes / sizes
+    spread = np.linalg.pinv(slopes.T @ slopes)[-1, -1] / sizes[-1] ** 2
     return p, float(np.sqrt(squares / max(len(number) - slopes.shape[1], 1) * spread))
 
 

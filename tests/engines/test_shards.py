@@ -27,8 +27,8 @@ pytest.importorskip("jax")
 LIBRARY = """
 import numpy as np
 from flowgraph import (
-    Array, DeclarationError, Scalar, Signal, Stream, block, delay, find_graph, graph, load_flight, lower,
-    real, simulate, simulate_many,
+    Array, DeclarationError, Scalar, Signal, Stream, block, delay, find_graph, graph, latest, load_flight,
+    lower, real, simulate, simulate_many,
 )
 from flowgraph.blocks.particles.resampling import ancestor_index
 from flowgraph.engines.xla.devices import Devices
@@ -62,6 +62,11 @@ def follower(seen: Stream[Scalar], rare: Stream[Scalar], *, size):
     after = followed(points, seen)
     points.feed(after)
     return {"points": after, "middle": middle(after), "rare": rare.filter(lambda x: x > 0.0)}
+
+
+@graph
+def doubled(seen: Stream[Scalar], rare: Stream[Scalar]):
+    return {"out": seen.map(lambda x: 2.0 * x) + latest(rare, init=0.5)}
 
 
 def given(seed):
@@ -101,6 +106,17 @@ parted = simulate(built, given(3), engine="xla", seed=3, shard={"particles": 4})
 same(parted.series, alone.series)
 places = (run.state["registers"]["points"]["place"] for run in (alone, parted))
 assert np.allclose(*places, rtol=1e-9, atol=1e-9)
+
+# what goes over all ticks at once is shared out likewise
+single = doubled.build()
+for inputs in (given, given(0)):
+    one = simulate_many(single, inputs, range(4), engine="xla")
+    many = simulate_many(single, inputs, range(4), engine="xla", shard={"runs": 2})
+    same(many.series, one.series)
+    for seed in range(4):
+        alone = simulate(single, inputs if isinstance(inputs, dict) else inputs(seed))
+        same({"out": many["out"].run(seed)}, alone.series)
+assert all(scan._parts is not None for scan in lower(single).__dict__["_batched"].values())
 
 # registers lie apart, and runs tell one another nothing
 pipeline = lower(built)

@@ -64,7 +64,7 @@ def test_an_input_is_spread_over_the_ticks_of_each_chunk(at):
     for first in range(0, 13, 4):
         last = min(first + 4, 13)
         buffers.fill(choice, time, [at], [[values]], slice(first, last))
-        kept, when, ((column,),) = buffers.arrays
+        kept, when, ((column,),), _ = buffers.arrays
         short = 4 - (last - first)
         np.testing.assert_array_equal(column, np.r_[dense[first:last], np.zeros(short)])
         np.testing.assert_array_equal(kept, np.r_[choice[first:last], [99] * short])

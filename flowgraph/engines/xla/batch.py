@@ -22,6 +22,9 @@ from flowgraph.errors import DataError
 from flowgraph.pipeline.pipeline import Pipeline, Port
 from flowgraph.recorder.random import seed_words
 
+Outputs = list[tuple[np.ndarray, list[np.ndarray]]]
+"""Of a chunk, for each output a mask and its leaves."""
+
 _TICKS_AT_ONCE = 512
 _CHUNK_BYTES = 64 * 2**20
 
@@ -46,7 +49,7 @@ def vectorised(runs: ManyRuns, passes: tuple[str, ...], options: RunOptions) -> 
         )
     scan = compiled[which]
     columns_first = _columns([first], True, real)
-    chunks: list[list[Chunk]] = []
+    chunks: list[list[Outputs]] = []
     wall = 0.0
     for n, members in enumerate(_chunks(len(seeds), size)):
         columns = columns_first if runs.shared else _columns(_tapes(runs, members), False, real)
@@ -124,32 +127,33 @@ def _columns(tapes: list[Tape], shared: bool, real: Any) -> list[list[np.ndarray
     return [[np.stack(leaves) for leaves in zip(*ports, strict=True)] for ports in zip(*made, strict=True)]
 
 
-def _without_absent(part: Chunk) -> Chunk:
-    """The chunk without the ticks at which an output is known to be absent in all runs."""
-    outputs = [
-        (mask, leaves if mask.ndim > 1 or mask.all() else [leaf[:, mask] for leaf in leaves])
-        for mask, leaves in part.outputs
-    ]
-    return replace(part, outputs=outputs)
+def _without_absent(part: Chunk) -> Outputs:
+    """The outputs, without the ticks at which one is known to be absent in all runs."""
+    found = []
+    for mask, leaves in part.outputs:
+        there = np.ones(part.ticks, bool) if mask is None else mask
+        whole = there.ndim > 1 or there.all()
+        found.append((there, leaves if whole else [leaf[:, there] for leaf in leaves]))
+    return found
 
 
-def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Chunk]], runs: int) -> Runs:
+def _collected(port: Port, k: int, time: np.ndarray, chunks: list[list[Outputs]], runs: int) -> Runs:
     """One output of all runs, at the ticks in which it is present in any."""
 
-    def joined(pick: Callable[[Chunk], np.ndarray]) -> np.ndarray:
+    def joined(pick: Callable[[Outputs], np.ndarray]) -> np.ndarray:
         rows = [np.concatenate([pick(part) for part in parts], axis=1) for parts in chunks]
         return (rows[0] if len(rows) == 1 else np.concatenate(rows))[:runs]
 
-    masks = [part.outputs[k][0] for part in chunks[0]]
+    masks = [part[k][0] for part in chunks[0]]
     if all(mask.ndim == 1 for mask in masks):  # the same in all runs, and already left out where absent
         some: np.ndarray = np.concatenate(masks)
         present = np.ones((runs, int(some.sum())), dtype=bool)
-        leaves = {leaf.name: joined(lambda p, n=n: p.outputs[k][1][n]) for n, leaf in enumerate(port.leaves)}  # type: ignore[misc]
+        leaves = {leaf.name: joined(lambda p, n=n: p[k][1][n]) for n, leaf in enumerate(port.leaves)}  # type: ignore[misc]
         return Runs(port.name, time[some], present, leaves)
-    present = joined(lambda part: part.outputs[k][0])
+    present = joined(lambda part: part[k][0])
     some = np.asarray(present.any(axis=0))
     leaves = {
-        leaf.name: joined(lambda p, n=n: p.outputs[k][1][n])[:, some]  # type: ignore[misc]
+        leaf.name: joined(lambda p, n=n: p[k][1][n])[:, some]  # type: ignore[misc]
         for n, leaf in enumerate(port.leaves)
     }
     return Runs(port.name, time[some], present[:, some], leaves)

@@ -2,13 +2,13 @@
 
 They lie where XLA takes an array as it is, at a multiple of 64 bytes; one at another address would be copied.
 An input that is not there at every tick is spread over the ticks here, a chunk at a time, so that no array
-of all ticks is made of it. A run that ends leaves its buffers to the next, which the system need not give it
-new memory for.
+of all ticks is made of it: with zeros between its values, or with the last of them. A run that ends leaves
+its buffers to the next, which the system need not give it new memory for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class Buffers:
         axis: of the ticks in these.
         real: the dtype of real numbers.
         idle: the choice at ticks in which nothing is present.
+        held: places of inputs whose values stay until the next; None where nobody asks since when they do.
     """
 
     def __init__(
@@ -40,8 +41,10 @@ class Buffers:
         axis: int,
         real: Any,
         idle: int,
+        held: Collection[int] | None = None,
     ) -> None:
-        self._ticks, self._axis, self._idle = ticks, axis, idle
+        self._ticks, self._axis, self._idle, self._held = ticks, axis, idle, held or ()
+        self._since = None if held is None else np.zeros(len(inputs), np.int32)
         self._choice = aligned((ticks,), choice)
         self._time = aligned((ticks,), np.int64) if timed else None
         self._written: list[Rows] = [slice(0, 0, 1)] * len(inputs)  # for each port, where it is not 0
@@ -72,8 +75,11 @@ class Buffers:
 
     @property
     def arrays(self) -> tuple[Any, ...]:
-        """What the scan goes through: choice, time (None where it is not read) and the leaves."""
-        return self._choice, self._time, self._leaves
+        """What the scan goes through: choice, time (None where it is not read), the leaves, and since when.
+
+        Since which tick of the chunk each input that is held has a value; before it may be anything.
+        """
+        return self._choice, self._time, self._leaves, self._since
 
     def fill(
         self,
@@ -100,14 +106,21 @@ class Buffers:
         before = (slice(None),) * self._axis
         for k, (at, port, leaves) in enumerate(zip(rows, inputs, self._leaves, strict=True)):
             places, part = _within(at, here)
+            values = [array[(*before, part)] for array in port]
+            if self._since is not None and k in self._held:
+                self._since[k] = first = _first(places, self._ticks)
+                for some, kept in zip(values, leaves, strict=True):
+                    whole = np.moveaxis(kept, self._axis, 0)
+                    _hold(whole[first:], np.moveaxis(some, self._axis, 0), places)
+                continue
             last, self._written[k] = self._written[k], places
             same = isinstance(places, slice) and isinstance(last, slice) and places == last
-            for array, kept in zip(port, leaves, strict=True):
+            for some, kept in zip(values, leaves, strict=True):
                 if isinstance(at, slice) and at.step is None:  # at all ticks
                     kept[(*before, slice(count, None))] = 0
                 elif not same:
                     kept[...] = 0
-                kept[(*before, places)] = array[(*before, part)]
+                kept[(*before, places)] = some
 
     def holds(self, array: np.ndarray) -> bool:
         """Whether an array lies in one of these, and so will not stay as it is."""
@@ -123,6 +136,25 @@ def _within(rows: Rows, here: slice) -> tuple[Rows, slice]:
     last = here.stop if rows.stop is None else min(here.stop, rows.stop)
     before, within = (max(0, -(-(tick - start) // step)) for tick in (here.start, last))
     return slice(start + before * step - here.start, max(last - here.start, 0), step), slice(before, within)
+
+
+def _first(places: Rows, ticks: int) -> int:
+    """The first of some ticks of a chunk; after its last where there is none."""
+    if isinstance(places, slice):
+        return min(places.start, ticks) if places.start < places.stop else ticks
+    return int(places[0]) if len(places) else ticks
+
+
+def _hold(kept: np.ndarray, values: np.ndarray, places: Rows) -> None:
+    """Write values at some ticks, and at those after each the same; `kept` begins at the first."""
+    if not len(values):
+        return
+    if isinstance(places, np.ndarray):
+        kept[...] = np.repeat(values, np.diff(places - places[0], append=len(kept)), axis=0)
+        return
+    step, whole = places.step or 1, len(values) - 1
+    kept[: whole * step].reshape(whole, step, *kept.shape[1:])[...] = values[:-1, None]
+    kept[whole * step :] = values[-1]
 
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:

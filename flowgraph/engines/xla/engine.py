@@ -41,8 +41,10 @@ class _Compiled(Player):
             cells = after
             times = tape.time[done : done + part.ticks]
             for output, (mask, leaves) in zip(outputs, part.outputs, strict=True):
-                there = (times, leaves) if mask.all() else (times[mask], [leaf[mask] for leaf in leaves])
-                output.add(part.ticks, *there)
+                if mask is None or mask.all():
+                    output.add(part.ticks, times, leaves)
+                else:
+                    output.add(part.ticks, times[mask], [leaf[mask] for leaf in leaves])
             done += part.ticks
             if progress is not None:
                 progress.update(done, int(times[-1]))

@@ -3,7 +3,8 @@
 Few source patterns: each has its own specialised program, chosen by a switch. Many patterns, or programs so
 small that the switch would cost more than it saves: one program in which presence is data. Ticks go in
 chunks of a fixed size, so that one compilation serves recordings of any length and memory stays bounded;
-the last chunk is filled up with ticks in which nothing is present.
+the last chunk is filled up with ticks in which nothing is present. Where most of a small program needs
+nothing of the tick before, that is computed for all ticks of a chunk at once.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from flowgraph.engines.xla.namespace import JaxNamespace
 from flowgraph.pipeline.optimise import ARRAYS, optimise
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
+from flowgraph.pipeline.recurrence import Parts, parts
 from flowgraph.recorder.ops import OPS, bound_attrs
+from flowgraph.recorder.trace import Instruction
 
 _MOST_PATTERNS = 8
 _SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
@@ -32,7 +35,8 @@ _UNROLLED = 4
 _SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
-_LARGEST_OF_SMALL, _WASTE = 2**20, 0.1  # of ticks that take less than copying what they make
+_LARGEST_OF_SMALL, _WASTE = 2**18, 0.1  # of ticks that take less than a call of many
+_SMALL_TICKS, _TICK_BY_TICK = 128, 0.5  # numbers that a tick makes, and the share that needs the tick before
 _KEPT_BYTES = 32 * 2**20  # of buffers that wait for the next run
 
 
@@ -40,11 +44,12 @@ _KEPT_BYTES = 32 * 2**20  # of buffers that wait for the next run
 class Chunk:
     """Outputs of consecutive ticks: for each output port a mask and its leaves, first axis ticks.
 
-    With a leading axis of runs, a mask that is the same in all runs has no such axis.
+    Without a mask it is known to be there at every tick. With a leading axis of runs, a mask that is the same
+    in all runs has no such axis.
     """
 
     ticks: int
-    outputs: list[tuple[np.ndarray, list[np.ndarray]]]
+    outputs: list[tuple[np.ndarray | None, list[np.ndarray]]]
 
 
 class Scan:
@@ -77,6 +82,7 @@ class Scan:
         self.follows = [_known_presence(programs, k) for k in range(len(pipeline.outputs))]
         played = [shared_program] if self.branches is None else self.branches
         self._timed = any(_reads(program, pipeline.time) for program in played)
+        self._parts = self._apart() if self.branches is None else None
         self._unroll = _UNROLLED if self.branches is None and _moved(pipeline) <= _SMALL_TICK else 1
         self._input_axis = 0 if shared or runs is None else 1
         self._output_axis = 0 if runs is None else 1
@@ -84,7 +90,7 @@ class Scan:
         placed = {} if devices is None else self._placed(devices, leads, () if shared else leads)
         play = self._chunk
         if runs is not None:
-            play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0)))
+            play = self.jax.vmap(play, in_axes=(0, 0, (None, None, None if shared else 0, None)))
         self._compiled: Any = None
         self._free: list[Buffers] = []
         self._play_chunk = self.jax.jit(play, **placed)
@@ -105,8 +111,9 @@ class Scan:
             for port, known in zip(self.pipeline.outputs, self.follows, strict=True)
         ]
         time = every if self._timed else None
+        since = every if self._parts is not None else None
         return {
-            "in_shardings": (cells, devices.at(*leads), (every, time, given)),
+            "in_shardings": (cells, devices.at(*leads), (every, time, given, since)),
             "out_shardings": (cells, made),
         }
 
@@ -126,44 +133,73 @@ class Scan:
                 return free
         ports = len(self.pipeline.inputs)
         kind, idle = (np.int32, len(self.keys)) if self.branches is not None else (bits(ports), 0)
-        return Buffers(self.chunk, kind, self._timed, inputs, self._input_axis, self.dtype, idle)
+        held = None if self._parts is None else self._parts.seen.keys()
+        return Buffers(self.chunk, kind, self._timed, inputs, self._input_axis, self.dtype, idle, held)
+
+    def _apart(self) -> Parts | None:
+        """The program in parts, where that is small and most of it needs nothing of the tick before."""
+        found = parts(self.shared, self.pipeline)
+        return found if found.numbers <= _SMALL_TICKS and found.share <= _TICK_BY_TICK else None
 
     def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
+        if self._parts is not None:
+            return self._in_parts(self._parts, cells, seed, xs)
         step = self._switched if self.branches is not None else self._flagged
         return self.jax.lax.scan(partial(step, seed), cells, xs, unroll=self._unroll)
 
     def _start(
         self, program: Program, cells: tuple[Any, ...], seed: Any, time: Any, inputs: Any
     ) -> dict[int, Any]:
+        env = self._known(program, seed) | dict(zip(program.reads, cells, strict=True))
+        return env | self._given(time, inputs)
+
+    def _known(self, program: Program, seed: Any) -> dict[int, Any]:
+        """What is the same at every tick."""
         jnp = self.jax.numpy
         env: dict[int, Any] = {n: jnp.asarray(_as(a, self.dtype)) for n, a in program.constants.items()}
-        env[self.pipeline.seed] = seed
-        if self._timed:
-            env[self.pipeline.time] = time
-        env.update(zip((c.read for r in self.pipeline.registers for c in r.cells), cells, strict=True))
+        return env | {self.pipeline.seed: seed}
+
+    def _given(self, time: Any, inputs: Any) -> dict[int, Any]:
+        """The time and the inputs, of a tick or of several."""
+        env: dict[int, Any] = {self.pipeline.time: time} if self._timed else {}
         for port, leaves in zip(self.pipeline.inputs, inputs, strict=True):
             env.update(zip((leaf.value for leaf in port.leaves), leaves, strict=True))
         return env
 
-    def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
-        jnp, xp = self.jax.numpy, JaxNamespace(self.jax)
-        for i in program.instructions:
+    def _present(self, key: Any) -> dict[int, Any]:
+        return {port.present: (key >> k) & 1 == 1 for k, port in enumerate(self.pipeline.inputs)}
+
+    def _run(self, instructions: Sequence[Instruction], env: dict[int, Any]) -> dict[int, Any]:
+        xp = JaxNamespace(self.jax)
+        for i in instructions:
             env[i.out] = OPS[i.op].run(
                 xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
             )
+        return env
+
+    def _outputs(self, program: Program, value: Callable[[int], Any], *lead: int) -> list[Any]:
+        """Mask and leaves of each output; `lead` is an axis before those of a value."""
+        jnp = self.jax.numpy
         outputs = []
         ports = zip(program.outputs, self.pipeline.outputs, self.follows, strict=True)
         for (flag, leaves), port, follows in ports:
-            mask = None if follows is not None else jnp.asarray(flag is not None and env.get(flag, True))
+            mask = None
+            if follows is None:
+                mask = jnp.zeros(lead, bool) if flag is None else jnp.asarray(value(flag))
             if flag is None:
-                blank = tuple(jnp.zeros(x.shape, _dtype(x.dtype, self.dtype)) for x in port.leaves)
-                outputs.append((mask, blank))
+                blank = (jnp.zeros((*lead, *x.shape), _dtype(x.dtype, self.dtype)) for x in port.leaves)
+                outputs.append((mask, tuple(blank)))
             else:
-                outputs.append((mask, tuple(env[n] for n in leaves)))
-        return tuple(env[n] for n in program.writes), outputs
+                outputs.append((mask, tuple(value(n) for n in leaves)))
+        return outputs
+
+    def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
+        self._run(program.instructions, env)
+        value = lambda n: env[n]
+        return tuple(env[n] for n in program.writes), self._outputs(program, value)
 
     def _switched(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
-        key, time, inputs = x
+        key, time, inputs, _ = x
         assert self.branches is not None
 
         def branch(program: Program) -> Callable[..., Any]:
@@ -175,11 +211,47 @@ class Scan:
         return self.jax.lax.switch(key, [branch(p) for p in [*self.branches, nothing]], cells, time, inputs)
 
     def _flagged(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
-        key, time, inputs = x
-        env = self._start(self.shared, cells, seed, time, inputs)
-        for k, port in enumerate(self.pipeline.inputs):
-            env[port.present] = (key >> k) & 1 == 1
+        key, time, inputs, _ = x
+        env = self._start(self.shared, cells, seed, time, inputs) | self._present(key)
         return self._play(self.shared, env)
+
+    def _in_parts(self, found: Parts, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
+        """All ticks of a chunk: at once what is before and after the registers that are carried."""
+        jnp, program = self.jax.numpy, self.shared
+        key, time, inputs, since = xs
+        known = self._known(program, seed)
+        known |= {program.reads[place]: cells[place] for place in found.held}
+        ticks = self._given(time, inputs) | self._present(key)
+        ticks |= {n: jnp.arange(len(key)) >= since[port] for port, n in found.seen.items()}
+
+        def at_once(instructions: Sequence[Instruction]) -> dict[int, Any]:
+            def of_one(values: dict[int, Any]) -> dict[int, Any]:
+                env = self._run(instructions, known | values)
+                return {i.out: env[i.out] for i in instructions}
+
+            return dict(self.jax.vmap(of_one)(ticks))
+
+        def step(now: tuple[Any, ...], values: dict[int, Any]) -> Any:
+            env = known | values | {program.reads[p]: c for p, c in zip(found.carried, now, strict=True)}
+            self._run(found.around, env)
+            return tuple(env[program.writes[p]] for p in found.carried), {n: env[n] for n in found.made}
+
+        def each(n: int) -> Any:
+            return ticks[n] if n in ticks else jnp.broadcast_to(known[n], (len(key), *known[n].shape))
+
+        ticks |= at_once(found.before)
+        after = list(cells)
+        if found.carried:
+            now = tuple(cells[p] for p in found.carried)
+            into = {n: ticks[n] for n in found.into}
+            last, made = self.jax.lax.scan(step, now, into, length=len(key), unroll=self._unroll)
+            ticks |= made
+            for p, cell in zip(found.carried, last, strict=True):
+                after[p] = cell
+        ticks |= at_once(found.after)
+        for p in found.held:
+            after[p] = ticks[program.writes[p]][-1]
+        return tuple(after), self._outputs(program, each, len(key))
 
     def __call__(
         self,
@@ -208,25 +280,39 @@ class Scan:
         choice = key if self.branches is None else pattern
         self.compile(cells, seed, inputs)
         now: Any = tuple(_as(c, self.dtype) for c in cells)
-        buffers = self._buffers(inputs)
-        for start in range(0, len(time), self.chunk):
-            count = min(self.chunk, len(time) - start)
-            kept = (slice(None),) * self._output_axis + (slice(count),)
-            part = pattern[start : start + count]
-            buffers.fill(choice, time, rows, inputs, slice(start, start + count))
+        starts = range(0, len(time), self.chunk)
+        turns = [self._buffers(inputs) for _ in starts[:2]]
+        played: tuple[slice, Any, Any, Buffers] | None = None
+        for n, start in enumerate(starts):
+            here, buffers = slice(start, min(start + self.chunk, len(time))), turns[n % 2]
+            buffers.fill(choice, time, rows, inputs, here)
             with self.jax.enable_x64(True):
                 now, ys = self._compiled(now, seed, buffers.arrays)
-                outputs = [
-                    (
-                        np.asarray(mask)[kept] if known is None else _picked(known, part),
-                        [_held(np.asarray(leaf), buffers)[kept] for leaf in leaves],
-                    )
-                    for (mask, leaves), known in zip(ys, self.follows, strict=True)
-                ]
-                now = self.jax.block_until_ready(now)  # the buffers are read until then
-            yield Chunk(count, outputs), [np.asarray(c) for c in now]
-        if buffers.bytes <= _KEPT_BYTES:
-            self._free = [buffers]
+            # While XLA plays these ticks, those before are handed out and the next are filled in.
+            if played is not None:
+                yield self._handed(pattern, *played)
+            played = here, now, ys, buffers
+        if played is not None:
+            yield self._handed(pattern, *played)
+        if sum(b.bytes for b in turns) <= _KEPT_BYTES:
+            self._free = turns
+
+    def _handed(
+        self, pattern: np.ndarray, here: slice, now: Any, ys: Any, buffers: Buffers
+    ) -> tuple[Chunk, list[Any]]:
+        """What a call has made of the ticks `here`, and the cells after them, once it is done."""
+        count = here.stop - here.start
+        kept = (slice(None),) * self._output_axis + (slice(count),)
+        with self.jax.enable_x64(True):
+            outputs = [
+                (
+                    np.asarray(mask)[kept] if known is None else _picked(known, pattern[here]),
+                    [_held(np.asarray(leaf), buffers)[kept] for leaf in leaves],
+                )
+                for (mask, leaves), known in zip(ys, self.follows, strict=True)
+            ]
+            now = self.jax.block_until_ready(now)  # the buffers are read until then
+        return Chunk(count, outputs), [np.asarray(c) for c in now]
 
 
 def _held(array: np.ndarray, buffers: Buffers) -> np.ndarray:
@@ -255,8 +341,8 @@ def _places(keys: tuple[int, ...], key: np.ndarray) -> np.ndarray:
     return np.asarray(table[key])
 
 
-def _picked(known: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return np.ones(len(places), bool) if known.all() else np.asarray(known[places])
+def _picked(known: np.ndarray, places: np.ndarray) -> np.ndarray | None:
+    return None if known.all() else np.asarray(known[places])
 
 
 def _known_presence(programs: list[Program], k: int) -> np.ndarray | None:

@@ -50,13 +50,13 @@ def test_a_constant_is_no_growth():
     assert exponent(number[:3], number[:3])[1] is None
 
 
-def test_the_error_of_an_exponent_is_how_far_it_scatters():
+@pytest.mark.parametrize(("constant", "each", "first"), [(0.5, 0.02, 1), (3e-4, 8e-9, 3)])
+def test_the_error_of_an_exponent_is_how_far_it_scatters(constant, each, first):
     """Over 200 series with errors of 3 %, the mean of the errors told is the scatter within a third."""
     rng = np.random.default_rng(7)
-    number = 10.0 ** np.arange(1, 7)
-    found = [
-        exponent(number, (0.5 + 0.02 * number**1.1) * (1 + 0.03 * rng.normal(size=6))) for _ in range(200)
-    ]
+    number = 10.0 ** np.arange(first, first + 6)
+    errors_of = lambda: 1 + 0.03 * rng.normal(size=6)
+    found = [exponent(number, (constant + each * number**1.1) * errors_of()) for _ in range(200)]
     powers, errors = np.array(found, float).T
     assert powers.mean() == pytest.approx(1.1, abs=0.01)
     assert 0.66 < errors.mean() / powers.std() < 1.5
