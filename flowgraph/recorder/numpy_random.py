@@ -28,13 +28,13 @@ FEW = 16
 _LOW, _HIGH = (0, 1) if sys.byteorder == "little" else (1, 0)
 
 
-def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int) -> np.ndarray:
-    """`count` random words (uint32) of Philox4x32; see `random.words`."""
-    if count <= FEW:
+def words(count: int, name: int, time: int, seed: np.ndarray, rounds: int, *, first: int = 0) -> np.ndarray:
+    """`count` random words (uint32) of Philox4x32, of the counters from `first` on; see `random.words`."""
+    if count <= FEW and not first:
         return np.array(few_words(count, name, int(time), seed, rounds), np.uint32)
     time, n = int(time), -(-count // 4)
     even = np.empty((2, n), np.uint32)
-    even[0], even[1] = np.arange(n, dtype=np.uint32), time & _WORD
+    even[0], even[1] = np.arange(first, first + n, dtype=np.uint32), time & _WORD
     return _mixed(even, np.array([[name], [(time >> 32) & _WORD]], np.uint32), seed, rounds)[:count]
 
 

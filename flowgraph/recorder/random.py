@@ -33,6 +33,7 @@ _WORD = 0xFFFFFFFF
 _SEGMENT_BITS = 6  # segments an octave: 64
 _PLACE_BITS = 14  # bits of the position within a segment
 _FRACTION_BITS = 22  # a draw is an integer times 2^-22
+_AT_ONCE = 1 << 15  # numbers that NumPy makes together: what is between them and their words stays in a cache
 _BASE = 127 << _SEGMENT_BITS  # of the float32 exponent
 
 
@@ -150,10 +151,20 @@ def _in_numpy(kind: str, shape: tuple[int, ...], name: int, time: Any, seed: np.
     if kind == "uniform" and count <= numpy_random.FEW:
         few = [(w >> 8) * 2.0**-24 for w in numpy_random.few_words(count, name, int(time), seed, ROUNDS)]
         return np.array(few).reshape(shape) if shape else np.float64(few[0])
-    bits = numpy_random.words(count, name, time, seed, ROUNDS)
-    if kind == "uniform":
-        return uniform_from(bits, xp=NUMPY).reshape(shape)
-    return _normals(bits).reshape(shape)
+    if count <= _AT_ONCE:
+        return _made(kind, numpy_random.words(count, name, time, seed, ROUNDS)).reshape(shape)
+    counters, step = -(-count // 4), _AT_ONCE // 4
+    found = np.empty((4, counters))
+    for first in range(0, counters, step):
+        some = min(step, counters - first)
+        bits = numpy_random.words(4 * some, name, time, seed, ROUNDS, first=first)
+        found[:, first : first + some] = _made(kind, bits).reshape(4, some)
+    return found.reshape(4 * counters)[:count].reshape(shape)
+
+
+def _made(kind: str, bits: np.ndarray) -> Any:
+    """Numbers of words."""
+    return uniform_from(bits, xp=NUMPY) if kind == "uniform" else _normals(bits)
 
 
 def numbers_at(kind: str, shape: tuple[int, ...], name: int, times: np.ndarray, seed: np.ndarray) -> Any:
@@ -164,8 +175,7 @@ def numbers_at(kind: str, shape: tuple[int, ...], name: int, times: np.ndarray, 
         name: the hash of the site.
     """
     bits = numpy_random.words_at(math.prod(shape), name, times, seed, ROUNDS)
-    made = uniform_from(bits, xp=NUMPY) if kind == "uniform" else _normals(bits.ravel())
-    return made.reshape(*shape, len(times))
+    return _made(kind, bits.ravel()).reshape(*shape, len(times))
 
 
 def _normals(bits: np.ndarray) -> Any:

@@ -157,6 +157,7 @@ FILTERS = """
 flight = load_flight("sim", settings={"duration": "2"})
 for name, settings, shards in (
     ("rbpf_indoor", {"particles": 200}, ({"runs": 3}, {"particles": 4}, {"runs": 2, "particles": 2})),
+    ("rbpf_indoor", {"particles": 600}, ({"particles": 4},)),  # so many are played in turns, row by row
     ("ins_eskf", {}, ({"runs": 4},)),
 ):
     made = find_graph(name).case(flight, **settings)

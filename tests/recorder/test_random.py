@@ -189,7 +189,7 @@ def test_names_of_one_hash_are_refused():
 
 
 @pytest.mark.parametrize("kind", ["normal", "uniform"])
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (16,), (17,), (3, 100)])
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (16,), (17,), (3, 100), (3, 43_691)])
 def test_the_ways_of_numpy_give_the_same_numbers(kind, shape):
     """Few are made with Python's integers, many with few passes; another namespace has neither."""
     for time, seed in ((0, 0), (-5, 2**63 + 1), (2**62 + 7, 12345)):

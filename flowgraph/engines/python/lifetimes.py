@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
-_NAME = re.compile(r"\bw\d+_\d+\b")
-_WRITTEN = re.compile(r"\s*(w\d+_\d+) = ")
+_NAME = re.compile(r"\b[hvw]\d+_\d+\b")
+_WRITTEN = re.compile(r"\s*([hvw]\d+_\d+) = ")
 _INDENT = 4
 
 Place = tuple[tuple[int, int], ...]

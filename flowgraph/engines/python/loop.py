@@ -24,6 +24,7 @@ from flowgraph.data.series import Series
 from flowgraph.engines.python.lifetimes import let_go
 from flowgraph.engines.python.plan import Plan, Presence, Writer, compiled, named
 from flowgraph.engines.python.steps import KINDS, Line, Written, silent, single, written
+from flowgraph.engines.python.strips import Rooms, Strips, Whole
 from flowgraph.language.graph import Argument, CallNode, Graph, RegisterNode, SourceNode, Wire
 from flowgraph.language.recording import StepTrace
 from flowgraph.recorder.random import Site
@@ -99,13 +100,17 @@ def _written(graph: Graph, patterns: tuple[int, ...]) -> Loop:
             lines.append(f"    r{index} = r[{index}]")
             stores[f"r[{index}]"] = f"r{index}"
     given = ["t", "key", *(which.given(k) for k in which.steady)]
-    lines += ["    try:", f"        for {', '.join(given)} in ticks:"]
+    lines += ["    rooms = Rooms()", "    try:", f"        for {', '.join(given)} in ticks:"]
     for n, key in enumerate(patterns):
         lines.append(f"            {'if' if n == 0 else 'elif'} key == {key}:")
         writer = _LoopWriter(graph, key, which, len(lines))
         writer.reaction()
-        lines += let_go(writer.lines, writer.arrays)
-        owner |= writer.owner
+        strips = Strips(writer.lines, writer.whole)
+        owner |= {
+            len(lines) + n: writer.owner[writer.first + k + 1] for n, (_, k) in enumerate(strips.made, 1)
+        }
+        which.names |= strips.names
+        lines += let_go([line for line, _ in strips.made], writer.arrays | strips.arrays)
     lines.append("            done = t")
     lines += ["    finally:", f"        {', '.join(stores)}, = {', '.join(stores.values())},"]
     to = " or ".join(named(graph, key) for key in patterns)
@@ -147,7 +152,8 @@ class _Which:
     def __init__(self, graph: Graph, patterns: tuple[int, ...]) -> None:
         self.graph = graph
         self.names: dict[str, Any] = {
-            "int32": np.int32, "bool_": np.bool_, "concatenate": np.concatenate, "asarray": np.asarray
+            "Rooms": Rooms, "int32": np.int32, "bool_": np.bool_, "concatenate": np.concatenate,
+            "asarray": np.asarray,
         }  # fmt: skip
         self._texts: dict[tuple[int, int], Written] = {}
         writers = [Writer(graph, key) for key in patterns]
@@ -263,6 +269,9 @@ class _LoopWriter(Writer):
         self.leaves: dict[tuple[int, int], list[str]] = {}
         self.next: dict[int, list[str]] = {}
         self.arrays: set[str] = set()
+        self.whole: dict[int, Whole] = {}
+        """The lines that are one instruction, by where they stand."""
+        self._shapes: dict[int, tuple[int, ...]] = {}
         self.known: dict[str, str] = {}
         """By what is computed, the variable that has it already."""
 
@@ -338,6 +347,7 @@ class _LoopWriter(Writer):
         for argument, given in zip(call.arguments, step.arguments, strict=True):
             if given:
                 local |= dict(zip(given, self._read(argument), strict=True))
+        self._shapes = text.shapes
         self.arrays |= {f"w{index}_{n}" for n, shape in text.shapes.items() if shape}
         for line in text.lines:
             self._line(line, index, local, call.path)
@@ -372,6 +382,9 @@ class _LoopWriter(Writer):
                 local[i.out] = self.known[text]
                 return
             self.emit(f"{name} = {text}", owner)
+            self.whole[len(self.lines) - 1] = Whole(
+                i, tuple(local[a] for a in i.args), tuple(self._shapes.get(a, ()) for a in i.args)
+            )
             self.known[text] = local[i.out] = name
             return
         for word, lines, taken in zip((f"if {local[i.args[0]]}", "else"), line.arms, i.args[1:], strict=True):

@@ -102,6 +102,11 @@ def enough_devices(shard: Mapping[str, int]) -> list[Any]:
     return there[:wanted]
 
 
+def on_processor() -> bool:
+    """Whether the devices of the chosen kind are processors."""
+    return bool(_there(import_jax())[0].platform == "cpu")
+
+
 def _there(jax: Any) -> list[Any]:
     """The devices of the kind that is chosen."""
     chosen = jax.config.jax_default_device

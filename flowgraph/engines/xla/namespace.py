@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from flowgraph.pipeline.optimise.rows import LEAST_LANES
 from flowgraph.recorder import ranges
 from flowgraph.recorder.namespaces import unnormalized_sinc
 from flowgraph.recorder.ops import OPS, bound_attrs
@@ -46,13 +47,17 @@ class JaxLinearAlgebra:
 class JaxNamespace:
     """`jax.numpy` with what pipelines add to it or define further, and a faster `take` and short reductions.
 
+    Args:
+        jax: the module.
+        true: what is so, but XLA cannot know, where branches are cheap; None elsewhere.
+
     A reduction over a short axis of a large array, such as the sum of the squares of three numbers for each
     particle, is written as operations on slices, in the order of the axis. These XLA computes in one loop
     with what is around them; a reduction, on a processor, is a call that keeps the loops around it apart.
     """
 
-    def __init__(self, jax: Any) -> None:
-        self._jax = jax
+    def __init__(self, jax: Any, true: Any = None) -> None:
+        self._jax, self._true = jax, true
         self.linalg = JaxLinearAlgebra(jax)
 
     def float32_bits(self, x: Any) -> Any:
@@ -119,7 +124,11 @@ class JaxNamespace:
         return reduce(fold, parts)
 
     def materialise(self, x: Any) -> Any:
-        return self._jax.lax.optimization_barrier(x)
+        """Past a barrier XLA on a processor still computes twice what is used twice; past a branch not."""
+        lax, jnp = self._jax.lax, self._jax.numpy
+        if self._true is None or x.size < LEAST_LANES:
+            return lax.optimization_barrier(x)
+        return lax.cond(self._true, lambda y: y, jnp.zeros_like, x)
 
     def take(self, x: Any, indices: Any, *, axis: int = 0, mode: str = "clip") -> Any:
         """`jnp.take`, along the last axis from a flat array.

@@ -20,9 +20,11 @@ import numpy as np
 
 from flowgraph.data.tape import Rows, bits
 from flowgraph.engines.xla.buffers import Buffers
-from flowgraph.engines.xla.devices import RUNS, Devices, import_jax
+from flowgraph.engines.xla.devices import RUNS, Devices, import_jax, on_processor
 from flowgraph.engines.xla.namespace import JaxNamespace
+from flowgraph.engines.xla.turns import in_turns
 from flowgraph.pipeline.optimise import ARRAYS, optimise
+from flowgraph.pipeline.optimise.rows import take_rows
 from flowgraph.pipeline.pipeline import Pipeline
 from flowgraph.pipeline.program import Program, specialise
 from flowgraph.pipeline.recurrence import Parts, parts
@@ -33,6 +35,7 @@ _MOST_PATTERNS = 8
 _SMALL_WORK = 64  # scalar operations below which selecting is cheaper than branching
 _UNROLLED = 4
 _SMALL_TICK = 64  # bytes that a tick moves, below which XLA still writes a loop over several as plain code
+_WIDE_TICK = 2**16  # bytes that a tick moves, above which a switch's copies cost more than a loop
 _CHUNK_BYTES = 64 * 2**20
 _LARGEST_CHUNK = 131072
 _LARGEST_OF_SMALL, _WASTE = 2**18, 0.1  # of ticks that take less than a call of many
@@ -84,6 +87,7 @@ class Scan:
         self._timed = any(_reads(program, pipeline.time) for program in played)
         self._parts = self._apart() if self.branches is None else None
         self._unroll = _UNROLLED if self.branches is None and _moved(pipeline) <= _SMALL_TICK else 1
+        self._wide = _moved(pipeline) >= _WIDE_TICK and on_processor()
         self._input_axis = 0 if shared or runs is None else 1
         self._output_axis = 0 if runs is None else 1
         leads = () if runs is None else (RUNS,)
@@ -144,6 +148,9 @@ class Scan:
     def _chunk(self, cells: tuple[Any, ...], seed: Any, xs: Any) -> Any:
         if self._parts is not None:
             return self._in_parts(self._parts, cells, seed, xs)
+        if self.branches is not None and self._wide:
+            steps = [partial(self._tick, take_rows(program), seed) for program in self.branches]
+            return in_turns(self.jax, steps, cells, *xs[:3])
         step = self._switched if self.branches is not None else self._flagged
         return self.jax.lax.scan(partial(step, seed), cells, xs, unroll=self._unroll)
 
@@ -169,8 +176,10 @@ class Scan:
     def _present(self, key: Any) -> dict[int, Any]:
         return {port.present: (key >> k) & 1 == 1 for k, port in enumerate(self.pipeline.inputs)}
 
-    def _run(self, instructions: Sequence[Instruction], env: dict[int, Any]) -> dict[int, Any]:
-        xp = JaxNamespace(self.jax)
+    def _run(
+        self, instructions: Sequence[Instruction], env: dict[int, Any], true: Any = None
+    ) -> dict[int, Any]:
+        xp = JaxNamespace(self.jax, true)
         for i in instructions:
             env[i.out] = OPS[i.op].run(
                 xp, *(env[a] for a in i.args), **bound_attrs(i.op, i.attrs, self.dtype)
@@ -193,10 +202,15 @@ class Scan:
                 outputs.append((mask, tuple(value(n) for n in leaves)))
         return outputs
 
-    def _play(self, program: Program, env: dict[int, Any]) -> tuple[tuple[Any, ...], Any]:
-        self._run(program.instructions, env)
+    def _play(self, program: Program, env: dict[int, Any], true: Any = None) -> tuple[tuple[Any, ...], Any]:
+        self._run(program.instructions, env, true)
         value = lambda n: env[n]
         return tuple(env[n] for n in program.writes), self._outputs(program, value)
+
+    def _tick(
+        self, program: Program, seed: Any, cells: tuple[Any, ...], time: Any, inputs: Any, true: Any
+    ) -> Any:
+        return self._play(program, self._start(program, cells, seed, time, inputs), true)
 
     def _switched(self, seed: Any, cells: tuple[Any, ...], x: Any) -> Any:
         key, time, inputs, _ = x

@@ -27,11 +27,19 @@ LARGEST_WORK = 256
 """Scalar operations of an instruction above which it stays one."""
 
 
-class _Unroller:
-    def __init__(self, program: Program, largest: int) -> None:
+class Unroller:
+    """The pass at work on a program: arrays in its tables are taken apart, others are not.
+
+    Args:
+        program: what to rewrite.
+        largest: scalar operations of an instruction above which it stays one.
+        lanes: sizes of last axes that stay whole; those of the program if left out.
+    """
+
+    def __init__(self, program: Program, largest: int, lanes: frozenset[int] | None = None) -> None:
         self.draft = Draft(program)
         self.program, self.largest = program, largest
-        self.elements = Elements(self.draft.specs, program.lanes, self.make)
+        self.elements = Elements(self.draft.specs, program.lanes if lanes is None else lanes, self.make)
         self.made = {i.out: i for i in program.instructions}
         self.tables: dict[int, Table] = {}
         self.loads: dict[Any, int] = {}
@@ -48,9 +56,13 @@ class _Unroller:
                 draft.keep(i)
             else:
                 self.tables[i.out] = table
+                self.settled(i, table)
         for n in ends(self.program.outputs, self.program.writes):
             self.pack(n)
         return draft.done()
+
+    def settled(self, i: Instruction, table: Table) -> None:
+        """What else is done with the elements of an array that was taken apart."""
 
     def expanded(self, i: Instruction) -> Table | None:
         """The elements of a result, where it is small enough and has a rule."""
@@ -136,4 +148,4 @@ def unroll(program: Program, *, largest: int = LARGEST_WORK) -> Program:
         program: what to rewrite.
         largest: scalar operations of an instruction above which it stays one.
     """
-    return _Unroller(program, largest).run()
+    return Unroller(program, largest).run()
