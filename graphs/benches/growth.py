@@ -60,7 +60,7 @@ PIECE = 65_536
 """Ticks of a streamed run that are made, played and written at a time."""
 LEAST_MEMORY = 1.0e6
 """Bytes below which growth is that of the allocator, and no exponent is told."""
-ENOUGH, AGAIN, LONG, REPEATS = 0.3, 3, 3.0, 7
+ENOUGH, AGAIN, LONG, REPEATS = 0.3, 3, 8.0, 7
 """A run is repeated for so many seconds, and so often where it does not take too long: the first is dearer,
 as the system hands out the pages of its memory. Seven times at most."""
 

@@ -251,18 +251,40 @@ static inline void fg_{kind}({real} *restrict out, int32_t n, uint32_t hash, int
         "b": "bool",
         **{k: f"{k}_t" for k in ("int32", "int64", "uint32", "uint64")},
     }.items():
-        nan = " || (x != x && a[place + step - 1] == a[place + step - 1])" if kind == "r" else ""
-        found[f"fg_search_{kind}"] = (
+        nan = " || (x != x && y == y)" if kind == "r" else ""
+        found[f"fg_before_{kind}"] = (
             (),
+            f"""static inline bool fg_before_{kind}({type_} y, {type_} x, int right) {{
+    return y < x || (right && y == x){nan};
+}}
+""",
+        )
+        found[f"fg_search_{kind}"] = (
+            (f"fg_before_{kind}",),
             f"""/* how many of n numbers in order come before x (or, on the right, do not come after it) */
 static inline int64_t fg_search_{kind}(const {type_} *a, int32_t n, {type_} x, int right) {{
     int32_t place = 0, step = 1;
     while (step <= n / 2) step *= 2;
     for (; step > 0; step /= 2) {{
-        if (place + step <= n && (a[place + step - 1] < x || (right && a[place + step - 1] == x){nan}))
-            place += step;
+        if (place + step <= n && fg_before_{kind}(a[place + step - 1], x, right)) place += step;
     }}
     return place;
+}}
+""",
+        )
+        found[f"fg_search_near_{kind}"] = (
+            (f"fg_before_{kind}", f"fg_search_{kind}"),
+            f"""/* the same, first a few steps on from the last place: enough where x comes in order */
+static inline int64_t fg_search_near_{kind}(
+    const {type_} *a, int32_t n, {type_} x, int right, int32_t *near)
+{{
+    int32_t place = *near;
+    const int32_t end = n - place > 8 ? place + 8 : n;
+    if (place == 0 || fg_before_{kind}(a[place - 1], x, right)) {{
+        for (; place < end && fg_before_{kind}(a[place], x, right); place++) {{}}
+        if (place < end || place == n) return *near = place;
+    }}
+    return *near = (int32_t)fg_search_{kind}(a, n, x, right);
 }}
 """,
         )

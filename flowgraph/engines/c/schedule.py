@@ -4,6 +4,9 @@ Level by level there is straight code, then one loop for each space. An operatio
 at which all it needs is there; what a loop sums up, or stores for a look-up, is there at the next level. So
 a chain of operations over the particles is one loop up to where it needs a sum over all of them. What one
 loop computes and a later one needs is kept in memory in between.
+
+A search among sorted numbers goes from one turn to the next, so it has a loop of its own, with no more than
+it needs: the turns of the others can be done together.
 """
 
 from __future__ import annotations
@@ -75,21 +78,30 @@ def group_of(item: Item) -> Group:
 
 
 def schedule(tape: Tape, roots: Iterable[Item], *, blocks: bool = False) -> Schedule:
-    """Order what the roots need; with `blocks`, products over many places go with the loops before them."""
-    live = _live(roots)
-    made = Schedule(sorted(live, key=lambda i: i.order))
-    for item in made.items:
-        _level(item)
+    """Order what the roots need.
+
+    Args:
+        tape: of all that was made.
+        roots: what is wanted.
+        blocks: whether products over many places go with the loops before them, and one number of an array
+            is read where a loop keeps it.
+    """
+    roots = list(roots)
+    if blocks:
+        _name_turns(_live(roots))
+    made = Schedule(sorted(_live(roots), key=lambda i: i.order))
+    _level(made.items)
     made.levels = 1 + max((group_of(i)[0] for i in made.items), default=0)
     users: dict[Node, list[Group]] = defaultdict(list)
     for item in made.items:
         for node in arguments(item):
             made.uses[node] += 1
             users[node].append(group_of(item))
+    factors = {v.buffer for i in made.items if isinstance(i, Macro) and i.kind == "matmul" for v in i.inputs}
     kept = {
         i.node: Place(i.buffer, i.offset, i.strides)
         for i in made.items
-        if isinstance(i, Store) and (_is_whole(i) or _is_state(i))
+        if isinstance(i, Store) and (_is_whole(i, factors) or _is_state(i))
     }
     for node, groups in users.items():
         if node.space and node.op not in REPEATED and any(g[0] > node.level for g in groups):
@@ -102,10 +114,15 @@ def schedule(tape: Tape, roots: Iterable[Item], *, blocks: bool = False) -> Sche
     return made
 
 
-def _is_whole(store: Store) -> bool:
-    """Whether it keeps its node as a spill would: all of it, in C's order."""
-    plain = store.buffer.kind == "work" and not store.offset and store.space == store.node.space != ()
-    return plain and store.strides == row_major(store.space)
+def _is_whole(store: Store, factors: set[Buffer]) -> bool:
+    """Whether it keeps its node as a spill would: all of it, in C's order.
+
+    A row of a factor of a product does not: that factor may be no longer than a block.
+    """
+    buffer = store.buffer
+    plain = buffer.kind == "work" and store.space == store.node.space != ()
+    row = buffer in factors and buffer.size != _size(store.space)
+    return plain and not row and store.strides == row_major(store.space)
 
 
 def _is_state(store: Store) -> bool:
@@ -119,6 +136,24 @@ def _size(space: Space) -> int:
     for n in space:
         size *= n
     return size
+
+
+def _name_turns(items: set[Item]) -> None:
+    """Make of a load of what one turn of a loop stores the number that its node has in that turn.
+
+    Then it is read where the loop keeps it anyway, as in a register: one number is no reason to store all.
+    """
+    for item in items:
+        if not (isinstance(item, Node) and item.op == "load" and not item.extra[2]):
+            continue
+        buffer, offset, _ = item.extra
+        for store in buffer.writers if buffer.kind == "work" else ():
+            if not (isinstance(store, Store) and len(store.space) == 1 and store.strides[0] > 0):
+                continue
+            turn, between = divmod(offset - store.offset, store.strides[0])
+            own = store.node.space == store.space and store.node.op not in REPEATED
+            if own and not between and 0 <= turn < store.space[0]:
+                item.op, item.args, item.extra = "turn", (store.node,), turn
 
 
 def _live(roots: Iterable[Item]) -> set[Item]:
@@ -136,17 +171,64 @@ def _live(roots: Iterable[Item]) -> set[Item]:
     return found
 
 
-def _level(item: Item) -> None:
-    needed = [a.level for a in arguments(item)] + [b.ready for b in reads(item)]
-    level = max(needed, default=0)
+def _level(items: list[Item]) -> None:
+    """Give each its level: what stands in a loop that searches, and no search needs, comes after it."""
+    least: dict[Item, int] = {}
+    while True:
+        for buffer in {b for i in items for b in _filled(i)}:
+            buffer.ready = 0
+        for item in items:
+            item.level = _first_level(item, least.get(item, 0))
+        rest = _beside_searches(items)
+        if not rest:
+            return
+        least |= rest
+
+
+def _first_level(item: Item, least: int) -> int:
+    needed = [a.level + (a.op == "search" and a.space != ()) for a in arguments(item)]
+    level = max([*needed, *(b.ready for b in reads(item))], default=0)
+    level = max(level + (_is_sum(item) or _is_turn(item)), least)
+    for buffer in _filled(item):
+        _ready(buffer, level + 1 if isinstance(item, Store) and item.space else level)
+    return level
+
+
+def _filled(item: Item) -> list[Buffer]:
     if isinstance(item, Macro):
-        item.level = level
-        _ready(item.output.buffer, level)
-    elif isinstance(item, Store):
-        item.level = level
-        _ready(item.buffer, level + 1 if item.space else level)
-    else:
-        item.level = level + 1 if item.op == "reduce" else level
+        return [item.output.buffer]
+    return [item.buffer] if isinstance(item, Store) else []
+
+
+def _is_sum(item: Item) -> bool:
+    return isinstance(item, Node) and item.op == "reduce"
+
+
+def _is_turn(item: Item) -> bool:
+    return isinstance(item, Node) and item.op == "turn"
+
+
+def _beside_searches(items: list[Item]) -> dict[Item, int]:
+    """What stands in the first loop with a search that has more than it needs, and the level after it."""
+    loops: dict[Group, list[Item]] = defaultdict(list)
+    for item in items:
+        level, space = group_of(item)
+        if space and not (isinstance(item, Node) and item.op in REPEATED):
+            loops[level, space].append(item)
+    for (level, _), inside in sorted(loops.items()):
+        waiting: list[Item] = [i for i in inside if isinstance(i, Node) and i.op == "search"]
+        if not waiting:
+            continue
+        needed: set[Item] = set()
+        while waiting:
+            item = waiting.pop()
+            if item not in needed:
+                needed.add(item)
+                waiting.extend(a for a in arguments(item) if a.space and a.level == level)
+        rest = {i: level + 1 + _is_sum(i) for i in inside if i not in needed}
+        if rest:
+            return rest
+    return {}
 
 
 def _ready(buffer: Buffer, level: int) -> None:

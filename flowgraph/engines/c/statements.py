@@ -29,7 +29,7 @@ class Writer(Lines):
     """
 
     blocks = True
-    """Whether it writes products in blocks."""
+    """Whether it writes products in blocks, and reads one number of an array where a loop keeps it."""
 
     def __init__(self, plan: Schedule, expressions: Expressions, names: Callable[[Buffer], str]) -> None:
         super().__init__(expressions, names)
@@ -106,6 +106,8 @@ class Writer(Lines):
         self.line(f"const {self.type_of(node)} v{node.order} = {text};")
 
     def _reads_memory(self, node: Node) -> bool:
+        if node.op == "turn":
+            return True
         if node.op not in ("load", "gather", "search"):
             return False
         kind = node.extra[0].kind
@@ -137,6 +139,8 @@ class Writer(Lines):
                 self.line(f"{self.flag_type} n{node.order} = {self.no_flag};")
         self.flat = len(space) > 1 and is_flat(items, space)
         sizes = (math.prod(space),) if self.flat else space
+        for search in [i for i in items if isinstance(i, Node) and i.op == "search"]:
+            self.line(f"int32_t n{search.order} = 0;")
         if len(sizes) == 1:
             self.at_once(reductions, items)
         for k, n in enumerate(sizes):
@@ -183,9 +187,8 @@ class Writer(Lines):
 
     def at_once(self, reductions: list[Node], items: list[Node | Store]) -> None:
         """Say that the turns of the next loop may be done together, where they may."""
-        clauses = "".join(self._clause(n) for n in reductions)
-        if clauses or not any(isinstance(i, Node) and i.op == "search" for i in items):
-            self.line(f"FG_SIMD(omp simd{clauses})")
+        if not any(isinstance(i, Node) and i.op == "search" for i in items):
+            self.line(f"FG_SIMD(omp simd{''.join(self._clause(n) for n in reductions)})")
 
     def sum_type(self, node: Node) -> str:
         """The type of what a loop sums up."""
@@ -296,6 +299,9 @@ class Writer(Lines):
         if node.op == "load":
             buffer, offset, strides = node.extra
             return self.at(buffer, self.index(offset, strides))
+        if node.op == "turn":
+            buffer, offset, strides = self.plan.spills[node.args[0]]
+            return self.at(self.plan.late.get(buffer, buffer), str(offset + node.extra * strides[0]))
         if node.op == "iota":
             return f"(int64_t)i{node.extra}"
         if node.op == "gather":
@@ -311,10 +317,11 @@ class Writer(Lines):
         if node.op == "search":
             buffer, offset, size, side = node.extra
             kind = "r" if buffer.dtype == "real" else "b" if buffer.dtype == "bool" else buffer.dtype
-            name = self.write.helper(f"fg_search_{kind}")
+            near = f", &n{node.order}" if node.space else ""
+            name = self.write.helper(f"fg_search_{'near_' if near else ''}{kind}")
             whole = self.names(buffer) + (f" + {offset}" if offset else "")
             array = f"&{whole}" if buffer.bare else whole
-            return f"{name}({array}, {size}, {self.ref(node.args[0])}, {int(side == 'right')})"
+            return f"{name}({array}, {size}, {self.ref(node.args[0])}, {int(side == 'right')}{near})"
         if _is_quotient(node) and node.args[1] in self.often:
             return self._times_inverse(*node.args)
         return self.write.write(node, [self.ref(a) for a in node.args])
