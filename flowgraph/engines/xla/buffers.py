@@ -61,8 +61,7 @@ class Buffers:
     @property
     def bytes(self) -> int:
         """What they take."""
-        some = [self._choice, self._time, *(leaf for port in self._leaves for leaf in port)]
-        return sum(a.nbytes for a in some if a is not None)
+        return sum(a.nbytes for a in self._filled)
 
     def fits(self, inputs: Sequence[Sequence[np.ndarray]]) -> bool:
         """Whether these inputs go into them, but for the number of their rows."""
@@ -124,7 +123,13 @@ class Buffers:
 
     def holds(self, array: np.ndarray) -> bool:
         """Whether an array lies in one of these, and so will not stay as it is."""
-        return any(np.may_share_memory(array, kept) for port in self._leaves for kept in port)
+        return any(np.may_share_memory(array, kept) for kept in self._filled)
+
+    @property
+    def _filled(self) -> list[np.ndarray]:
+        """What is filled again for each chunk."""
+        some = [self._choice, self._time, *(leaf for port in self._leaves for leaf in port)]
+        return [a for a in some if a is not None]
 
 
 def _within(rows: Rows, here: slice) -> tuple[Rows, slice]:
