@@ -17,6 +17,8 @@ they leave the caches that is no line either.
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import math
 import resource
@@ -233,6 +235,7 @@ def one(of: str, mode: str, engine: str, number: int, duration: float) -> None:
         given = lambda: _run(built, mode, engine, number)
         # XLA compiles for each number of ticks; and the first run of any loads what it needs
         _run(built, mode, engine, min(number, PIECE) if engine == "xla" else 200)()
+    give_back()
     forget_peak()
     held = memory()
     run = given()
@@ -293,6 +296,13 @@ def peak() -> int:
     """The most bytes that this process has held, since that was forgotten."""
     with open("/proc/self/status") as file:
         return 1024 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
+
+
+def give_back() -> None:
+    """What the allocator keeps of an earlier run is the system's again, where it has a function for that."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def forget_peak() -> None:

@@ -8,6 +8,7 @@ import pytest
 from flowgraph import Scalar, Stream, find_graph, graph, scan, simulate
 from flowgraph.blocks.flights import simulated
 from flowgraph.engines.python import loop, strips
+from flowgraph.engines.python.plan import compiled
 from flowgraph.engines.python.strips import Rooms, Strips, Sum, Together, Whole, by_columns, halves, parts
 from flowgraph.recorder.ops import Spec
 from flowgraph.recorder.trace import Instruction
@@ -90,10 +91,12 @@ def test_a_cloud_in_strips_has_the_bits_of_one_that_is_not(name, flight, particl
     sensors = {"sensors": "imu,gps,altimeter"} if flight else {}
     flown = simulated.load(flight, settings={"duration": 0.6, **sensors})
     written = []
-    compiled = loop.compiled
-    monkeypatch.setattr(
-        loop, "compiled", lambda graph, text, *more: written.append(text) or compiled(graph, text, *more)
-    )
+
+    def noted(graph, text, *more):
+        written.append(text)
+        return compiled(graph, text, *more)
+
+    monkeypatch.setattr(loop, "compiled", noted)
 
     def run(engine):
         case = find_graph(name).case(flown, particles=particles)

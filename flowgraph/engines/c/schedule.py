@@ -40,8 +40,8 @@ class Schedule:
     Args:
         items: all that is needed, in order; those of a group have its level and space.
         uses: how often a node is named.
-        spills: where a node of one loop is kept for later ones: where it is stored anyway, as a register's
-            new value is, or in memory of its own.
+        spills: where a node of one loop is kept for later ones: where that loop stores it anyway, as a
+            register's new value is, or in memory of its own.
         late: state buffers that cannot be written in place, with the work buffer that stands in.
         span: first and last level at which a work buffer is in use.
         blocks: loops that go block by block, with the product that takes each block.
@@ -101,7 +101,7 @@ def schedule(tape: Tape, roots: Iterable[Item], *, blocks: bool = False) -> Sche
     kept = {
         i.node: Place(i.buffer, i.offset, i.strides)
         for i in made.items
-        if isinstance(i, Store) and (_is_whole(i, factors) or _is_state(i))
+        if isinstance(i, Store) and i.level == i.node.level and (_is_whole(i, factors) or _is_state(i))
     }
     for node, groups in users.items():
         if node.space and node.op not in REPEATED and any(g[0] > node.level for g in groups):

@@ -65,6 +65,8 @@ def put_aside(program: Program, kept: Collection[int] = ()) -> tuple[Program, li
     for i in reversed(program.instructions):  # the outermost first
         if i.op != "where" or i.out in gone or math.prod(program.specs[i.args[0]].shape) != 1:
             continue
+        if i.args[1] == i.args[2]:  # the same either way
+            continue
         for truth, root in ((False, i.args[2]), (True, i.args[1])):
             other = i.args[1 if root == i.args[2] else 2]
             if {program.specs[root], program.specs[other]} != {i.spec} or i.spec.dtype != "real":

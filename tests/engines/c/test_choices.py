@@ -147,8 +147,18 @@ def test_what_serves_something_else_stays():
     def two(given: Stream[Limited]):
         return {"a": both(given), "b": little(given)}
 
-    program = program_of(two.build())
-    assert put_aside(program) == (program, [])
+    @block
+    def alike(given: Limited, *, xp: Any) -> Matrix:
+        fourth = (given.value @ given.value) @ (given.value @ given.value)
+        return Matrix(value=xp.where(given.limit > 0.0, fourth, fourth))
+
+    @graph
+    def same(given: Stream[Limited]):
+        return {"a": alike(given)}
+
+    for built in (two.build(), same.build()):
+        program = program_of(built)
+        assert put_aside(program) == (program, [])
     held = program_of(powers.build())
     last = next(i.args[1] for i in held.instructions if i.op == "where" and i.spec.shape == (SIZE, SIZE))
     assert put_aside(held, (last,))[1] == []

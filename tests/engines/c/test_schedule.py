@@ -85,3 +85,28 @@ def test_a_search_has_a_loop_of_its_own():
     assert not search[0]
     assert "fg_sin" not in search[1]
     assert any("fg_sin" in body and "reduction(+" in simd for simd, body in loops)
+
+
+@pytest.mark.parametrize("kept", ["state", "table"])
+def test_what_is_stored_after_a_search_is_not_read_there_before(kept):
+    """The numbers that are looked up are also a register's, or those among which the most is sought."""
+
+    @block
+    def look(state, x: Scalar, *, xp) -> tuple[Row, Scalar]:
+        asked = xp.abs(xp.sin(state + x))
+        place = xp.astype(xp.searchsorted(xp.asarray(np.linspace(0.0, 1.0, N)), asked), xp.float64)
+        if kept == "state":
+            return asked, xp.sum(xp.cos(place) * asked)
+        return xp.sin(place + x), place[xp.argmax(asked)] + xp.sum(asked)
+
+    @look.init
+    def _(x):
+        return np.linspace(0.0, 3.0, N)
+
+    @graph
+    def looked(x: Stream[Scalar]):
+        return look(x)
+
+    built = looked.build(x=aperiodic())
+    right = simulate(built, GIVEN, engine="python").output.leaves["value"]
+    np.testing.assert_allclose(simulate(built, GIVEN, engine="c").output.leaves["value"], right, rtol=1e-9)
