@@ -64,7 +64,8 @@ def _play_parts(graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
     known = dict(zip(graph.sources, events.series, strict=True))
     ends = {n: int(s.time[-1]) if len(s) else last[n] for n, s in known.items()}
     collected: dict[str, Series] = {}
-    wall = 0.0
+    wall, notes = 0.0, tuple[str, ...]()
+    counts: dict[str, Any] = {}
     for part in (parts.before, parts.accelerated, parts.after):
         if part is None:
             continue
@@ -74,7 +75,8 @@ def _play_parts(graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
             found = play(LoweredGraph(part), given, options.but(init=None, state=begin))
         else:
             found = Run(part, given, state=begin).to_end().result()
-        wall += found.wall_s
+        wall, notes = wall + found.wall_s, (*notes, *found.notes)
+        counts.update(found.stats)
         tree["registers"].update(found.state["registers"])
         for c in part.collected:
             collected[c.name] = series = found.series[c.name]
@@ -84,7 +86,8 @@ def _play_parts(graph: Graph, inputs: Inputs, options: RunOptions) -> Result:
             )
     tree["sources"] = {n: np.asarray(t, dtype=np.int64) for n, t in ends.items()}
     outputs = {c.name: collected[c.name] for c in graph.collected}
-    return Result(graph.name, options.engine, outputs, tree, statistics(graph, tree), len(events.time), wall)
+    counts.update(statistics(graph, tree))
+    return Result(graph.name, options.engine, outputs, tree, counts, len(events.time), wall, notes)
 
 
 def _state_of(part: Graph, tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,9 @@ from flowgraph import Scalar, Stream, find_graph, graph, scan, simulate
 from flowgraph.blocks.flights import simulated
 from flowgraph.engines.python import loop, strips
 from flowgraph.engines.python.plan import compiled
-from flowgraph.engines.python.strips import Rooms, Sum, Together, by_columns, halves, parts
+from flowgraph.engines.python.strips import Rooms, Strips, Sum, Together, Whole, by_columns, halves, parts
+from flowgraph.recorder.ops import Spec
+from flowgraph.recorder.trace import Instruction
 from tests.support import same_state
 
 
@@ -125,3 +127,27 @@ def test_what_is_collected_stays_though_rooms_are_used_again(short):
     found, plain = (simulate(g.build(), inputs, engine=e)["out"].value for e in ("python", "reference"))
     np.testing.assert_array_equal(found, plain)
     assert len(np.unique(found[:, 0, 0])) == ticks
+
+
+def test_a_thousand_strips_after_one_another_are_written_as_one_is(short):
+    """Each goes over what a sum of the strip before it was needed for."""
+    lines, known, size = list[str](), dict[int, Whole](), 400
+
+    def add(op, *args, axis=None):
+        shapes = tuple((size,) if a.startswith(("x", "w")) and a not in sums else () for a in args)
+        out, attrs = len(lines), {} if axis is None else {"axis": axis}
+        spec = Spec(() if op == "sum" else (size,), "real")
+        known[out] = Whole(Instruction(op, (), attrs, out, spec, ""), args, shapes)
+        lines.append(f"    w0_{out} = {op}({', '.join(args)})")
+        if op == "sum":
+            sums.add(f"w0_{out}")
+        return f"w0_{out}"
+
+    value, sums = "x0_0", set[str]()
+    for _ in range(1100):
+        value = add("sin", add("cos", add("tanh", value)))
+        value = add("divide", value, add("sum", value, axis=-1))
+    lines.append(f"    c0({value})")
+    made = [line for line, _ in Strips(lines, known).made]
+    assert sum(line.startswith("    for at in parts_400:") for line in made) == 1100
+    assert len(made) < 20 * 1100

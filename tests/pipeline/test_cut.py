@@ -148,6 +148,21 @@ def test_many_runs_have_the_host_in_each():
         np.testing.assert_allclose(batch["out"].run(k)["value"], one["out"]["value"], rtol=1e-12)
 
 
+@pytest.mark.parametrize("engine", ["reference", "numpy"])
+def test_what_the_accelerated_part_has_to_say_is_said(engine):
+    @graph
+    def g(x: Stream[Scalar]):
+        return {"odd": x.map(lambda v: v**0.5), "table": looked_up(double(x))}
+
+    built, given = g.build(), {"x": scalars(np.arange(4) * MS, np.array([1.0, 2.0, -1.0, 3.0]))}
+    python, found = (simulate(built, given, engine=e, diverged="count") for e in ("python", engine))
+    assert "odd are not finite, the first at t = 2000000 ns" in found.notes[0]
+    assert (found.notes, found.stats) == (python.notes, python.stats)
+    batch = simulate_many(built, given, [1, 2], engine=engine, keep=["odd"], diverged="count")
+    assert list(batch.diverged) == [0, 1]
+    assert not simulate_many(built, given, [1], engine=engine, keep=["table"], diverged="count").diverged
+
+
 def test_a_pipeline_alone_needs_what_the_host_makes():
     built, events = whole([]), data()
     pipeline, found = lower(built), simulate(built, events)

@@ -267,9 +267,9 @@ class Strips:
         outer = len(lines[0]) - len(lines[0].lstrip())
         self._indent = " " * outer
         names_ = [m[1] if (m := _WRITTEN.match(line)) else "" for line in lines]
+        times = Counter(names_)
         self._names = [
-            n if names_.count(n) == 1 and line[outer] != " " else ""
-            for n, line in zip(names_, lines, strict=True)
+            n if times[n] == 1 and line[outer] != " " else "" for n, line in zip(names_, lines, strict=True)
         ]
         self._reads = [
             set(_READ.findall(line.partition(" = ")[2] if name else line))
@@ -310,29 +310,35 @@ class Strips:
 
     def _segment(self, places: Sequence[int]) -> None:
         """Lines that can stand in any order in which what they read is there."""
+        while places:
+            places = self._with_a_strip(places)
+
+    def _with_a_strip(self, places: Sequence[int]) -> list[int]:
+        """Those of the first strip, and those that can stand before it; gives those that are left."""
         count = next((self._lanes[k] for k in places if k in self._lanes), 0)
         before, strip, after = [], [], []
         inside: set[str] = set()
         late: set[str] = set()  # is there only after the strip
         for k in places:
-            if self._lanes.get(k) == count and count and not self._reads[k] & late:
+            reads = self._reads[k]
+            if self._lanes.get(k) == count and count and reads.isdisjoint(late):
                 strip.append(k)
                 line = self._known[k]
                 (late if _is_sum(line.instruction, line.shapes) else inside).add(self._names[k])
-            elif self._reads[k] & (late | inside):
+            elif not (reads.isdisjoint(late) and reads.isdisjoint(inside)):
                 after.append(k)
                 late.add(self._names[k])
             else:
                 before.append(k)
         if not strip:
             self._plain(places)
-            return
+            return []
         if sum(self._known[k].instruction.op not in _VIEWS for k in strip) < _LEAST_LINES:
             self._plain([*before, *strip])
         else:
             self._plain(before)
             self._strip(strip, count)
-        self._segment(after)
+        return after
 
     def _strip(self, places: Sequence[int], count: int) -> None:
         self.names |= {f"parts_{count}": parts(count), "Together": Together, "Sum": Sum}
