@@ -289,6 +289,8 @@ class Strips:
             if self._names[k]:
                 segment.append(k)
                 continue
+            if lines[k][outer:] == "pass":  # what nobody reads was there
+                continue
             self._segment(segment)
             segment = []
             if k in within and self._strips:
